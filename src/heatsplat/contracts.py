@@ -1,0 +1,264 @@
+"""The nouns that every room of heatsplat shares: cameras, views, scenes, ranges and what a renderer returns.
+
+Conventions, once for all of them (docs/conventions.md has the page):
+
+* OpenCV camera axes: x right, y down, z forward. ``viewmat`` maps world to camera.
+* Pixel centres lie at +0.5, so the centre of the top-left pixel is (0.5, 0.5).
+* Images are [H, W, C] float32 in [0, 1]; a ``ThermalRange`` says which temperatures 0 and 1 stand for.
+* Time is float64 seconds since the first training frame of the scene. Physics is in kelvin, files and metrics in °C.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+KELVIN_AT_0_C = 273.15
+
+
+class SceneError(ValueError):
+    """Input data that cannot be used as it is. The message names the file, key or shape and the remedy."""
+
+
+@dataclass(frozen=True)
+class ThermalRange:
+    """The temperatures that image values 0 and 1 stand for; linear between them, in °C."""
+
+    min_c: float
+    max_c: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.min_c) and math.isfinite(self.max_c) and self.min_c < self.max_c):
+            raise SceneError(
+                f"thermal range {self.min_c} .. {self.max_c} °C is not a range: the minimum must be finite and below the "
+                "maximum. Check the bounds file of the scene."
+            )
+
+    @property
+    def span_k(self) -> float:
+        """Width of the range in kelvin."""
+        return self.max_c - self.min_c
+
+    def to_celsius(self, unit: Any) -> Any:
+        """Temperatures in °C of image values (0 is ``min_c``, 1 is ``max_c``); any shape, tensor, array or number."""
+        return self.min_c + unit * self.span_k
+
+    def to_unit(self, celsius: Any) -> Any:
+        """Image values of temperatures in °C; values outside [0, 1] are kept."""
+        return (celsius - self.min_c) / self.span_k
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion (images are undistorted when they are loaded).
+
+    Args:
+        viewmat: world-to-camera matrix [4, 4], float64, OpenCV axes.
+        K: intrinsics [3, 3] in pixels, float64; the principal point counts from the corner of the image.
+        width, height: image size in pixels.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
+            raise SceneError(
+                f"camera needs viewmat [4, 4] and K [3, 3], got {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise SceneError(f"camera has no pixels: {self.width} x {self.height}")
+        object.__setattr__(self, "viewmat", self.viewmat.to(torch.float64))
+        object.__setattr__(self, "K", self.K.to(torch.float64))
+
+    @property
+    def center(self) -> Tensor:
+        """Position of the camera in the world, [3] float64."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera on a grid of ``width`` x ``height`` pixels; intrinsics scale by the actual pixel counts."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)
+        return Camera(self.viewmat, self.K * scale[:, None], width, height)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Weather at one moment. Every value may be missing (None); a thermal model names what it needs."""
+
+    air_c: float | None = None
+    wind_m_s: float | None = None
+    humidity_percent: float | None = None
+    irradiance_w_m2: float | None = None
+    pressure_hpa: float | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is known of one image without its pixels.
+
+    Args:
+        name: file name, for messages and result tables.
+        frame_id: index of the frame in the whole scene (all splits), unique.
+        camera: where it was taken from.
+        time_s: float64 seconds since the first training frame, or None.
+        environment: weather at that time, or None.
+    """
+
+    name: str
+    frame_id: int
+    camera: Camera
+    time_s: float | None = None
+    environment: Environment | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """One image with its frame: what one training step sees.
+
+    Args:
+        frame: name, id, camera and time.
+        thermal: [H, W, C] float32 in [0, 1], C = 1 (3 only for pseudo-colour data, which has no temperature); or None.
+        rgb: [H, W, 3] float32 in [0, 1], or None.
+        mask: [H, W] bool, True where a pixel counts; None means that all do.
+    """
+
+    frame: Frame
+    thermal: Tensor | None = None
+    rgb: Tensor | None = None
+    mask: Tensor | None = None
+
+    @property
+    def camera(self) -> Camera:
+        return self.frame.camera
+
+    @property
+    def time_s(self) -> float | None:
+        return self.frame.time_s
+
+    def image(self, modality: str) -> Tensor:
+        """The image of a modality ("thermal" or "rgb"), [H, W, C]. Raises SceneError where the view has none."""
+        image = getattr(self, modality)
+        if image is None:
+            raise SceneError(f"view {self.frame.name} has no {modality} image; choose a method or data set that fits")
+        return image
+
+    def to(self, device: torch.device | str) -> View:
+        """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them)."""
+        moved = {
+            key: value.to(device, non_blocking=True)
+            for key in ("thermal", "rgb", "mask")
+            if (value := getattr(self, key)) is not None
+        }
+        return replace(self, **moved)
+
+
+class ViewSet(Sequence[View]):
+    """Frames whose pixels are decoded when asked for, so that a scene costs its stored integers and no more.
+
+    Args:
+        frames: what is known without pixels.
+        decode: function from a position in ``frames`` to the View.
+    """
+
+    def __init__(self, frames: Sequence[Frame], decode: Callable[[int], View]) -> None:
+        self.frames = tuple(frames)
+        self._decode = decode
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> View:  # type: ignore[override]
+        if isinstance(index, slice):
+            raise TypeError("take a subset of views with .subset(positions)")
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        return self._decode(index % len(self))
+
+    def __iter__(self) -> Iterator[View]:
+        return (self[i] for i in range(len(self)))
+
+    def subset(self, positions: Sequence[int]) -> ViewSet:
+        """The views at ``positions``, in that order."""
+        positions = list(positions)
+        return ViewSet([self.frames[i] for i in positions], lambda i: self._decode(positions[i]))
+
+    @property
+    def times_s(self) -> list[float | None]:
+        return [frame.time_s for frame in self.frames]
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """Everything a loader found out about a scene, in heatsplat's conventions.
+
+    Args:
+        name: scene name, used for the run's folder.
+        train, val, test: views. ``val`` draws curves during training and selects nothing.
+        points: [P, 3] float32 points of the scene.
+        point_colors: [P, 3] float32 in [0, 1], or None.
+        thermal_range: bounds in °C, or None when image values are no temperatures.
+        ambient_c: temperature of the surroundings in °C, or None.
+        metres_per_unit: scale of the world, or None when unknown.
+        notes: what the loader found and assumed, for the report: name -> value or sentence.
+        probes: scene points [n, 3] whose temperature over time is drawn, or None to let the training choose.
+        truth: function (points [n, 3], times_s [F]) -> °C [n, F] on synthetic scenes, or None.
+    """
+
+    name: str
+    train: ViewSet
+    val: ViewSet
+    test: ViewSet
+    points: Tensor
+    point_colors: Tensor | None = None
+    thermal_range: ThermalRange | None = None
+    ambient_c: float | None = None
+    metres_per_unit: float | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
+    probes: Tensor | None = None
+    truth: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""
+        centers = torch.stack([frame.camera.center for frame in self.train.frames])
+        radius = (centers - centers.mean(0)).norm(dim=1).max().item()
+        return 1.1 * radius if radius > 0 else 1.0
+
+    @property
+    def metadata(self) -> frozenset[str]:
+        """Names of the metadata that the scene has, in the vocabulary of ``ThermalModel.needs``."""
+        has = {
+            "time": all(t is not None for t in self.train.times_s) and len(self.train) > 0,
+            "thermal_range": self.thermal_range is not None,
+            "ambient": self.ambient_c is not None,
+            "metres": self.metres_per_unit is not None,
+            "weather": all(frame.environment is not None for frame in self.train.frames) and len(self.train) > 0,
+        }
+        return frozenset(name for name, there in has.items() if there)
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """What a renderer returns, for M modalities (opacity sets) and C channels.
+
+    Args:
+        features: [H, W, C] composited features, background included.
+        alpha: [M, H, W] accumulated opacity of each modality.
+        depth: [H, W] accumulated depth of the first modality (sum of weight times camera z; divide by alpha for the
+            expected depth), or None when it was not asked for.
+        meta: "means2d" [N, 2] in pixels, a tensor whose .grad is filled by the backward pass (and whose .absgrad is, with
+            absgrad=True); "radii" [N, 2] int32 extents in pixels, 0 where a Gaussian is not seen; "visible_ids" [n] int64.
+    """
+
+    features: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    meta: dict[str, Tensor]

@@ -1,0 +1,121 @@
+"""The renderer contract: one function, three backends, one test suite (tests/renderers)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import RenderOutput
+
+# Constants that all backends share, so that they can be compared pixel by pixel (values of gsplat 1.5).
+BLUR = 0.3  # pixels² added to the diagonal of the projected covariance
+ALPHA_MIN = 1.0 / 255.0  # a contribution below this is skipped
+ALPHA_MAX = 0.999  # alpha is clamped here; its gradient is zero where it is
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance would fall to this
+FOV_MARGIN = 0.3  # the Jacobian's x/z and y/z are clamped at the image border plus this times half the field of view
+
+BACKENDS = ("reference", "cpu", "gsplat")
+
+
+@dataclass(frozen=True)
+class RenderInputs:
+    """Checked arguments of ``rasterization`` in one shape: opacities [M, N], modality_channels a tuple of M counts."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor | Callable[[Tensor], Tensor]
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+    near: float
+    far: float
+    background: Tensor | None
+    antialiased: bool
+    modality_channels: tuple[int, ...] | None
+    absgrad: bool
+    depth: bool
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor | Callable[[Tensor], Tensor],
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    far: float = 1e10,
+    background: Tensor | None = None,
+    antialiased: bool = False,
+    modality_channels: Sequence[int] | None = None,
+    backend: str = "auto",
+    absgrad: bool = False,
+    depth: bool = True,
+) -> RenderOutput:
+    """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
+
+    **Convention:** OpenCV axes; ``viewmats`` maps world to camera; pixel centres at +0.5; quaternions wxyz, any length but
+    zero; front to back in order of camera z, equal depths in order of index.
+
+    Args:
+        means: [N, 3] centres.
+        quats: [N, 4] rotations wxyz; normalised inside; a zero quaternion hides its Gaussian.
+        scales: [N, 3] semi-axes, not their logarithms.
+        opacities: [N], or [M, N] for M modalities that share geometry, projection and depth order.
+        features: [N, C], or a function from the visible ids [n] int64 to [n, C], called once after projection.
+        viewmats: [4, 4] world to camera.
+        Ks: [3, 3] intrinsics in pixels.
+        width, height: image size in pixels.
+        near, far: Gaussians whose camera z lies outside are not seen.
+        background: [C] added behind what is left of the transmittance; None is black.
+        antialiased: scales opacity by the square root of det(covariance) / det(blurred covariance) (Mip-Splatting, 2D).
+        modality_channels: how many of the C channels each modality composites, M counts with sum C. Default: all in one
+            (M = 1).
+        backend: "reference" (float64-able oracle), "cpu", "gsplat" (CUDA), or "auto" by the device of ``means``.
+        absgrad: also gather the sum of absolute values of the screen gradients in ``meta["means2d"].absgrad``.
+        depth: composite the depth of the first modality as well.
+
+    Returns:
+        RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
+
+    Raises:
+        ValueError: shapes do not fit together, or the backend is unknown.
+        ImportError: the backend is gsplat and it is not installed (the message says how to get it).
+    """
+    n = means.shape[0]
+    for name, tensor, shape in (("means", means, (n, 3)), ("quats", quats, (n, 4)), ("scales", scales, (n, 3))):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
+    if opacities.ndim == 1:
+        opacities = opacities[None]
+    if opacities.ndim != 2 or opacities.shape[1] != n:
+        raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
+    if isinstance(features, Tensor) and (features.ndim != 2 or features.shape[0] != n):
+        raise ValueError(f"features must have shape [{n}, C], got {list(features.shape)}")
+    if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
+        raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
+    if opacities.shape[0] > 1 and modality_channels is None:
+        raise ValueError(f"{opacities.shape[0]} opacity sets need modality_channels, such as (3, 1)")
+    if modality_channels is not None and len(modality_channels) != opacities.shape[0]:
+        raise ValueError(f"modality_channels {tuple(modality_channels)} must name {opacities.shape[0]} counts")
+    if width < 1 or height < 1:
+        raise ValueError(f"image must have pixels, got {width} x {height}")
+    if backend == "auto":
+        backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
+    inputs = RenderInputs(
+        means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
+        background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth,
+    )  # fmt: skip
+    return import_module(f"heatsplat.renderers.{backend}").render(inputs)

@@ -1,0 +1,55 @@
+"""What a camera does to a clean image: a chain of small parts, each the identity at first and bounded always."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from heatsplat.contracts import Frame, SceneData
+
+
+class SensorPart(nn.Module, ABC):
+    """One effect of a camera. One part is one file with one subclass and one entry in a list in conf/sensor/."""
+
+    lr: float = 1e-3
+
+    def prepare(self, scene: SceneData) -> None:
+        """Takes sizes (number of frames, image shape) from the scene. Called once, before training."""
+        return
+
+    @abstractmethod
+    def forward(self, image: Tensor, frame: Frame) -> Tensor:
+        """The image that the camera records of the clean ``image`` [H, W, C]; identity before training."""
+
+    def regulariser(self) -> Tensor | None:
+        """A weighted scalar added to the loss, or None."""
+        return None
+
+
+class SensorChain(nn.Module):
+    """Parts in the order in which light meets them. An empty chain is absent: it returns the very tensor it was given.
+
+    Args:
+        parts: name -> part.
+    """
+
+    def __init__(self, parts: Mapping[str, SensorPart] | None = None) -> None:
+        super().__init__()
+        self.parts = nn.ModuleDict(parts or {})
+
+    def prepare(self, scene: SceneData) -> None:
+        for part in self.parts.values():
+            part.prepare(scene)
+
+    def forward(self, image: Tensor, frame: Frame) -> Tensor:
+        """The recorded image [H, W, C] of a clean one."""
+        for part in self.parts.values():
+            image = part(image, frame)
+        return image
+
+    def regularisers(self) -> dict[str, Tensor]:
+        """Regularisers of the parts by name, absent ones left out."""
+        terms = {name: part.regulariser() for name, part in self.parts.items()}
+        return {name: term for name, term in terms.items() if term is not None}

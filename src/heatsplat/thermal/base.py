@@ -1,0 +1,142 @@
+"""The contract of a thermal model: what a splat emits, seen from a camera at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import Camera, Environment, SceneData, SceneError
+from heatsplat.splats import Splats
+
+
+@dataclass(frozen=True)
+class Query:
+    """What is asked of a thermal model: these Gaussians, from this camera, at this time.
+
+    Args:
+        ids: [n] int64 indices of the Gaussians in view, or None for all of them.
+        camera: the camera that looks.
+        time_s: float64 seconds since the first training frame, or None.
+        environment: weather at that time, or None.
+        frame_id: id of the frame, or None for a view that no one took.
+    """
+
+    ids: Tensor | None = None
+    camera: Camera | None = None
+    time_s: float | None = None
+    environment: Environment | None = None
+    frame_id: int | None = None
+
+    def rows(self, tensor: Tensor) -> Tensor:
+        """The rows of a per-Gaussian tensor that are asked for, [n, ...]."""
+        return tensor if self.ids is None else tensor.index_select(0, self.ids)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Moved geometry of a deforming model, for all N Gaussians: means [N, 3], quats [N, 4], scales [N, 3]."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+
+
+@dataclass(frozen=True)
+class Emission:
+    """What splats emit: ``features`` [n, C] in image units."""
+
+    features: Tensor
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """What is known of the Gaussians before training: positions and the image values seen there.
+
+    Args:
+        means: [N, 3] positions.
+        values: [N, C] mean image value at the projections of each point, in [0, 1].
+        generator: for models that start from random numbers.
+    """
+
+    means: Tensor
+    values: Tensor
+    generator: torch.Generator
+
+
+@dataclass(frozen=True)
+class PerGaussian:
+    """A tensor that every Gaussian carries for a thermal model.
+
+    Args:
+        initial: [N, ...] starting values.
+        lr: learning rate.
+        l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled weight
+            decay of 2 * l2 is exactly its gradient).
+    """
+
+    initial: Tensor
+    lr: float
+    l2: float = 0.0
+
+
+class ThermalModel(nn.Module, ABC):
+    """What a splat emits. One model is one file with one subclass and one yaml in conf/thermal/.
+
+    Class attributes:
+        needs: metadata the model cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
+        modality: the image that it explains, "thermal" or "rgb".
+        modality_channels: channels of each opacity set, such as (1,); their sum is the number of features.
+    """
+
+    needs: frozenset[str] = frozenset()
+    modality: str = "thermal"
+    modality_channels: tuple[int, ...] = (1,)
+
+    def check(self, scene: SceneData) -> None:
+        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``."""
+        missing = sorted(self.needs - scene.metadata)
+        if missing:
+            raise SceneError(
+                f"{type(self).__name__} needs {', '.join(missing)}, which scene '{scene.name}' does not have "
+                f"(it has: {', '.join(sorted(scene.metadata)) or 'images only'}). Choose a method that does without, "
+                "or give the data set the missing metadata."
+            )
+
+    @abstractmethod
+    def prepare(self, scene: SceneData) -> None:
+        """Takes constants (time grids, ranges) from the scene into buffers. Called once, before anything else."""
+
+    @abstractmethod
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        """The tensors that every Gaussian carries for this model, by the name under which they live in Splats."""
+
+    @abstractmethod
+    def features(self, splats: Splats, query: Query) -> Emission:
+        """What the Gaussians in ``query.ids`` emit. Evaluates those only."""
+
+    def geometry(self, splats: Splats, query: Query) -> Geometry | None:
+        """Moved geometry at ``query.time_s`` for deforming models; None means that splats stay where they are."""
+        return None
+
+    def on_step(self, step: int) -> None:
+        """Told the training step before it runs, for schedules such as the degree of spherical harmonics."""
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        """Extra loss terms by name, each a weighted scalar with a gradient. Penalties x² belong in PerGaussian.l2."""
+        return {}
+
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        """Temperature of every Gaussian in kelvin at a time, [N]; None where the model has no temperature."""
+        return None
+
+    def effects(self) -> dict[str, dict]:
+        """The physical effects that the model simulates, by catalogue name, each with its settings (for metrics.json)."""
+        return {}
+
+    @property
+    @abstractmethod
+    def cost(self) -> int:
+        """Multiply-adds per Gaussian and view."""
