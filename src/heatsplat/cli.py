@@ -1,0 +1,96 @@
+"""The command line: composes a configuration with Hydra, builds the parts, runs one job. Only this file imports Hydra.
+
+Only Hydra is imported before the configuration is composed, so that --help, --cfg and typing errors answer at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import traceback
+from collections.abc import Callable
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+ROOT = Path(__file__).resolve().parents[2]
+CONF = str(ROOT / "conf")
+FAILED = "FAILED"
+
+log = logging.getLogger("heatsplat")
+
+
+def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
+    """A fraction of max_steps as a whole number of steps, at least ``minimum``."""
+    return max(int(minimum), round(float(fraction) * int(_root_.max_steps)))
+
+
+def _scene_name(data: str, root: str | None, scene: str | None) -> str:
+    """Name of the scene in the run's folder: data.scene, else the last folder of data.root, else the data set."""
+    name = scene or (Path(root).name if root else None) or data
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in str(name))
+
+
+OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
+OmegaConf.register_new_resolver("steps", _steps, replace=True)
+OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
+
+
+def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
+    """Runs ``work(config, output_dir)`` so that a failure leaves a FAILED file and a readable message.
+
+    In a sweep the exception goes on to Hydra, which runs the other jobs; a single run ends with exit code 1.
+    """
+
+    @wraps(work)
+    def job(config: DictConfig) -> Any:
+        hydra_config = HydraConfig.get()
+        output_dir = Path(hydra_config.runtime.output_dir)
+        (output_dir / FAILED).unlink(missing_ok=True)
+        try:
+            return work(config, output_dir)
+        except Exception as error:
+            (output_dir / FAILED).write_text(traceback.format_exc())
+            cause = _expected(error)
+            if hydra_config.mode == RunMode.MULTIRUN or cause is None:
+                raise
+            log.error("%s: %s", type(cause).__name__, cause)
+            sys.exit(1)
+
+    return job
+
+
+def _expected(error: BaseException) -> BaseException | None:
+    """The error behind ``error`` that is the user's to mend and needs no traceback, or None."""
+    from heatsplat.contracts import SceneError
+
+    while error is not None:
+        if isinstance(error, SceneError | FileNotFoundError | ImportError | FloatingPointError):
+            return error
+        error = error.__cause__
+    return None
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="train")
+@_job
+def train(config: DictConfig, output_dir: Path) -> float | None:
+    """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
+    from heatsplat.io.results import METRICS_FILE, RunResults
+    from heatsplat.training.session import fit, prepare_machine
+
+    if (output_dir / METRICS_FILE).exists():
+        log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
+        return RunResults.read(output_dir / METRICS_FILE).test.get("psnr")
+
+    prepare_machine(config.threads)
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    build = partial(hydra.utils.instantiate, _convert_="all")
+    trainer = build(plain["trainer"], callbacks=list(build(plain["callbacks"]).values()), logger=build(plain["logger"]))
+    module = build(plain["module"], config=plain, output_dir=str(output_dir))
+    results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
+    return results.test.get("psnr")

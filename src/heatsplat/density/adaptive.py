@@ -1,0 +1,133 @@
+"""Adaptive density control, the standard recipe of 3D Gaussian Splatting (Kerbl et al. 2023, section 5), with a cap."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.ops import Cloud
+from heatsplat.geometry.rotations import quats_to_rotations
+
+SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian (Kerbl et al. 2023)
+
+
+class Adaptive(DensityControl):
+    """Clones small and splits large Gaussians whose screen position still pulls, prunes those that are transparent.
+
+    The statistic is the norm of the loss gradient with respect to the screen position in normalised device coordinates
+    (two units per image side), averaged over the views since the last refinement that saw the Gaussian.
+
+    Args:
+        start, stop: first and last step at which Gaussians are added or removed.
+        every: steps between refinements.
+        grad_threshold: growth above this mean gradient (per NDC unit).
+        clone_scale: Gaussians with a largest semi-axis up to this (times extent) are cloned, larger ones split.
+        prune_opacity: Gaussians below this opacity (in every modality) are removed.
+        prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
+        reset_every: steps between opacity resets; none at or after ``stop``.
+        reset_opacity: opacities are lowered to at most this.
+        cap_max: never more Gaussians than this; the strongest gradients grow first.
+        absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
+    """
+
+    def __init__(
+        self,
+        start: int = 500,
+        stop: int = 15_000,
+        every: int = 100,
+        grad_threshold: float = 2e-4,
+        clone_scale: float = 0.01,
+        prune_opacity: float = 0.005,
+        prune_scale: float = 0.1,
+        reset_every: int = 3000,
+        reset_opacity: float = 0.01,
+        cap_max: int = 100_000,
+        absgrad: bool = False,
+    ) -> None:
+        if every < 1 or reset_every < 1 or cap_max < 1:
+            raise ValueError(
+                f"density.every, reset_every and cap_max must be at least 1, got {every}, {reset_every}, {cap_max}"
+            )
+        self.start, self.stop, self.every = start, stop, every
+        self.grad_threshold, self.clone_scale = grad_threshold, clone_scale
+        self.prune_opacity, self.prune_scale = prune_opacity, prune_scale
+        self.reset_every, self.reset_opacity = reset_every, reset_opacity
+        self.cap_max, self.absgrad = cap_max, absgrad
+
+    def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
+        """ "gradient" [N], the sum of gradient norms, and "seen" [N], the number of views that saw the Gaussian."""
+        return {"gradient": torch.zeros(count, device=device), "seen": torch.zeros(count, device=device)}
+
+    @torch.no_grad()
+    def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
+        if step >= self.stop:
+            return
+        means2d, ids = output.meta["means2d"], output.meta["visible_ids"]
+        pull = means2d.absgrad if self.absgrad else means2d.grad
+        if pull is None:
+            return
+        pull = pull[ids] * pull.new_tensor([camera.width / 2, camera.height / 2])
+        state["gradient"].index_add_(0, ids, pull.norm(dim=1))
+        state["seen"].index_add_(0, ids, torch.ones_like(ids, dtype=state["seen"].dtype))
+
+    @torch.no_grad()
+    def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
+        added = removed = 0
+        due = self.start <= step < self.stop and (step + 1) % self.every == 0
+        if due:
+            added = self._grow(cloud, extent, generator)
+            removed = self._prune(cloud, step, extent)
+            for statistic in cloud.state.values():
+                statistic.zero_()
+        reset = 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
+        if reset:
+            ceiling = torch.logit(torch.tensor(self.reset_opacity)).item()
+            cloud.overwrite("opacity_logits", cloud.splats["opacity_logits"].clamp(max=ceiling))
+        return DensityChange(added, removed, reset) if due or reset else None
+
+    def _grow(self, cloud: Cloud, extent: float, generator: torch.Generator) -> int:
+        pull = cloud.state["gradient"] / cloud.state["seen"].clamp(min=1)
+        grow = pull > self.grad_threshold
+        room = max(0, self.cap_max - len(cloud))
+        if int(grow.sum()) > room:  # one more Gaussian each, whether it is cloned or split
+            strongest = pull.argsort(descending=True, stable=True)[:room]
+            grow = torch.zeros_like(grow)
+            grow[strongest] = True
+        large = cloud.splats.scales.amax(dim=1) > self.clone_scale * extent
+        clones, splits = (grow & ~large).nonzero().squeeze(1), (grow & large).nonzero().squeeze(1)
+        if len(clones):
+            cloud.append(cloud.rows(clones))
+        if len(splits):
+            halves = self._halves(cloud, splits, generator)
+            keep = torch.ones(len(cloud), dtype=torch.bool, device=pull.device)
+            keep[splits] = False
+            cloud.keep(keep)
+            cloud.append(halves)
+        return len(clones) + len(splits)
+
+    @staticmethod
+    def _halves(cloud: Cloud, ids: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """Two Gaussians for each of ``ids``, drawn from it and smaller by 1.6; everything else is inherited."""
+        rows = {name: tensor.repeat(2, *[1] * (tensor.ndim - 1)) for name, tensor in cloud.rows(ids).items()}
+        draw = torch.randn(rows["means"].shape, generator=generator, dtype=rows["means"].dtype).to(rows["means"].device)
+        rotations = quats_to_rotations(rows["quats"])
+        rows["means"] += torch.einsum("nij,nj->ni", rotations, draw * rows["log_scales"].exp())
+        rows["log_scales"] -= torch.log(torch.tensor(SPLIT_SHRINK)).item()
+        return rows
+
+    def _prune(self, cloud: Cloud, step: int, extent: float) -> int:
+        keep = (cloud.splats.opacities > self.prune_opacity).any(dim=0)
+        if step + 1 > self.reset_every:
+            keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
+        keep &= torch.isfinite(cloud.splats.means).all(dim=1)
+        removed = int((~keep).sum())
+        if removed == len(cloud):
+            raise RuntimeError(
+                f"density control would remove all {removed} Gaussians at step {step}: every opacity is below "
+                f"{self.prune_opacity}. Lower the learning rates or density.prune_opacity, or start from more points."
+            )
+        if removed:
+            cloud.keep(keep)
+        return removed

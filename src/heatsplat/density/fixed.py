@@ -1,0 +1,9 @@
+"""Density control that leaves the Gaussians as they are."""
+
+from __future__ import annotations
+
+from heatsplat.density.base import DensityControl
+
+
+class Fixed(DensityControl):
+    """No Gaussian is added or removed; no statistic is kept."""

@@ -1,0 +1,78 @@
+"""A renderer as a run uses it: the rasterisation function with its settings fixed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Camera, RenderOutput, SceneData
+from heatsplat.renderers.base import BACKENDS, rasterization
+
+
+class Renderer:
+    """``rasterization`` with the settings of a run.
+
+    Args:
+        backend: "auto", "cpu", "gsplat" or "reference".
+        antialiased: compensates opacity for the screen blur (Mip-Splatting's 2D filter).
+        near, far: visible range of camera z in world units.
+        background: what lies behind the splats: "ambient" (the ambient temperature where the scene has one, black where
+            not), or an image value in [0, 1].
+    """
+
+    def __init__(
+        self,
+        backend: str = "auto",
+        antialiased: bool = False,
+        near: float = 0.01,
+        far: float = 1e10,
+        background: str | float = "ambient",
+    ) -> None:
+        if backend not in ("auto", *BACKENDS):
+            raise ValueError(f"renderer.backend '{backend}' is unknown; choose auto, {', '.join(BACKENDS)}")
+        if isinstance(background, str) and background != "ambient":
+            raise ValueError(f"renderer.background must be 'ambient' or a number in [0, 1], got '{background}'")
+        self.backend, self.antialiased, self.near, self.far = backend, antialiased, near, far
+        self.background = background
+
+    def background_of(self, scene: SceneData, modality: str) -> float:
+        """Image value behind the splats of a scene, in [0, 1]."""
+        if self.background != "ambient":
+            return float(self.background)
+        if modality != "thermal" or scene.thermal_range is None or scene.ambient_c is None:
+            return 0.0
+        return min(1.0, max(0.0, scene.thermal_range.to_unit(scene.ambient_c)))
+
+    def __call__(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features,
+        camera: Camera,
+        background: Tensor | None,
+        modality_channels: tuple[int, ...],
+        absgrad: bool = False,
+        depth: bool = False,
+    ) -> RenderOutput:
+        """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``."""
+        return rasterization(
+            means,
+            quats,
+            scales,
+            opacities,
+            features,
+            camera.viewmat.to(torch.float32),
+            camera.K.to(torch.float32),
+            camera.width,
+            camera.height,
+            near=self.near,
+            far=self.far,
+            background=background,
+            antialiased=self.antialiased,
+            modality_channels=modality_channels,
+            backend=self.backend,
+            absgrad=absgrad,
+            depth=depth,
+        )

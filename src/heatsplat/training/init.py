@@ -1,0 +1,114 @@
+"""Splats before the first step: where they are, how large, and what image value they start from."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from heatsplat.contracts import SceneData, SceneError
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
+from heatsplat.training.rng import generator_for
+
+log = logging.getLogger(__name__)
+
+NEIGHBOURS = 3  # a new splat is as large as the distance to its nearest points (Kerbl et al. 2023)
+MIN_SQUARED_DISTANCE = 1e-7
+SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
+
+
+class Initialisation:
+    """How splats start.
+
+    Args:
+        source: "sfm" takes the scene's points, "random" draws ``count`` of them in the box of the points.
+        count: number of Gaussians drawn by "random"; for "sfm", points beyond this many are left out (evenly spread by a
+            seeded draw). None takes all points.
+        opacity: initial opacity in (0, 1).
+        scale: factor on the initial size.
+    """
+
+    def __init__(self, source: str = "sfm", count: int | None = None, opacity: float = 0.1, scale: float = 1.0) -> None:
+        if source not in ("sfm", "random"):
+            raise ValueError(f"init.source must be 'sfm' or 'random', got '{source}'")
+        if not 0 < opacity < 1:
+            raise ValueError(f"init.opacity must lie in (0, 1), got {opacity}")
+        self.source, self.count, self.opacity, self.scale = source, count, opacity, scale
+
+    def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
+        means = self._means(scene, generator_for(seed, 0, "init"))
+        values = image_values_at(scene, means, thermal.modality, thermal.modality_channels[0])
+        declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+        squared = neighbour_distances(means).square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
+        count = len(means)
+        logit = torch.logit(torch.tensor(self.opacity))
+        tensors = {
+            "means": means,
+            "log_scales": (0.5 * squared.log() + np.log(self.scale))[:, None].repeat(1, 3),
+            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            "opacity_logits": logit.repeat(count, len(thermal.modality_channels)),
+        }
+        return Splats(tensors | {name: item.initial for name, item in declared.items()}), declared
+
+    def _means(self, scene: SceneData, generator: torch.Generator) -> Tensor:
+        points = scene.points.float()
+        if self.source == "random":
+            count = self.count or 100_000
+            low, high = torch.quantile(points, torch.tensor([0.01, 0.99]), dim=0)
+            return low + (high - low) * torch.rand(count, 3, generator=generator)
+        if len(points) < NEIGHBOURS + 1:
+            raise SceneError(
+                f"scene '{scene.name}' has {len(points)} points, at least {NEIGHBOURS + 1} are needed to start from; "
+                "use init=random."
+            )
+        if self.count is not None and len(points) > self.count:
+            points = points[torch.randperm(len(points), generator=generator)[: self.count].sort().values]
+        return points
+
+
+def neighbour_distances(points: Tensor) -> Tensor:
+    """Distances from each point to its three nearest others, [P, 3]; fewer columns when there are fewer points."""
+    array = points.numpy().astype(np.float64)
+    k = min(NEIGHBOURS, len(array) - 1)
+    distances, _ = cKDTree(array).query(array, k=k + 1, workers=1)
+    return torch.from_numpy(distances[:, 1:]).float()
+
+
+def image_values_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:
+    """Median image value at the projections of points over the training views that see them, [P, channels] in [0, 1].
+
+    Points that no view sees get the median of the others. No test for occlusion: the median over views stands it.
+    """
+    positions = np.unique(
+        np.linspace(0, len(scene.train) - 1, min(SAMPLED_VIEWS, len(scene.train))).round().astype(int)
+    )
+    samples = torch.full((len(positions), len(points), channels), float("nan"))
+    for row, position in enumerate(positions):
+        view = scene.train[int(position)]
+        image, camera = view.image(modality), view.camera
+        local = points.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        pixels = local @ camera.K.T
+        column = (pixels[:, 0] / pixels[:, 2]).floor()
+        line = (pixels[:, 1] / pixels[:, 2]).floor()
+        seen = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
+        ids = seen.nonzero().squeeze(1)
+        at_line, at_column = line[ids].long(), column[ids].long()
+        if view.mask is not None:
+            valid = view.mask[at_line, at_column]
+            ids, at_line, at_column = ids[valid], at_line[valid], at_column[valid]
+        values = image[at_line, at_column]
+        samples[row, ids] = values if values.shape[1] == channels else values.mean(1, keepdim=True).expand(-1, channels)
+    medians = samples.nanmedian(dim=0).values
+    unseen = medians.isnan().any(1)
+    if unseen.all():
+        raise SceneError(
+            f"none of the {len(points)} points of scene '{scene.name}' lies in any training view: points and cameras are "
+            "in different coordinate systems"
+        )
+    medians[unseen] = medians[~unseen].median(0).values
+    return medians

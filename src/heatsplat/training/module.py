@@ -1,0 +1,226 @@
+"""The LightningModule: one view, one render, one loss, one step of one optimiser. It knows no variant by name."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Frame, RenderOutput, SceneData, SceneError, View
+from heatsplat.density.base import DensityControl
+from heatsplat.density.ops import Cloud
+from heatsplat.io.results import RunResults
+from heatsplat.losses.compose import Loss, LossInputs
+from heatsplat.renderers.settings import Renderer
+from heatsplat.sensors.base import SensorChain
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Query, ThermalModel
+from heatsplat.training.init import Initialisation
+from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.rng import generator_for
+
+CHECKPOINT_KEY = "heatsplat"
+
+
+class SplatTraining(pl.LightningModule):
+    """Trains splats with a thermal model on the views of a scene.
+
+    Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``, ``output_dir``
+    and ``predict(frame)``.
+
+    Args:
+        thermal: what splats emit.
+        renderer: how splats become pixels.
+        sensor: what the camera does to the clean image.
+        density: how many Gaussians there are.
+        loss: what is minimised.
+        init: how splats start.
+        optim: learning rates and schedule.
+        seed: seed of every random draw.
+        config: the resolved configuration as plain containers; travels in the checkpoint, so that a checkpoint and its
+            data are enough to evaluate or render.
+        output_dir: folder of the run.
+    """
+
+    def __init__(
+        self,
+        thermal: ThermalModel,
+        renderer: Renderer,
+        sensor: SensorChain,
+        density: DensityControl,
+        loss: Loss,
+        init: Initialisation,
+        optim: Optimisation,
+        seed: int = 0,
+        config: dict[str, Any] | None = None,
+        output_dir: Path | str = ".",
+    ) -> None:
+        super().__init__()
+        self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
+        self.density, self.loss, self.init, self.optim = density, loss, init, optim
+        self.seed, self.config, self.output_dir = seed, config or {}, Path(output_dir)
+        self.modality = thermal.modality
+        self.results = RunResults()
+        self.scene: SceneData | None = None
+        self.splats: Splats | None = None
+        self._declared: dict = {}
+        self._density_state: dict[str, Tensor] = {}
+        self._rendered: tuple[RenderOutput, View] | None = None
+
+    # Set-up ------------------------------------------------------------------------------------------------------------
+
+    def setup(self, stage: str) -> None:
+        """Builds splats from the scene of the trainer's data module, once."""
+        if self.scene is None:
+            self.attach(self.trainer.datamodule.scene)
+
+    def attach(self, scene: SceneData) -> None:
+        """Builds everything whose size depends on the scene. Refuses a scene that lacks what the thermal model needs."""
+        self.thermal.check(scene)
+        self.scene = scene
+        self.thermal.prepare(scene)
+        self.sensor.prepare(scene)
+        self.splats, self._declared = self.init(scene, self.thermal, self.seed)
+        self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
+        background = self.renderer.background_of(scene, self.modality)
+        self.register_buffer("background", torch.full((sum(self.thermal.modality_channels),), background))
+
+    def on_fit_start(self) -> None:
+        if self.trainer.world_size > 1:
+            raise RuntimeError(
+                f"one scene trains on one device, but trainer.devices asks for {self.trainer.world_size}. "
+                "Use several devices by running several jobs side by side: add -m and launcher=joblib or launcher=slurm."
+            )
+        self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
+
+    def configure_optimizers(self):
+        groups = self.optim.geometry_groups(self.splats, self.scene.extent)
+        groups += [
+            {"params": [self.splats[name]], "name": name, "lr": item.lr, "weight_decay": 2 * item.l2}
+            for name, item in self._declared.items()
+        ]
+        groups += [
+            {"params": [parameter], "name": f"thermal.{name}", "lr": self.thermal.lr}
+            for name, parameter in self.thermal.named_parameters()
+        ]
+        groups += [
+            {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr}
+            for name, part in self.sensor.parts.items()
+            for inner, parameter in part.named_parameters()
+        ]
+        optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    # One step ----------------------------------------------------------------------------------------------------------
+
+    def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
+        """The clean image that the splats send to the camera of ``frame`` at its time."""
+        query = Query(None, frame.camera, frame.time_s, frame.environment, frame.frame_id)
+        moved = self.thermal.geometry(self.splats, query)
+        means, quats, scales = (
+            (self.splats.means, self.splats.quats, self.splats.scales)
+            if moved is None
+            else (moved.means, moved.quats, moved.scales)
+        )
+
+        def emitted(ids: Tensor) -> Tensor:
+            visible = Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id)
+            return self.thermal.features(self.splats, visible).features
+
+        return self.renderer(
+            means,
+            quats,
+            scales,
+            self.splats.opacities,
+            emitted,
+            frame.camera,
+            self.background,
+            self.thermal.modality_channels,
+            absgrad=absgrad,
+            depth=depth,
+        )
+
+    def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
+        step = self.global_step
+        view = view.to(self.device)
+        self.thermal.on_step(step)
+        output = self.render(view.frame, absgrad=self.density.absgrad)
+        prediction = self.sensor(output.features, view.frame)
+        inputs = LossInputs(
+            prediction, view.image(self.modality), view.mask, view, self.splats, step, self.trainer.max_steps
+        )
+        terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
+        self._rendered = (output, view)
+        return {"loss": sum(terms.values()), "terms": {name: term.detach() for name, term in terms.items()}}
+
+    def on_after_backward(self) -> None:
+        output, view = self._rendered
+        self.density.observe(self._density_state, output, view.camera, self.global_step)
+        self._rendered = None
+
+    def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
+        """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
+        step = self.global_step
+        optimizer.step(closure=optimizer_closure)
+        cloud = Cloud(self.splats, getattr(optimizer, "optimizer", optimizer), self._density_state)
+        self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
+
+    # Evaluation --------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def predict(self, frame: Frame) -> Tensor:
+        """The image that the camera would record of ``frame``, [H, W, C] in [0, 1]; this is what metrics score."""
+        return self.sensor(self.render(frame).features, frame).clamp(0, 1)
+
+    def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
+        start = time.perf_counter()
+        prediction = self.predict(view.frame)
+        if prediction.is_cuda:
+            torch.cuda.synchronize()
+        return {"view": view, "prediction": prediction, "seconds": time.perf_counter() - start}
+
+    test_step = validation_step
+
+    def transfer_batch_to_device(self, batch: View, device: torch.device, dataloader_idx: int) -> View:
+        return batch.to(device)
+
+    # Checkpoints -------------------------------------------------------------------------------------------------------
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint[CHECKPOINT_KEY] = {
+            "config": self.config,
+            "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
+        weights = checkpoint["state_dict"]
+        check_same_recipe(self, checkpoint)
+        self.splats.resize(weights["splats.raw.means"].shape[0])
+        for name, buffer in list(self.named_buffers()):
+            stored = weights.get(name)
+            if stored is not None and stored.shape != buffer.shape:
+                owner, _, leaf = name.rpartition(".")
+                setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
+        state = checkpoint[CHECKPOINT_KEY]["density_state"]
+        self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
+
+
+def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None:
+    """Raises SceneError when a checkpoint was written by another method than ``module`` trains."""
+    if CHECKPOINT_KEY not in checkpoint:
+        raise SceneError("the checkpoint was not written by heatsplat: it holds no 'heatsplat' entry")
+    stored = checkpoint[CHECKPOINT_KEY]["config"].get("name")
+    here = module.config.get("name")
+    names = {f"splats.raw.{name}" for name in module.splats.names}
+    found = {name for name in checkpoint["state_dict"] if name.startswith("splats.raw.")}
+    if stored != here or names != found:
+        difference = ", ".join(sorted(name.removeprefix("splats.raw.") for name in names ^ found)) or "none"
+        raise SceneError(
+            f"the checkpoint is of method '{stored}', this run is method '{here}' (tensors that differ: {difference}). "
+            f"Continue it with method={stored} and the settings it was trained with, or start without ckpt."
+        )

@@ -1,0 +1,54 @@
+"""Learning rates of the geometry and the schedule of a run; one Adam with one named group per tensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from heatsplat.splats import Splats
+
+
+class Optimisation:
+    """The optimiser's settings (defaults of 3D Gaussian Splatting).
+
+    Args:
+        means, log_scales, quats, opacity_logits: learning rates; that of the means is multiplied by the scene's extent.
+        means_end: factor on the means' learning rate at the last step; log-linear in between.
+        betas, eps: of Adam.
+    """
+
+    def __init__(
+        self,
+        means: float = 1.6e-4,
+        means_end: float = 0.01,
+        log_scales: float = 5e-3,
+        quats: float = 1e-3,
+        opacity_logits: float = 5e-2,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        self.means, self.means_end = means, means_end
+        self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
+        self.betas, self.eps = tuple(betas), eps
+
+    def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
+        """Parameter groups of the four geometry tensors."""
+        rates = {
+            "means": self.means * extent,
+            "log_scales": self.log_scales,
+            "quats": self.quats,
+            "opacity_logits": self.opacity_logits,
+        }
+        return [{"params": [splats[name]], "name": name, "lr": lr} for name, lr in rates.items()]
+
+    def build(self, groups: list[dict[str, Any]], max_steps: int):
+        """The optimiser over all groups, and the scheduler to call after every step."""
+        optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
+        factors = [
+            (lambda step: self.means_end ** min(step / max(max_steps, 1), 1.0))
+            if group["name"] == "means"
+            else (lambda step: 1.0)
+            for group in optimizer.param_groups
+        ]
+        return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)

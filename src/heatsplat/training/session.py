@@ -1,0 +1,108 @@
+"""One run on one machine: threads, graceful interruption, fit, test."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import RunResults
+from heatsplat.training.module import SplatTraining
+
+log = logging.getLogger("heatsplat")
+
+# Lightning speaks of data loader workers, of its products and of a torch deprecation; none is the user's to act on.
+NOISE = (r".*does not have many workers.*", r".*LeafSpec.*", r".*`isinstance\(treespec.*", r".*Checkpoint directory.*")
+
+
+def prepare_machine(threads: int | None) -> None:
+    """Fixes the number of CPU threads (None takes all cores) and quietens messages that no user can act on."""
+    threads = threads or os.cpu_count() or 1
+    torch.set_num_threads(threads)
+    os.environ["NUMBA_NUM_THREADS"] = str(threads)
+    for pattern in NOISE:
+        warnings.filterwarnings("ignore", message=pattern)
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+
+
+class StopOnInterrupt(pl.Callback):
+    """Ends training after the current step when Ctrl-C was pressed, with a checkpoint that resumes; a second one aborts."""
+
+    def __init__(self) -> None:
+        self.interrupted = False
+
+    def ask(self, *_: Any) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
+        log.warning("Interrupted: finishing this step and writing a checkpoint. Press Ctrl-C again to abort at once.")
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        if self.interrupted:
+            trainer.should_stop = True
+
+    @contextmanager
+    def listening(self):
+        """Takes over Ctrl-C while the block runs (in the main thread; elsewhere the block just runs)."""
+        try:
+            before = signal.signal(signal.SIGINT, self.ask)
+        except ValueError:
+            yield
+            return
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
+def load_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The checkpoint as a dict of tensors and plain containers. Raises SceneError when there is none at ``path``."""
+    path = Path(path)
+    if not path.is_file():
+        there = sorted(str(p) for p in path.parent.glob("*.ckpt")) or sorted(str(p) for p in path.rglob("*.ckpt"))
+        raise SceneError(f"no checkpoint at {path}" + (f"; there are: {', '.join(there)}" if there else ""))
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise SceneError(f"{path} is not a checkpoint that can be read: {error}") from error
+
+
+def fit(
+    module: SplatTraining,
+    data: pl.LightningDataModule,
+    trainer: pl.Trainer,
+    ckpt: str | None = None,
+    test: bool = True,
+) -> RunResults:
+    """Trains, then tests; what was measured. After Ctrl-C the process ends with code 130 and says how to go on."""
+    if ckpt is not None:
+        load_checkpoint(ckpt)
+    stop = next(callback for callback in trainer.callbacks if isinstance(callback, StopOnInterrupt))
+    with stop.listening():
+        trainer.fit(module, datamodule=data, ckpt_path=ckpt)
+    if stop.interrupted:
+        last = module.output_dir / "checkpoints" / "last.ckpt"
+        trainer.save_checkpoint(last)
+        log.warning("Stopped at step %d. Go on with the same command and ckpt=%s", trainer.global_step, last)
+        sys.exit(130)
+    if test:
+        trainer.test(module, datamodule=data, verbose=False)
+    return module.results
+
+
+def restore(module: SplatTraining, data: pl.LightningDataModule, checkpoint: dict[str, Any]) -> SplatTraining:
+    """The module with the weights of a checkpoint, ready to predict views of the data module's scene."""
+    data.setup("test")
+    module.attach(data.scene)
+    module.on_load_checkpoint(checkpoint)
+    module.load_state_dict(checkpoint["state_dict"])
+    return module.eval()
