@@ -26,8 +26,8 @@ class Initialisation:
 
     Args:
         source: "sfm" takes the scene's points, "random" draws ``count`` of them in the box of the points.
-        count: number of Gaussians drawn by "random"; for "sfm", points beyond this many are left out (evenly spread by a
-            seeded draw). None takes all points.
+        count: number of Gaussians drawn by "random"; for "sfm", points beyond this many are left out by a seeded
+            draw. None takes all points.
         opacity: initial opacity in (0, 1).
         scale: factor on the initial size.
     """
@@ -107,8 +107,8 @@ def image_values_at(scene: SceneData, points: Tensor, modality: str, channels: i
     unseen = medians.isnan().any(1)
     if unseen.all():
         raise SceneError(
-            f"none of the {len(points)} points of scene '{scene.name}' lies in any training view: points and cameras are "
-            "in different coordinate systems"
+            f"none of the {len(points)} points of scene '{scene.name}' lies in any training view: points and cameras "
+            "are in different coordinate systems"
         )
     medians[unseen] = medians[~unseen].median(0).values
     return medians

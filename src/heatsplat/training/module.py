@@ -29,8 +29,8 @@ CHECKPOINT_KEY = "heatsplat"
 class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
-    Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``, ``output_dir``
-    and ``predict(frame)``.
+    Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
+    ``output_dir`` and ``predict(frame)``.
 
     Args:
         thermal: what splats emit.
@@ -71,7 +71,7 @@ class SplatTraining(pl.LightningModule):
         self._density_state: dict[str, Tensor] = {}
         self._rendered: tuple[RenderOutput, View] | None = None
 
-    # Set-up ------------------------------------------------------------------------------------------------------------
+    # Set-up ------------------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
         """Builds splats from the scene of the trainer's data module, once."""
@@ -79,7 +79,7 @@ class SplatTraining(pl.LightningModule):
             self.attach(self.trainer.datamodule.scene)
 
     def attach(self, scene: SceneData) -> None:
-        """Builds everything whose size depends on the scene. Refuses a scene that lacks what the thermal model needs."""
+        """Builds all that depends on the scene. Refuses a scene that lacks what the thermal model needs."""
         self.thermal.check(scene)
         self.scene = scene
         self.thermal.prepare(scene)
@@ -93,7 +93,7 @@ class SplatTraining(pl.LightningModule):
         if self.trainer.world_size > 1:
             raise RuntimeError(
                 f"one scene trains on one device, but trainer.devices asks for {self.trainer.world_size}. "
-                "Use several devices by running several jobs side by side: add -m and launcher=joblib or launcher=slurm."
+                "Use several devices by jobs side by side: add -m and launcher=joblib or launcher=slurm."
             )
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
@@ -115,7 +115,7 @@ class SplatTraining(pl.LightningModule):
         optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    # One step ----------------------------------------------------------------------------------------------------------
+    # One step ----------------------------------------------------------------------------------------
 
     def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
@@ -169,7 +169,7 @@ class SplatTraining(pl.LightningModule):
         cloud = Cloud(self.splats, getattr(optimizer, "optimizer", optimizer), self._density_state)
         self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
 
-    # Evaluation --------------------------------------------------------------------------------------------------------
+    # Evaluation --------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def predict(self, frame: Frame) -> Tensor:
@@ -188,7 +188,7 @@ class SplatTraining(pl.LightningModule):
     def transfer_batch_to_device(self, batch: View, device: torch.device, dataloader_idx: int) -> View:
         return batch.to(device)
 
-    # Checkpoints -------------------------------------------------------------------------------------------------------
+    # Checkpoints -------------------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {

@@ -35,7 +35,7 @@ def prepare_machine(threads: int | None) -> None:
 
 
 class StopOnInterrupt(pl.Callback):
-    """Ends training after the current step when Ctrl-C was pressed, with a checkpoint that resumes; a second one aborts."""
+    """Ends training after the current step when Ctrl-C was pressed; a second Ctrl-C aborts at once."""
 
     def __init__(self) -> None:
         self.interrupted = False
