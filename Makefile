@@ -1,0 +1,54 @@
+# Every target sets up what it needs by itself: a virtual environment in .venv with a CPU build of torch.
+# CUDA instead of CPU:  make install CUDA=1        another interpreter:  make install PYTHON=python3.12
+
+PYTHON ?= python3
+VENV   := .venv
+RUN    := $(VENV)/bin/python
+READY  := $(VENV)/.ready
+
+# A folder of wheels that offers torch (PIP_FIND_LINKS) is used as it is; elsewhere uv picks the build for CPU or CUDA.
+LOCAL_TORCH := $(firstword $(wildcard $(addsuffix /torch-*.whl,$(PIP_FIND_LINKS))))
+TORCH_BUILD := $(if $(LOCAL_TORCH),,--torch-backend $(if $(CUDA),auto,cpu))
+EXTRAS      := dev$(if $(CUDA),$(comma)gsplat)
+comma       := ,
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-slow lint format bench tensorboard clean
+
+help:  ## list these targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(READY)  ## set up the environment and nothing else (CUDA=1 for a CUDA build of torch and gsplat)
+
+$(READY): pyproject.toml constraints/torch.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "heatsplat needs Python 3.11 or newer; '$(PYTHON)' is older. Try: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
+	@echo "Setting up $(VENV) (about a minute, 2 GB)"
+	@test -x $(RUN) || $(PYTHON) -m venv $(VENV)
+	@$(RUN) -m pip install -q --disable-pip-version-check uv
+	@UV_FIND_LINKS="$(PIP_FIND_LINKS)" $(RUN) -m uv pip install -q --python $(RUN) $(TORCH_BUILD) -c constraints/torch.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+demo: $(READY)  ## train ETGS on the embedded synthetic scene, about four minutes; ends with the metrics and a picture
+	@$(RUN) src/train.py method=etgs max_steps=3000 $(ARGS)
+
+test: $(READY)  ## run the tests
+	@$(RUN) -m pytest -m "not slow" $(ARGS)
+
+test-slow: $(READY)  ## run the tests that take minutes
+	@$(RUN) -m pytest -m slow $(ARGS)
+
+lint: $(READY)  ## check style and formatting
+	@$(RUN) -m ruff check . && $(RUN) -m ruff format --check .
+
+format: $(READY)  ## mend style and formatting
+	@$(RUN) -m ruff check --fix -q . ; $(RUN) -m ruff format -q .
+
+bench: $(READY)  ## time the renderer against its peers and its floor
+	@$(RUN) src/study.py study=renderer $(ARGS)
+
+tensorboard: $(READY)  ## look at all runs in TensorBoard
+	@$(VENV)/bin/tensorboard --logdir outputs
+
+clean:  ## remove the environment and caches (outputs/ stays)
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis build *.egg-info src/*.egg-info
