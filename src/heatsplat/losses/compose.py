@@ -1,0 +1,94 @@
+"""The loss of a run: named terms, each times a weight and a schedule, on or absent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from heatsplat.contracts import View
+from heatsplat.splats import Splats
+
+
+@dataclass(frozen=True)
+class LossInputs:
+    """What a loss term may look at in one training step.
+
+    Args:
+        prediction: [H, W, C] image after the sensor, with a gradient.
+        target: [H, W, C] image to reproduce, in [0, 1]; constant. Any value, NaN too, where the mask is False.
+        mask: [H, W] bool, True where a pixel counts; None means that all do.
+        view: the view that the images belong to.
+        splats: the Gaussians.
+        step: training step, from 0.
+        max_steps: length of the run in steps.
+        target_key: names the content of target and mask, so that terms may keep what they computed from them: equal
+            keys promise equal pixels. None, the default, promises nothing.
+    """
+
+    prediction: Tensor
+    target: Tensor
+    mask: Tensor | None
+    view: View
+    splats: Splats
+    step: int
+    max_steps: int
+    target_key: Hashable | None = None
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the run that is done, in [0, 1]."""
+        return min(self.step / max(self.max_steps, 1), 1.0)
+
+
+class LossTerm(Protocol):
+    """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term."""
+
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]: ...
+
+
+class Weighted:
+    """A term times a weight and a schedule; at weight zero the term is not even evaluated.
+
+    Args:
+        term: what is weighted.
+        weight: factor.
+        schedule: factor as a function of progress (heatsplat.losses.schedules), or None for constant 1.
+    """
+
+    def __init__(self, term: LossTerm, weight: float = 1.0, schedule: Callable[[float], float] | None = None) -> None:
+        self.term = term
+        self.weight = weight
+        self.schedule = schedule
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        factor = self.weight if self.schedule is None else self.weight * self.schedule(inputs.progress)
+        if factor == 0.0:
+            return {}
+        return {name: factor * value for name, value in _named(self.term(inputs)).items()}
+
+
+class Loss:
+    """The weighted scalars of all terms by name; their sum is the loss.
+
+    Args:
+        terms: name -> term, or None for a term that is absent.
+    """
+
+    def __init__(self, terms: Mapping[str, LossTerm | None]) -> None:
+        self.terms = {name: term for name, term in terms.items() if term is not None}
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        """Scalars by name: ``name`` of a term that returns a tensor, ``name/part`` of one that returns several."""
+        scalars: dict[str, Tensor] = {}
+        for name, term in self.terms.items():
+            for part, value in _named(term(inputs)).items():
+                scalars[f"{name}/{part}" if part else name] = value
+        return scalars
+
+
+def _named(values: Tensor | dict[str, Tensor]) -> dict[str, Tensor]:
+    """A term's values by name; a lone scalar has the empty name."""
+    return {"": values} if isinstance(values, Tensor) else values

@@ -1,0 +1,112 @@
+"""The photometric loss of 3D Gaussian splatting: (1 - w) L1 + w (1 - SSIM).
+
+The functions ``l1`` and ``ssim_map`` are plain torch and unreduced, so that callers mask and average as they need; they
+are also the oracle of the fused kernel that ``Photometric`` uses on the CPU.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.losses.compose import LossInputs
+
+WINDOW = 11  # taps of the Gaussian window
+SIGMA = 1.5  # its standard deviation in pixels
+C1, C2 = 0.01**2, 0.03**2  # stabilisers of the luminance and the contrast term for images in [0, 1]
+
+
+def window(dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    """The 11 taps of the SSIM window, a Gaussian of 1.5 pixels that sums to one."""
+    offsets = torch.arange(WINDOW, dtype=torch.float64, device=device) - WINDOW // 2
+    taps = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    return (taps / taps.sum()).to(dtype)
+
+
+def l1(prediction: Tensor, target: Tensor) -> Tensor:
+    """Absolute differences, [H, W, C]."""
+    return (prediction - target).abs()
+
+
+def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Structural similarity of every pixel, [H, W, C], at most 1 (Wang et al. 2004, Eq. 13).
+
+    **Convention:** 11x11 Gaussian window of 1.5 pixels; images in [0, 1]; pixels outside the image count as 0, and so
+    do masked ones: a masked pixel is one that lies outside. (Libraries that reflect or crop the border differ within 5
+    pixels of it.)
+
+    Variances are those of images from which the target's mean was taken away. Exact arithmetic would not notice (the
+    missing part of the window is accounted for), float32 does: E[x²] - E[x]² of a bright flat image is all rounding.
+
+    Args:
+        prediction, target: [H, W, C], floating point. Differentiable in both.
+        mask: [H, W] bool, True where a pixel counts.
+    """
+    channels = prediction.shape[-1]
+    inside = torch.ones_like(prediction) if mask is None else mask[..., None].expand_as(prediction).to(prediction)
+    shift = _mean(target.detach(), mask)
+    x = torch.where(inside > 0, prediction - shift, 0.0)
+    y = torch.where(inside > 0, target - shift, 0.0)
+    taps = window(prediction.dtype, prediction.device)
+
+    stacked = torch.stack((x, y, x * x, y * y, x * y, inside)).permute(0, 3, 1, 2)
+    horizontal = taps.expand(channels, 1, 1, WINDOW)
+    blurred = functional.conv2d(stacked, horizontal, padding=(0, WINDOW // 2), groups=channels)
+    blurred = functional.conv2d(blurred, horizontal.transpose(2, 3), padding=(WINDOW // 2, 0), groups=channels)
+    x_mean, y_mean, xx, yy, xy, covered = blurred.permute(0, 2, 3, 1)
+
+    outside = 1.0 - covered  # the share of the window that lies outside, where images minus shift are -shift
+    dx, dy = x_mean - shift * outside, y_mean - shift * outside
+    x_variance = xx + shift**2 * outside - dx * dx
+    y_variance = yy + shift**2 * outside - dy * dy
+    covariance = xy + shift**2 * outside - dx * dy
+    x_mean, y_mean = x_mean + shift * covered, y_mean + shift * covered
+    luminance = (2 * x_mean * y_mean + C1) / (x_mean**2 + y_mean**2 + C1)
+    return luminance * (2 * covariance + C2) / (x_variance + y_variance + C2)
+
+
+class Photometric:
+    """The terms "l1" and "dssim", weighted: (1 - w) mean|x - y| and w (1 - mean SSIM).
+
+    Means run over the channels of the pixels that count. Masked pixels neither contribute nor receive a gradient, and
+    SSIM windows see them as pixels outside the image, so cropping and masking are the same. Without a pixel that counts
+    both terms are 0.
+
+    Args:
+        dssim_weight: w in [0, 1]. At 0 SSIM is absent: not computed, not reported.
+        dssim_half: halves 1 - SSIM (ETGS, Eq. 36), so that it lies in [0, 1].
+
+    Raises:
+        ValueError: w is outside [0, 1]; or, when called, the images or the mask do not fit together.
+    """
+
+    def __init__(self, dssim_weight: float = 0.2, dssim_half: bool = False) -> None:
+        if not 0.0 <= dssim_weight <= 1.0:
+            raise ValueError(f"dssim_weight is a share of the loss in [0, 1], got {dssim_weight}")
+        self.l1_weight = 1.0 - dssim_weight
+        self.dssim_weight = 0.5 * dssim_weight if dssim_half else dssim_weight
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        prediction, target, mask = inputs.prediction, inputs.target, inputs.mask
+        if prediction.shape != target.shape or prediction.ndim != 3:
+            raise ValueError(
+                f"prediction and target must both be [H, W, C], got {list(prediction.shape)} and {list(target.shape)}"
+            )
+        if mask is not None and mask.shape != target.shape[:2]:
+            raise ValueError(f"mask must be {list(target.shape[:2])} like the images, got {list(mask.shape)}")
+        if mask is not None:
+            prediction = torch.where(mask[..., None], prediction, 0.0)
+            target = torch.where(mask[..., None], target, 0.0)
+        terms = {"l1": self.l1_weight * _mean(l1(prediction, target), mask).mean()}
+        if self.dssim_weight > 0.0:
+            dissimilarity = _mean(1.0 - ssim_map(prediction, target, mask), mask).mean()
+            terms["dssim"] = self.dssim_weight * dissimilarity
+        return terms
+
+
+def _mean(image: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean over the pixels that count, [C]; 0 where none does."""
+    if mask is None:
+        return image.mean((0, 1))
+    return torch.where(mask[..., None], image, 0.0).sum((0, 1)) / mask.sum().clamp(min=1)

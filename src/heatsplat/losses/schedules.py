@@ -1,0 +1,28 @@
+"""Weights that change over a run: functions of progress, the fraction of the run that is done, from 0 to 1.
+
+In config: ``{_target_: heatsplat.losses.schedules.linear, _partial_: true, start: 0.1, end: 0.4}``.
+"""
+
+from __future__ import annotations
+
+
+def constant(progress: float, value: float = 1.0) -> float:
+    """The same weight at every step."""
+    return value
+
+
+def linear(progress: float, start: float, end: float, before: float = 0.0, after: float = 1.0) -> float:
+    """The weight of a ramp: ``before`` until ``start``, then straight to ``after`` at ``end``, constant from there.
+
+    **Convention:** ``progress``, ``start`` and ``end`` are fractions of the run; start = end switches on at ``start``.
+
+    Raises:
+        ValueError: the ramp ends before it starts.
+    """
+    if end < start:
+        raise ValueError(f"linear ramp ends at {end} of the run, before it starts at {start}; swap start and end")
+    if progress < start:
+        return before
+    if progress >= end:
+        return after
+    return before + (after - before) * (progress - start) / (end - start)

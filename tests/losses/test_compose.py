@@ -1,0 +1,69 @@
+"""Loss composition: names, weights, schedules and absence."""
+
+import pytest
+import torch
+
+from heatsplat.losses import schedules
+from heatsplat.losses.compose import Loss, LossInputs, Weighted
+
+
+def at(step, max_steps=100):
+    image = torch.full((2, 2, 1), 3.0, requires_grad=True)
+    return LossInputs(image, torch.zeros(2, 2, 1), None, view=None, splats=None, step=step, max_steps=max_steps)
+
+
+def mean(inputs):
+    return inputs.prediction.mean()
+
+
+def parts(inputs):
+    return {"a": inputs.prediction.mean(), "b": 2 * inputs.prediction.mean()}
+
+
+def test_names_join_term_and_part():
+    values = Loss({"plain": mean, "photometric": parts})(at(0))
+    assert {name: value.item() for name, value in values.items()} == {
+        "plain": 3.0,
+        "photometric/a": 3.0,
+        "photometric/b": 6.0,
+    }
+
+
+def test_a_term_that_is_none_is_absent():
+    assert list(Loss({"plain": mean, "edge": None})(at(0))) == ["plain"]
+
+
+def test_weight_and_schedule_multiply():
+    ramp = Weighted(mean, weight=0.5, schedule=lambda progress: schedules.linear(progress, 0.2, 0.6))
+    assert Loss({"ramp": ramp})(at(40))["ramp"].item() == pytest.approx(3.0 * 0.5 * 0.5)
+
+
+def test_weight_zero_equals_absent():
+    def never(inputs):
+        pytest.fail("a term of weight zero was evaluated")
+
+    assert Loss({"off": Weighted(never, 0.0)})(at(0)) == {}
+    late = Weighted(never, 1.0, lambda progress: schedules.linear(progress, 0.5, 0.5))
+    assert Loss({"late": late})(at(49)) == {}
+    assert list(Loss({"late": Weighted(mean, 1.0, late.schedule)})(at(50))) == ["late"]
+
+
+@pytest.mark.parametrize("progress, expected", [(0.0, 2.0), (0.1, 2.0), (0.2, 2.5), (0.3, 3.0), (0.5, 4.0), (1.0, 4.0)])
+def test_linear_ramp(progress, expected):
+    assert schedules.linear(progress, 0.1, 0.5, before=2.0, after=4.0) == pytest.approx(expected)
+
+
+def test_constant_schedule():
+    assert schedules.constant(0.7) == 1.0
+    assert schedules.constant(0.7, 0.25) == 0.25
+
+
+def test_a_ramp_that_ends_before_it_starts_is_refused():
+    with pytest.raises(ValueError, match="ends at 0.1 of the run, before it starts at 0.4"):
+        schedules.linear(0.2, 0.4, 0.1)
+
+
+def test_progress_is_a_fraction_even_without_steps():
+    assert at(50, 200).progress == 0.25
+    assert at(5, 0).progress == 1.0
+    assert at(0, 0).progress == 0.0
