@@ -75,11 +75,13 @@ class PerGaussian:
         lr: learning rate.
         l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled weight
             decay of 2 * l2 is exactly its gradient).
+        l2_mean: divides l2 by the current number of Gaussians, so that the penalty is a mean over them instead of a sum.
     """
 
     initial: Tensor
     lr: float
     l2: float = 0.0
+    l2_mean: bool = False
 
 
 class ThermalModel(nn.Module, ABC):

@@ -1,0 +1,21 @@
+"""Kelvin and degrees Celsius. Physics is in kelvin; °C appears at files, metrics and pictures only."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from torch import Tensor
+
+KELVIN_AT_0_C = 273.15
+
+Temperature = TypeVar("Temperature", float, Tensor)
+
+
+def kelvin(celsius: Temperature) -> Temperature:
+    """Temperatures in kelvin of temperatures in °C; any shape, tensor or number."""
+    return celsius + KELVIN_AT_0_C
+
+
+def celsius(kelvin: Temperature) -> Temperature:
+    """Temperatures in °C of temperatures in kelvin; any shape, tensor or number."""
+    return kelvin - KELVIN_AT_0_C

@@ -1,0 +1,209 @@
+"""ETGS: every Gaussian relaxes to the ambient temperature (Newton) and is heated by a sum of harmonics, in closed form."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.physics.frequencies import default_tau_min, frequency_grid
+from heatsplat.physics.fused import visible_temperature
+from heatsplat.physics.units import kelvin
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+
+log = logging.getLogger(__name__)
+
+PARAMS = ("rate", "faithful")
+REDUCTIONS = ("sum", "mean_over_gaussians")
+CLIPS = ("straight_through", "hard", "none")
+INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
+LOG_RATES = (
+    -80.0,
+    30.0,
+)  # of the rate per span; wide enough to mean never and at once, narrow enough for float32 squares
+
+
+class NewtonHarmonic(ThermalModel):
+    """Emission of C dT/dt = -h (T - T_ambient) + Σ_k A_k sin ω_k t + B_k cos ω_k t (ETGS, ICLR 2026, Eq. 3-9).
+
+    Only h/C, A/C and B/C reach the image: scaling C, h, A and B together changes nothing but the penalty on A and B,
+    which an optimiser can so evade. ``param="rate"`` learns the three ratios; ``param="faithful"`` learns the paper's
+    four and fixes the scale by a weak prior that keeps C near 1.
+
+    **Convention:** inside, time is counted in observed spans and temperature in image units u = (T - Tmin)/(Tmax -
+    Tmin); so are rates and gains, and so is the penalty. A scene without a range is modelled in image values, with no
+    temperature in kelvin.
+
+    Tensors: "initial_state" [N], "source_gains" [N, 2, K] (sin, cos; absent without frequencies) and "log_rate" [N], or
+    "log_capacity" [N] and "log_conductance" [N] in faithful form.
+
+    Args:
+        frequencies: harmonics asked for; the grid may hold fewer. 0 is pure relaxation, without any tensor of a source.
+        param: "rate" or "faithful".
+        tau_min_s: shortest time constant in seconds that bounds the frequencies; None takes max(median gap, span /
+            200).
+        frequency_gain: steady-state amplitude below which a frequency is left out, in (0, 1].
+        source_l2: weight of the penalty on gains.
+        l2_reduction: "sum" over Gaussians and frequencies (the paper; grows with the number of Gaussians) or
+            "mean_over_gaussians" (a sum over frequencies alone).
+        gauge_l2: weight of the prior (log C)² in faithful form.
+        ambient: "measured" (the scene's, else learned), "learned" (from the measured one, if any) or a number in °C.
+        clip: how values outside the range are shown: "straight_through" clamps values but lets gradients pass, so that
+            a Gaussian outside comes back; "hard" stops its gradient (the paper's Eq. 9); "none" shows them as they are.
+        lr_initial, lr_gain, lr_rate, lr_ambient: learning rates.
+
+    Raises:
+        ValueError: an option is unknown.
+    """
+
+    needs = frozenset({"time"})
+
+    def __init__(
+        self,
+        frequencies: int = 24,
+        param: str = "rate",
+        tau_min_s: float | None = None,
+        frequency_gain: float = math.sqrt(0.5),
+        source_l2: float = 1e-5,
+        l2_reduction: str = "sum",
+        gauge_l2: float = 1e-5,
+        ambient: str | float = "measured",
+        clip: str = "straight_through",
+        lr_initial: float = 2.5e-3,
+        lr_gain: float = 2.5e-3,
+        lr_rate: float = 5e-3,
+        lr_ambient: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (
+            ("param", param, PARAMS),
+            ("l2_reduction", l2_reduction, REDUCTIONS),
+            ("clip", clip, CLIPS),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        if isinstance(ambient, str) and ambient not in ("measured", "learned"):
+            raise ValueError(f"ambient must be measured, learned or a number in °C, got '{ambient}'")
+        self.frequencies, self.param = frequencies, param
+        self.tau_min_s, self.frequency_gain = tau_min_s, frequency_gain
+        self.source_l2, self.l2_mean, self.gauge_l2 = source_l2, l2_reduction == "mean_over_gaussians", gauge_l2
+        self.clip = clip
+        self.lr_initial, self.lr_gain, self.lr_rate, self.lr = lr_initial, lr_gain, lr_rate, lr_ambient
+        self._ambient_from = ambient
+        self._ambient_unknown = False
+        self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
+        self.register_buffer("span_s", torch.ones((), dtype=torch.float64))
+        self.register_buffer("range_c", torch.full((2,), torch.nan, dtype=torch.float64))
+        self.register_buffer("ambient", torch.tensor(0.5))
+
+    def prepare(self, scene: SceneData) -> None:
+        self.check(scene)
+        times = torch.tensor(scene.train.times_s, dtype=torch.float64)
+        span_s = (times.max() - times.min()).item()
+        if span_s > 0:
+            self.span_s.fill_(span_s)
+            tau_min_s = default_tau_min(times) if self.tau_min_s is None else self.tau_min_s
+            self.omega = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain) * span_s
+        else:
+            log.warning("scene '%s' shows one moment only: the model has no heat source", scene.name)
+        if scene.thermal_range is None:
+            log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
+        else:
+            self.range_c.copy_(torch.tensor([scene.thermal_range.min_c, scene.thermal_range.max_c]))
+        self._set_ambient(scene)
+
+    def _set_ambient(self, scene: SceneData) -> None:
+        celsius = scene.ambient_c if isinstance(self._ambient_from, str) else self._ambient_from
+        if not isinstance(self._ambient_from, str) and scene.thermal_range is None:
+            raise SceneError(
+                f"ambient={celsius} is in °C, but scene '{scene.name}' has no temperature range to relate it to; "
+                "use thermal.ambient=learned"
+            )
+        known = celsius is not None and scene.thermal_range is not None
+        learned = self._ambient_from == "learned" or not known
+        value = torch.tensor(scene.thermal_range.to_unit(celsius) if known else 0.5, dtype=torch.float32)
+        if learned:
+            if self._ambient_from == "measured":
+                log.warning("scene '%s' has no measured ambient temperature: it is learned", scene.name)
+            del self.ambient
+            self.ambient = nn.Parameter(value)
+        else:
+            self.ambient = value
+        self._ambient_unknown = not known
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        initial = seeds.values.mean(1)
+        count = initial.shape[0]
+        if self._ambient_unknown and count > 0:
+            with torch.no_grad():
+                self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
+        log_rate = torch.full_like(initial, math.log(INITIAL_RATE))
+        tensors = {"initial_state": PerGaussian(initial, self.lr_initial)}
+        if self.param == "rate":
+            tensors["log_rate"] = PerGaussian(log_rate, self.lr_rate)
+        else:
+            tensors["log_capacity"] = PerGaussian(torch.zeros_like(initial), self.lr_rate, self.gauge_l2, self.l2_mean)
+            tensors["log_conductance"] = PerGaussian(log_rate, self.lr_rate)
+        if self.omega.numel() > 0:
+            gains = initial.new_zeros(count, 2, self.omega.numel())
+            tensors["source_gains"] = PerGaussian(gains, self.lr_gain, self.source_l2, self.l2_mean)
+        return tensors
+
+    def features(self, splats: Splats, query: Query) -> Emission:
+        if query.time_s is None:
+            raise ValueError("a scene that changes needs the time at which it is seen: give time_s")
+        state = self._state(splats, query.time_s, query.ids)
+        if self.clip == "straight_through":
+            state = _StraightThroughClamp.apply(state)
+        elif self.clip == "hard":
+            state = state.clamp(0, 1)
+        return Emission(state[:, None])
+
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        if self.range_c.isnan().any():
+            return None
+        return kelvin(ThermalRange(*self.range_c.tolist()).to_celsius(self._state(splats, time_s, None)))
+
+    def _state(self, splats: Splats, time_s: float, ids: Tensor | None) -> Tensor:
+        """Temperature in image units of the Gaussians ``ids``, [n], not clipped."""
+        faithful = self.param == "faithful"
+        log_rate = splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"]
+        source = self.omega.numel() > 0
+        return visible_temperature(
+            torch.as_tensor(time_s, dtype=torch.float64, device=self.span_s.device) / self.span_s,
+            self.ambient,
+            splats["initial_state"],
+            log_rate.clamp(*LOG_RATES).exp(),
+            self.omega,
+            splats["source_gains"] if source else None,
+            torch.exp(-splats["log_capacity"]) if faithful and source else None,
+            ids,
+        )
+
+    def effects(self) -> dict[str, dict]:
+        ambient = "learned" if isinstance(self.ambient, nn.Parameter) else "fixed"
+        effects = {"relaxation": {"param": self.param, "ambient": ambient}}
+        if self.omega.numel() > 0:
+            effects["harmonic_source"] = {"frequencies": self.omega.numel()}
+        return effects
+
+    @property
+    def cost(self) -> int:
+        # One exponential and 4 operations for relaxation; per frequency 3 weights, 2 responses of 3 and 2 gains.
+        return 12 + 11 * self.omega.numel()
+
+
+class _StraightThroughClamp(torch.autograd.Function):
+    """Values clamped to [0, 1] with the gradient of the identity."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor) -> Tensor:
+        return values.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:
+        return grad
