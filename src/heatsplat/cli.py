@@ -23,6 +23,7 @@ CONF = str(ROOT / "conf")
 FAILED = "FAILED"
 
 log = logging.getLogger("heatsplat")
+build = partial(hydra.utils.instantiate, _convert_="all")
 
 
 def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
@@ -36,6 +37,15 @@ def _scene_name(data: str, root: str | None, scene: str | None) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in str(name))
 
 
+def _run_of(ckpt: str | None) -> str:
+    """Folder of the run that wrote a checkpoint; what is made of the checkpoint goes there."""
+    if ckpt is None:
+        return str(ROOT / "outputs")
+    folder = Path(ckpt).expanduser().resolve().parent
+    return str(folder.parent if folder.name == "checkpoints" else folder)
+
+
+OmegaConf.register_new_resolver("run_of", _run_of, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
 OmegaConf.register_new_resolver("steps", _steps, replace=True)
 OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
@@ -89,8 +99,70 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
 
     prepare_machine(config.threads)
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    build = partial(hydra.utils.instantiate, _convert_="all")
+    if plain["data"].get("root") is not None:
+        plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
     trainer = build(plain["trainer"], callbacks=list(build(plain["callbacks"]).values()), logger=build(plain["logger"]))
     module = build(plain["module"], config=plain, output_dir=str(output_dir))
     results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="evaluate")
+@_job
+def evaluate(config: DictConfig, output_dir: Path) -> float | None:
+    """Measures the test views of a checkpoint. Returns the test PSNR."""
+    from heatsplat.training.session import prepare_machine, restore
+
+    prepare_machine(config.threads)
+    module, data, stored = _restored(config, output_dir)
+    callbacks = build(OmegaConf.to_container(config.callbacks, resolve=True))
+    trainer = build(
+        stored["trainer"] | {"accelerator": config.accelerator},
+        callbacks=list(callbacks.values()),
+        logger=build(OmegaConf.to_container(config.logger, resolve=True)),
+    )
+    restore(module, data, stored["checkpoint"])
+    trainer.test(module, datamodule=data, verbose=False)
+    return module.results.test.get("psnr")
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="render")
+@_job
+def render(config: DictConfig, output_dir: Path) -> None:
+    """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
+    from rich.progress import track
+
+    from heatsplat.shots import develop, plan
+    from heatsplat.training.session import prepare_machine, restore
+
+    prepare_machine(config.threads)
+    module, data, stored = _restored(config, output_dir)
+    restore(module, data, stored["checkpoint"])
+    plain = OmegaConf.to_container(config, resolve=True)
+    frames = plan(module.scene, plain["trajectory"], plain["time"], plain["view"], plain["frames"])
+    images = (module.predict(frame).cpu() for frame in track(frames, "rendering"))
+    options = {key: plain[key] for key in ("tiff", "png", "video", "fps", "range_c")}
+    written = develop(images, frames, module.scene, output_dir, **options)
+    log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
+
+
+def _restored(config: DictConfig, output_dir: Path) -> tuple[Any, Any, dict[str, Any]]:
+    """Module and data module as the checkpoint's configuration describes them, and that configuration.
+
+    The configuration comes with the checkpoint itself under "checkpoint"; what ``config.data`` says wins unless null.
+    """
+    from heatsplat.contracts import SceneError
+    from heatsplat.training.module import CHECKPOINT_KEY
+    from heatsplat.training.session import load_checkpoint
+
+    if config.ckpt is None:
+        raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
+    checkpoint = load_checkpoint(config.ckpt)
+    if CHECKPOINT_KEY not in checkpoint:
+        raise SceneError(f"{config.ckpt} was not written by heatsplat")
+    stored = checkpoint[CHECKPOINT_KEY]["config"]
+    changed = {key: value for key, value in OmegaConf.to_container(config.data).items() if value is not None}
+    if "root" in changed:
+        changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    module = build(stored["module"], config=stored, output_dir=str(output_dir))
+    return module, build(stored["data"] | changed), {**stored, "checkpoint": checkpoint}

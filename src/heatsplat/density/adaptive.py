@@ -8,7 +8,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, RenderOutput
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
-from heatsplat.geometry.rotations import quats_to_rotations
+from heatsplat.geometry.rotations import quats_to_matrices
 
 SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian (Kerbl et al. 2023)
 
@@ -112,7 +112,7 @@ class Adaptive(DensityControl):
         """Two Gaussians for each of ``ids``, drawn from it and smaller by 1.6; everything else is inherited."""
         rows = {name: tensor.repeat(2, *[1] * (tensor.ndim - 1)) for name, tensor in cloud.rows(ids).items()}
         draw = torch.randn(rows["means"].shape, generator=generator, dtype=rows["means"].dtype).to(rows["means"].device)
-        rotations = quats_to_rotations(rows["quats"])
+        rotations = quats_to_matrices(rows["quats"])
         rows["means"] += torch.einsum("nij,nj->ni", rotations, draw * rows["log_scales"].exp())
         rows["log_scales"] -= torch.log(torch.tensor(SPLIT_SHRINK)).item()
         return rows

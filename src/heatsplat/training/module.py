@@ -18,7 +18,7 @@ from heatsplat.losses.compose import Loss, LossInputs
 from heatsplat.renderers.settings import Renderer
 from heatsplat.sensors.base import SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.rng import generator_for
@@ -67,7 +67,7 @@ class SplatTraining(pl.LightningModule):
         self.results = RunResults()
         self.scene: SceneData | None = None
         self.splats: Splats | None = None
-        self._declared: dict = {}
+        self._declared: dict[str, PerGaussian] = {}
         self._density_state: dict[str, Tensor] = {}
         self._rendered: tuple[RenderOutput, View] | None = None
 
@@ -100,7 +100,7 @@ class SplatTraining(pl.LightningModule):
     def configure_optimizers(self):
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
         groups += [
-            {"params": [self.splats[name]], "name": name, "lr": item.lr, "weight_decay": 2 * item.l2}
+            {"params": [self.splats[name]], "name": name, "lr": item.lr, "weight_decay": self._penalty(item)}
             for name, item in self._declared.items()
         ]
         groups += [
@@ -151,7 +151,14 @@ class SplatTraining(pl.LightningModule):
         output = self.render(view.frame, absgrad=self.density.absgrad)
         prediction = self.sensor(output.features, view.frame)
         inputs = LossInputs(
-            prediction, view.image(self.modality), view.mask, view, self.splats, step, self.trainer.max_steps
+            prediction,
+            view.image(self.modality),
+            view.mask,
+            view,
+            self.splats,
+            step,
+            self.trainer.max_steps,
+            target_key=view.frame.frame_id,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         self._rendered = (output, view)
@@ -167,7 +174,14 @@ class SplatTraining(pl.LightningModule):
         step = self.global_step
         optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, getattr(optimizer, "optimizer", optimizer), self._density_state)
-        self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
+        if self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density")) is not None:
+            for group in optimizer.param_groups:
+                if group["name"] in self._declared:
+                    group["weight_decay"] = self._penalty(self._declared[group["name"]])
+
+    def _penalty(self, item: PerGaussian) -> float:
+        """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
+        return 2 * item.l2 / (len(self.splats) if item.l2_mean else 1)
 
     # Evaluation --------------------------------------------------------------------------------------
 

@@ -1,0 +1,131 @@
+"""Shots: which cameras at which times, and the files that a trained scene writes of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.geometry import trajectories
+from heatsplat.io.pictures import temperature_picture, write_png
+from heatsplat.io.tiff import write_temperature
+from heatsplat.io.video import write_video
+
+log = logging.getLogger("heatsplat")
+
+TRAJECTORIES = ("orbit", "path", "test", "train", "view")
+
+
+def plan(
+    scene: SceneData,
+    trajectory: str = "orbit",
+    time: float | Sequence[float] | None = None,
+    view: int | str = 0,
+    count: int = 60,
+) -> list[Frame]:
+    """The frames of a shot, in order.
+
+    Args:
+        scene: whose cameras and record of time are meant.
+        trajectory: "orbit" around the scene, "path" smoothly through the training cameras, "test" or "train" as taken,
+            or "view", one camera that stands still.
+        time: seconds since the first training frame; [start, end] lets time pass over the shot; None takes the time of
+            each view (test, train), the whole record (view) or its middle (orbit, path).
+        view: for "view": position among the training frames, or file name.
+        count: frames of "orbit", "path" and "view".
+
+    Raises:
+        SceneError: unknown trajectory or view, or a time that is not one or two numbers.
+    """
+    if trajectory not in TRAJECTORIES:
+        raise SceneError(f"trajectory '{trajectory}' is unknown; choose {', '.join(TRAJECTORIES)}")
+    if count < 1:
+        raise SceneError(f"a shot needs frames, got frames={count}")
+    if trajectory in ("test", "train"):
+        taken = getattr(scene, trajectory).frames
+        moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
+        return [replace(frame, time_s=moment) for frame, moment in zip(taken, moments, strict=True)]
+    cameras = _cameras(scene, trajectory, view, count)
+    if time is None:
+        record = [t for t in scene.train.times_s if t is not None]
+        if record:
+            time = (min(record), max(record)) if trajectory == "view" else (min(record) + max(record)) / 2
+    moments = [None] * count if time is None else _moments(time, count)
+    first_free = 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
+    return [
+        Frame(f"{trajectory}_{i:04d}", first_free + i, camera, moment)
+        for i, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
+    ]
+
+
+def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> list[Camera]:
+    taken = [frame.camera for frame in scene.train.frames]
+    if trajectory == "orbit":
+        return trajectories.orbit(taken, count)
+    if trajectory == "path":
+        return trajectories.interpolate(taken, count)
+    names = [Path(frame.name).name for frame in scene.train.frames]
+    if isinstance(view, str) and not view.lstrip("-").isdigit():
+        if Path(view).name not in names:
+            raise SceneError(f"view '{view}' is no training frame; there are {', '.join(names[:8])} ...")
+        return trajectories.fixed_view(taken[names.index(Path(view).name)], count)
+    if not -len(taken) <= int(view) < len(taken):
+        raise SceneError(f"view {view} does not exist: scene '{scene.name}' has training frames 0 to {len(taken) - 1}")
+    return trajectories.fixed_view(taken[int(view)], count)
+
+
+def _moments(time: float | Sequence[float], count: int) -> list[float]:
+    bounds = [float(t) for t in time] if isinstance(time, Sequence) else [float(time)]
+    if len(bounds) not in (1, 2) or not np.isfinite(bounds).all():
+        raise SceneError(f"time must be a number of seconds or [start, end], got {time}")
+    return np.linspace(bounds[0], bounds[-1], count).tolist()
+
+
+def develop(
+    images: Iterable[Tensor],
+    frames: Sequence[Frame],
+    scene: SceneData,
+    output_dir: Path,
+    tiff: bool = True,
+    png: bool = True,
+    video: bool = True,
+    fps: float = 15.0,
+    range_c: Sequence[float] | None = None,
+) -> list[Path]:
+    """Paths of the files written for the images [H, W, 1] of a shot: TIFF in °C, PNG with a bar, and one video.
+
+    Images are taken one by one, so that a long shot needs the memory of one. Without a thermal range they are no
+    temperatures: TIFFs then hold image values in [0, 1], and the log says so.
+    """
+    bounds = scene.thermal_range
+    if bounds is None:
+        log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
+    low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
+    written: list[Path] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        for frame, image in zip(frames, images, strict=True):
+            values = bounds.to_celsius(image) if bounds else image
+            stem = Path(frame.name).stem
+            if tiff:
+                written.append(output_dir / "tiff" / f"{stem}.tiff")
+                write_temperature(written[-1], values)
+            title = stem if frame.time_s is None else f"{stem}   {frame.time_s:.1f} s"
+            picture = temperature_picture(values, low, high, title, unit="°C" if bounds else "")
+            if png:
+                written.append(output_dir / "png" / f"{stem}.png")
+                write_png(written[-1], picture)
+            yield picture
+
+    if video:
+        write_video(output_dir / "video.mp4", pictures(), fps)
+        written.append(output_dir / "video.mp4")
+    else:
+        for _ in pictures():
+            pass
+    return written

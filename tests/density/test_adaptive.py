@@ -1,0 +1,111 @@
+"""The standard recipe: who grows, who goes, when, and never beyond the cap."""
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.density.adaptive import Adaptive
+from heatsplat.density.fixed import Fixed
+from heatsplat.density.ops import Cloud
+from heatsplat.splats import Splats
+
+
+def make_cloud(policy: Adaptive, scales: list[float], opacities: list[float]) -> Cloud:
+    count = len(scales)
+    splats = Splats(
+        {
+            "means": torch.arange(count * 3, dtype=torch.float32).reshape(count, 3),
+            "log_scales": torch.tensor(scales).log()[:, None].repeat(1, 3),
+            "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+            "opacity_logits": torch.logit(torch.tensor(opacities))[:, None],
+        }
+    )
+    optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names])
+    return Cloud(splats, optimizer, policy.initial_state(count, torch.device("cpu")))
+
+
+def pull(cloud: Cloud, strength: list[float]) -> None:
+    cloud.state["gradient"] = torch.tensor(strength)
+    cloud.state["seen"] = torch.ones(len(strength))
+
+
+def refine(policy: Adaptive, cloud: Cloud, step: int):
+    return policy.refine(cloud, step, extent=1.0, generator=torch.Generator().manual_seed(0))
+
+
+def test_small_are_cloned_large_are_split():
+    policy = Adaptive(start=0, stop=100, every=10)
+    cloud = make_cloud(policy, [0.005, 0.05, 0.05], [0.5, 0.5, 0.5])
+    pull(cloud, [1e-3, 1e-3, 1e-5])
+    change = refine(policy, cloud, 9)
+    assert (change.added, change.removed, len(cloud)) == (2, 0, 5)
+    scales = cloud.splats.scales[:, 0].tolist()
+    assert scales.count(pytest.approx(0.005)) == 2  # the clone and its origin
+    assert scales.count(pytest.approx(0.05 / 1.6)) == 2  # two halves, their parent gone
+    assert scales.count(pytest.approx(0.05)) == 1  # the one that did not pull
+
+
+def test_transparent_are_removed_and_too_large_after_the_first_reset():
+    policy = Adaptive(start=0, stop=1000, every=10, reset_every=100)
+    cloud = make_cloud(policy, [0.01, 0.01, 0.5], [0.5, 0.001, 0.5])
+    assert refine(policy, cloud, 9).removed == 1
+    assert len(cloud) == 2
+    assert refine(policy, cloud, 109).removed == 1
+    assert len(cloud) == 1
+
+
+def test_the_cap_holds_and_the_strongest_grow_first():
+    policy = Adaptive(start=0, stop=100, every=10, cap_max=5)
+    cloud = make_cloud(policy, [0.001] * 4, [0.5] * 4)
+    pull(cloud, [1e-3, 5e-3, 2e-3, 3e-3])
+    refine(policy, cloud, 9)
+    assert len(cloud) == 5
+    assert torch.equal(cloud.splats["means"][4], cloud.splats["means"][1])
+
+
+def test_opacity_reset_happens_on_time_and_not_after_stop():
+    policy = Adaptive(start=0, stop=250, every=1000, reset_every=100)
+    cloud = make_cloud(policy, [0.01] * 2, [0.9, 0.005])
+    assert refine(policy, cloud, 98) is None
+    assert refine(policy, cloud, 99).opacity_reset
+    assert cloud.splats.opacities[0].tolist() == pytest.approx([0.01, 0.005], rel=1e-4)
+    assert refine(policy, cloud, 299) is None
+
+
+def test_nothing_before_start_between_refinements_or_after_stop():
+    policy = Adaptive(start=50, stop=100, every=10)
+    cloud = make_cloud(policy, [0.001] * 3, [0.5] * 3)
+    for step in (9, 55, 109):
+        pull(cloud, [1.0, 1.0, 1.0])
+        assert refine(policy, cloud, step) is None
+    assert refine(policy, cloud, 59).added == 3
+
+
+def test_an_empty_cloud_is_an_error_that_says_why():
+    policy = Adaptive(start=0, stop=100, every=10)
+    cloud = make_cloud(policy, [0.01] * 2, [0.001] * 2)
+    with pytest.raises(RuntimeError, match="remove all 2 Gaussians at step 9"):
+        refine(policy, cloud, 9)
+    assert len(cloud) == 2
+
+
+def test_statistics_are_mean_norms_in_normalised_device_coordinates():
+    policy = Adaptive()
+    state = policy.initial_state(3, torch.device("cpu"))
+    means2d = torch.zeros(3, 2, requires_grad=True)
+    means2d.grad = torch.tensor([[3.0, 0.0], [0.0, 2.0], [9.0, 9.0]])
+    output = RenderOutput(
+        torch.zeros(2, 2, 1), torch.zeros(1, 2, 2), None, {"means2d": means2d, "visible_ids": torch.tensor([0, 1])}
+    )
+    camera = Camera(torch.eye(4), torch.eye(3), width=20, height=10)
+    policy.observe(state, output, camera, step=0)
+    assert state["gradient"].tolist() == [30.0, 10.0, 0.0]
+    assert state["seen"].tolist() == [1.0, 1.0, 0.0]
+
+
+def test_fixed_keeps_no_statistic_and_changes_nothing():
+    policy = Fixed()
+    assert policy.initial_state(4, torch.device("cpu")) == {}
+    cloud = make_cloud(Adaptive(), [0.01] * 2, [0.001] * 2)
+    assert policy.refine(cloud, 99, 1.0, torch.Generator()) is None
+    assert len(cloud) == 2

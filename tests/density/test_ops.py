@@ -1,0 +1,79 @@
+"""Surgery on Gaussians keeps parameters, Adam moments and statistics in step."""
+
+import pytest
+import torch
+
+from heatsplat.density.ops import Cloud
+from heatsplat.splats import Splats
+
+
+def make_cloud(count: int = 6) -> Cloud:
+    generator = torch.Generator().manual_seed(3)
+    shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (2,), "heat": (5,)}
+    splats = Splats({name: torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()})
+    optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names], lr=0.1)
+    sum(splats[name].square().sum() for name in splats.names).backward()
+    optimizer.step()
+    return Cloud(splats, optimizer, {"seen": torch.arange(count, dtype=torch.float32)})
+
+
+def moments(cloud: Cloud, name: str) -> torch.Tensor:
+    return cloud.optimizer.state[cloud.splats[name]]["exp_avg"]
+
+
+def test_keep_takes_the_same_rows_everywhere():
+    cloud = make_cloud()
+    before = {name: cloud.splats[name].detach().clone() for name in cloud.splats.names}
+    before_moments = {name: moments(cloud, name).clone() for name in cloud.splats.names}
+    mask = torch.tensor([True, False, True, True, False, False])
+    cloud.keep(mask)
+    assert len(cloud) == 3
+    for name in cloud.splats.names:
+        assert torch.equal(cloud.splats[name], before[name][mask])
+        assert torch.equal(moments(cloud, name), before_moments[name][mask])
+    assert torch.equal(cloud.state["seen"], torch.tensor([0.0, 2.0, 3.0]))
+
+
+def test_append_starts_moments_and_statistics_at_zero():
+    cloud = make_cloud()
+    rows = cloud.rows(torch.tensor([1, 4]))
+    rows["heat"] += 1
+    expected = torch.cat([cloud.splats["heat"].detach(), rows["heat"]])
+    cloud.append(rows)
+    assert len(cloud) == 8
+    assert torch.equal(cloud.splats["heat"], expected)
+    assert (moments(cloud, "heat")[6:] == 0).all() and (moments(cloud, "heat")[:6] != 0).all()
+    assert torch.equal(cloud.state["seen"][6:], torch.zeros(2))
+
+
+def test_append_refuses_incomplete_rows():
+    with pytest.raises(KeyError, match="heat"):
+        make_cloud().append({name: torch.zeros(1, n) for name, n in (("means", 3), ("log_scales", 3), ("quats", 4))}
+                            | {"opacity_logits": torch.zeros(1, 2)})  # fmt: skip
+
+
+def test_overwrite_forgets_moments_of_that_tensor_only():
+    cloud = make_cloud()
+    cloud.overwrite("opacity_logits", torch.full((6, 2), -2.0))
+    assert (cloud.splats["opacity_logits"] == -2).all()
+    assert (moments(cloud, "opacity_logits") == 0).all()
+    assert (moments(cloud, "means") != 0).all()
+
+
+def test_training_goes_on_after_surgery():
+    cloud = make_cloud()
+    cloud.keep(torch.arange(6) < 4)
+    cloud.append(cloud.rows(torch.tensor([0])))
+    before = cloud.splats["means"].detach().clone()
+    cloud.optimizer.zero_grad()
+    cloud.splats["means"].square().sum().backward()
+    cloud.optimizer.step()
+    assert (cloud.splats["means"] != before).all()
+
+
+def test_splats_name_what_is_missing_or_uneven():
+    with pytest.raises(ValueError, match="missing: opacity_logits"):
+        Splats({"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "quats": torch.zeros(2, 4)})
+    with pytest.raises(ValueError, match="one row per Gaussian"):
+        Splats({"means": torch.zeros(2, 3), "log_scales": torch.zeros(3, 3), "quats": torch.zeros(2, 4),
+                "opacity_logits": torch.zeros(2, 1)})  # fmt: skip
