@@ -1,0 +1,176 @@
+"""The CUDA backend: gsplat's kernels behind heatsplat's contract.
+
+It calls the four steps of ``gsplat.rasterization`` itself, one projection and one sort for all modalities, because
+features may be wanted only for what the projection found visible. It adds a few passes over N numbers to those steps.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import RenderOutput
+from heatsplat.renderers import reference
+from heatsplat.renderers.base import BLUR, RenderInputs
+
+TILE = 16  # the tile size that gsplat's kernels are tuned and tested for
+CHANNELS = 32  # composited in one go; gsplat's kernels slow down beyond, as they keep a pixel's channels in registers
+
+
+class Kernels(NamedTuple):
+    """The functions of gsplat that this backend calls."""
+
+    project: Callable
+    intersect: Callable
+    offsets: Callable
+    rasterize: Callable
+
+
+def render(inputs: RenderInputs) -> RenderOutput:
+    """Composited features, alpha and depth; ``heatsplat.renderers.rasterization`` has the contract.
+
+    **Convention:** the constants of ``renderers.base`` other than the blur are compiled into gsplat's kernels. Rows of
+    ``meta["means2d"]`` that were not seen are undefined. Quaternions whose squared length is 0 in float32 are hidden.
+    Absolute screen gradients are summed over modalities and over groups of 32 channels, each of which gsplat composites
+    on its own.
+
+    Raises:
+        ImportError: gsplat is missing.
+        ValueError: tensors are not float32 on a CUDA device, or features do not fit.
+    """
+    kernels = load()
+    check(inputs)
+    count, width, height = len(inputs.means), inputs.width, inputs.height
+    if count == 0:  # gsplat's launchers divide by the number of Gaussians
+        return reference.render(inputs)
+
+    # gsplat would divide by the length of a zero quaternion; an opacity of 0 culls the Gaussian before that is used.
+    hidden = inputs.quats.detach().square().sum(dim=1) == 0
+    radii, means2d, depths, conics, compensations = kernels.project(
+        inputs.means,
+        None,
+        inputs.quats,
+        inputs.scales,
+        inputs.viewmat[None],
+        inputs.K[None],
+        width,
+        height,
+        eps2d=BLUR,
+        near_plane=inputs.near,
+        far_plane=inputs.far,
+        calc_compensations=inputs.antialiased,
+        opacities=inputs.opacities.detach().amax(0).masked_fill(hidden, 0.0),
+    )
+    ids = (radii[0] > 0).all(dim=1).nonzero().squeeze(1)
+    means2d = means2d[0]
+    if means2d.requires_grad:
+        means2d.retain_grad()
+
+    features = inputs.features
+    if callable(features):
+        emitted = features(ids)
+        channels = reference.channel_counts(inputs, emitted, len(ids))
+        features = emitted.new_zeros(count, emitted.shape[1]).index_copy(0, ids, emitted)
+    else:
+        channels = reference.channel_counts(inputs, features, count)
+
+    columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
+    _, pairs, order = kernels.intersect(means2d[None], radii, depths, TILE, columns, rows)
+    starts = kernels.offsets(pairs, 1, columns, rows)
+
+    parts: list[Tensor] = []  # gsplat leaves the absolute gradients of each call on the centres that it was given
+
+    def composite(values: Tensor, opacities: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
+        images, alphas = [], []
+        groups = values.split(CHANNELS, dim=1)
+        grounds = [None] * len(groups) if behind is None else behind.split(CHANNELS)
+        for some, ground in zip(groups, grounds, strict=True):
+            parts.append(means2d[None])
+            image, alpha = kernels.rasterize(
+                parts[-1],
+                conics,
+                some[None],
+                opacities[None],
+                width,
+                height,
+                TILE,
+                starts,
+                order,
+                backgrounds=None if ground is None else ground[None],
+                absgrad=inputs.absgrad,
+            )
+            images.append(image[0])
+            alphas.append(alpha[0, ..., 0])
+        return torch.cat(images, dim=2), alphas[0]
+
+    images, alphas, depth = [], [], None
+    grounds = [None] * len(channels) if inputs.background is None else inputs.background.split(channels)
+    for m, (values, behind) in enumerate(zip(features.split(channels, dim=1), grounds, strict=True)):
+        opacities = inputs.opacities[m] * compensations[0] if inputs.antialiased else inputs.opacities[m]
+        with_depth = inputs.depth and m == 0
+        if with_depth:  # one more channel of the first modality, with nothing behind it
+            values = torch.cat([values, depths[0, :, None]], dim=1)
+            behind = None if behind is None else torch.cat([behind, behind.new_zeros(1)])
+        image, alpha = composite(values, opacities, behind)
+        if with_depth:
+            image, depth = image[..., :-1], image[..., -1]
+        images.append(image)
+        alphas.append(alpha)
+    if inputs.absgrad and means2d.requires_grad:
+        _gather_absgrad(means2d, parts)
+    meta = {"means2d": means2d, "radii": radii[0], "visible_ids": ids}
+    return RenderOutput(torch.cat(images, dim=2), torch.stack(alphas), depth, meta)
+
+
+def load() -> Kernels:
+    """gsplat's kernels.
+
+    Raises:
+        ImportError: gsplat, or something that it needs, is missing.
+    """
+    try:
+        from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+    except ImportError as error:
+        raise ImportError(
+            f"the CUDA renderer needs gsplat ({error}). Install it with: pip install -e '.[gsplat]', or choose "
+            "renderer=cpu"
+        ) from error
+    return Kernels(fully_fused_projection, isect_tiles, isect_offset_encode, rasterize_to_pixels)
+
+
+def check(inputs: RenderInputs) -> None:
+    """Refuses tensors that gsplat's kernels cannot read.
+
+    Raises:
+        ValueError: a tensor is not float32 on a CUDA device.
+    """
+    means = inputs.means
+    if means.device.type != "cuda" or means.dtype != torch.float32:
+        raise ValueError(
+            f"the gsplat renderer needs float32 tensors on a CUDA device, got {means.dtype} on {means.device}; move "
+            "the splats there or choose renderer=cpu (float32) or renderer=reference (any)"
+        )
+
+
+def _gather_absgrad(means2d: Tensor, parts: list[Tensor]) -> None:
+    """Makes the backward pass leave the sum of the parts' ``absgrad`` [N, 2] on ``means2d``.
+
+    The hook knows ``means2d`` weakly and ``means2d`` holds the parts: a hook that held them would be a reference cycle
+    through the autograd graph, which the garbage collector cannot see, and would leak every training step.
+    """
+    means2d.parts = parts
+    owner = weakref.ref(means2d)
+
+    def gather(_grad: Tensor) -> None:
+        if (centres := owner()) is None:
+            return
+        # A modality that the loss does not use has no backward pass and leaves nothing.
+        found = [part.absgrad for part in centres.parts if hasattr(part, "absgrad")]
+        centres.absgrad = torch.cat(found).sum(0) if found else torch.zeros_like(centres)
+
+    means2d.register_hook(gather)
