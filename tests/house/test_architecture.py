@@ -1,0 +1,109 @@
+"""Who may import whom (docs/architecture.md), read from the source with ast."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "src" / "heatsplat"
+
+# Room -> rooms of heatsplat that it may import. Rooms are folders, or single files at the top of the package.
+ALLOWED = {
+    "contracts": set(),
+    "physics": {"contracts", "kernels"},
+    "geometry": {"contracts", "kernels"},
+    "kernels": set(),
+    "splats": {"contracts"},
+    "sensors": {"contracts", "geometry", "physics"},
+    "losses": {"contracts", "geometry", "physics", "kernels", "splats"},
+    "metrics": {"contracts", "geometry", "physics"},
+    "renderers": {"contracts", "geometry", "splats", "kernels"},
+    "thermal": {"contracts", "geometry", "physics", "splats", "kernels"},
+    "density": {"contracts", "geometry", "splats"},
+    "effects": {"contracts", "physics"},
+    "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
+    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
+    "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"},
+    "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
+    "shots": {"contracts", "geometry", "io"},
+    "cli": {"contracts", "io", "training", "shots", "studies"},
+    "datamodules": {"contracts", "geometry", "sensors", "training"},
+}
+BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
+# Third-party package -> places that may import it.
+DOORS = {
+    "hydra": {"cli"},
+    "omegaconf": {"cli"},
+    "pytorch_lightning": {"training", "callbacks", "datamodules"},
+    "pycolmap": {"datamodules/formats"},
+    "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io"},
+    "numba": {"kernels"},
+    "gsplat": {"renderers"},
+}
+
+
+def sources() -> list[Path]:
+    return sorted([*PACKAGE.rglob("*.py"), *(ROOT / "datamodules").rglob("*.py")])
+
+
+def room_of(path: Path) -> str:
+    if PACKAGE not in path.parents:
+        return "datamodules"
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def place_of(path: Path) -> str:
+    relative = path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT)
+    return relative.parent.as_posix() if relative.parent.as_posix() != "." else relative.stem
+
+
+def imports_of(path: Path) -> set[str]:
+    """Dotted names that a file imports, anywhere in it: module names, and module.name for "from module import name"."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_rooms_import_only_what_they_may(path):
+    room = room_of(path)
+    if room == "__init__":
+        return
+    assert room in ALLOWED, f"{path} is in no known room; give it one in docs/architecture.md and here"
+    for name in imports_of(path):
+        parts = name.split(".")
+        if parts[0] == "datamodules":
+            assert room == "datamodules", f"{path} imports {name}: heatsplat never imports datamodules"
+        if parts[0] != "heatsplat" or len(parts) == 1 or room == parts[1]:
+            continue
+        other = parts[1] if (PACKAGE / parts[1]).exists() or (PACKAGE / f"{parts[1]}.py").exists() else "heatsplat"
+        assert other in ALLOWED[room], f"{path} imports {name}: {room} may import {sorted(ALLOWED[room])}"
+        if room == "training" and other in BASES_ONLY:
+            assert parts[2] in BASES_ONLY[other], f"{path} imports {name}: training knows no variant by name"
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_third_party_packages_come_in_by_their_door(path):
+    for name in imports_of(path):
+        package = name.split(".")[0]
+        if package in DOORS:
+            place = place_of(path)
+            assert any(place == door or place.startswith(f"{door}/") for door in DOORS[package]), (
+                f"{path} imports {package}, which belongs in {sorted(DOORS[package])}"
+            )
+
+
+def test_kernels_know_numpy_and_numba_only():
+    for path in (PACKAGE / "kernels").rglob("*.py"):
+        assert "torch" not in {name.split(".")[0] for name in imports_of(path)}, path
+
+
+def test_the_check_itself_sees_a_forbidden_import(tmp_path):
+    source = tmp_path / "bad.py"
+    source.write_text("from heatsplat.training import module\nimport cv2\n")
+    assert imports_of(source) == {"heatsplat.training.module", "cv2"}
