@@ -1,0 +1,233 @@
+"""Pictures for people: colour-mapped images with a bar that says what the colours mean.
+
+Composed from arrays with Pillow for the lettering, which takes milliseconds where a figure of matplotlib takes
+tenths of a second; the colour maps and the tick positions are matplotlib's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from PIL import Image, ImageDraw, ImageFont
+
+from heatsplat.contracts import ThermalRange
+
+THERMAL = "inferno"
+ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
+UNKNOWN = (128, 128, 128)  # NaN and masked pixels
+
+PAPER = 255
+INK = (45, 45, 45)
+FONT = 13
+GAP = 14
+BAR = 14
+PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
+
+
+@cache
+def _lut(name: str) -> np.ndarray:
+    """The 256 colours of a matplotlib map, uint8 [256, 3]."""
+    return matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """The font that matplotlib ships, which has the degree sign."""
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What colours mean: the values at the lower and upper end of a colour map, with their unit."""
+
+    low: float
+    high: float
+    unit: str
+    colormap: str = THERMAL
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One image [H, W, 3] uint8 under a title, with a bar at its right or without."""
+
+    image: np.ndarray
+    title: str
+    bar: Bar | None = None
+
+
+def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> np.ndarray:
+    """Colours of values, uint8 RGB [H, W, 3]; values outside low..high take the end's colour, NaN is grey.
+
+    Args:
+        values: [H, W], tensor or array.
+        low, high: values of the two ends of the map; where they are equal everything takes the middle's colour.
+        colormap: name of a matplotlib map.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(values)
+    unit = (np.where(known, values, low) - low) / (high - low) if high > low else np.full(values.shape, 0.5)
+    colors = _lut(colormap)[(unit.clip(0, 1) * 255).round().astype(np.uint8)]
+    colors[~known] = UNKNOWN
+    return colors
+
+
+def temperature_picture(
+    values: Any, low: float, high: float, title: str = "", unit: str = "°C", colormap: str = THERMAL
+) -> np.ndarray:
+    """One colour-mapped image with its bar, uint8 RGB; its size depends on the image, the bounds and the unit only.
+
+    Args:
+        values: [H, W] or [H, W, 1], tensor or array.
+        low, high: values of the bar's ends.
+        title: one line above the image, cut where it is too long.
+        unit: of the values.
+        colormap: name of a matplotlib map.
+    """
+    values = np.asarray(values)
+    values = values[..., 0] if values.ndim == 3 else values
+    return compose([Panel(colorize(values, low, high, colormap), title, Bar(low, high, unit, colormap))])
+
+
+def comparison_picture(
+    target: Any,
+    prediction: Any,
+    thermal_range: ThermalRange | None = None,
+    mask: Any = None,
+    error_limit: float | None = None,
+    title: str = "",
+) -> np.ndarray:
+    """Ground truth, render and their difference side by side, uint8 RGB.
+
+    **Convention:** the difference is render minus ground truth: red is too warm, blue too cold. Ground truth and render
+    share the colours, spread over the values of the ground truth.
+
+    Args:
+        target, prediction: [H, W, C] in [0, 1], C = 1 or 3.
+        thermal_range: temperatures of 0 and 1; None labels bars with image values.
+        mask: [H, W] bool, True where a pixel counts; the others are grey in ground truth and difference.
+        error_limit: end of the difference's bar, in °C (image values without a range); default: chosen from the image.
+        title: one line above the panels.
+    """
+    target, prediction = (np.asarray(image, dtype=np.float32) for image in (target, prediction))
+    if target.shape != prediction.shape or target.ndim != 3:
+        raise ValueError(f"two images [H, W, C] of one shape are compared, got {target.shape} and {prediction.shape}")
+    counted = np.isfinite(target).all(-1)
+    if mask is not None:
+        counted &= np.asarray(mask)
+    thermal = target.shape[2] == 1
+    unit, scale = ("°C", thermal_range.span_k) if thermal and thermal_range else ("", 1.0)
+    error = np.where(counted, (prediction - target).mean(-1) * scale, np.nan)
+    if error_limit is None:
+        error_limit = _round_up(float(np.nanpercentile(np.abs(error), 99)) if counted.any() else 0.0)
+
+    if thermal:
+        images = [image[..., 0] for image in (target, prediction)]
+        if thermal_range is not None:
+            images = [thermal_range.to_celsius(image) for image in images]
+        shown = images[0][counted] if counted.any() else images[1]
+        low, high = (float(x) for x in np.percentile(shown, (0.1, 99.9)))
+        images[0] = np.where(counted, images[0], np.nan)
+        pictures = [colorize(image, low, high) for image in images]
+        bar = Bar(low, high, unit)
+    else:
+        pictures = [(np.nan_to_num(image).clip(0, 1) * 255).round().astype(np.uint8) for image in (target, prediction)]
+        pictures[0][~counted] = UNKNOWN
+        bar = None
+    difference = Bar(-error_limit, error_limit, unit, ERROR)
+    return compose(
+        [
+            Panel(pictures[0], "ground truth"),
+            Panel(pictures[1], "render", bar),
+            Panel(colorize(error, -error_limit, error_limit, ERROR), "render − ground truth", difference),
+        ],
+        title,
+    )
+
+
+def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
+    """Panels in a row on white paper, each with its title and bar, under a common title, uint8 RGB with even sides.
+
+    Small images are enlarged by a whole factor without smoothing, so that their pixels can be counted.
+    """
+    line = FONT + 9
+    top = GAP + (line if title else 0)
+    factor = max(1, round(PANEL_HEIGHT / panels[0].image.shape[0]))
+    height, width = (side * factor for side in panels[0].image.shape[:2])
+    ticks = [_ticks(panel.bar) if panel.bar else [] for panel in panels]
+    labels = [max((_font(FONT).getlength(text) for _, text in marks), default=0) for marks in ticks]
+    widths = [
+        width + (BAR + 14 + int(np.ceil(label)) if panel.bar else 0)
+        for panel, label in zip(panels, labels, strict=True)
+    ]
+    shape = (top + line + height + GAP, GAP + sum(w + GAP for w in widths))
+    canvas = np.full((shape[0] + shape[0] % 2, shape[1] + shape[1] % 2, 3), PAPER, dtype=np.uint8)  # even: video codecs
+
+    page = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(page)
+    if title:
+        draw.text((GAP, GAP), _fit(title, shape[1] - 2 * GAP), font=_font(FONT), fill=INK)
+    x, y = GAP, top + line
+    for panel, marks, step in zip(panels, ticks, widths, strict=True):
+        draw.text((x, top), _fit(panel.title, step), font=_font(FONT), fill=INK)
+        image = np.repeat(np.repeat(panel.image, factor, axis=0), factor, axis=1)
+        page.paste(Image.fromarray(np.ascontiguousarray(image)), (x, y))
+        if panel.bar:
+            left = x + width + 6
+            ramp = np.broadcast_to(
+                _lut(panel.bar.colormap)[np.linspace(255, 0, height).round().astype(int), None], (height, BAR, 3)
+            )
+            page.paste(Image.fromarray(np.ascontiguousarray(ramp)), (left, y))
+            draw.rectangle((left - 1, y - 1, left + BAR, y + height), outline=(170, 170, 170))
+            for value, text in marks:
+                span = panel.bar.high - panel.bar.low
+                row = y + (height - 1) * (1 - ((value - panel.bar.low) / span if span > 0 else 0.5))
+                draw.line((left + BAR, row, left + BAR + 3, row), fill=INK)
+                draw.text((left + BAR + 6, row), text, font=_font(FONT), fill=INK, anchor="lm")
+        x += step + GAP
+    return np.asarray(page)
+
+
+def write_png(path: str | Path, picture: np.ndarray) -> None:
+    """Writes an RGB picture [H, W, 3] uint8 and makes its folder. Raises OSError where it cannot be written."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"cannot write {path}")
+
+
+def _ticks(bar: Bar) -> list[tuple[float, str]]:
+    """Values at round numbers within the bar, with their labels; the unit stands at the uppermost."""
+    if not bar.high > bar.low:
+        return [(bar.low, f"{bar.low:g} {bar.unit}".strip())]
+    steps = MaxNLocator(nbins=6, steps=[1, 2, 2.5, 5, 10]).tick_values(bar.low, bar.high)
+    margin = 0.02 * (bar.high - bar.low)
+    values = [v for v in steps if bar.low - 1e-9 * margin <= v <= bar.high + 1e-9 * margin]
+    digits = max(0, int(np.ceil(-np.log10(steps[1] - steps[0]) - 1e-9)))
+    digits += int(round((steps[1] - steps[0]) * 10**digits, 6) % 1 != 0)  # steps of 2.5
+    texts = [f"{v + 0.0:.{digits}f}".replace("-", "−") for v in values]
+    texts[-1] = f"{texts[-1]} {bar.unit}".strip()
+    return list(zip(values, texts, strict=True))
+
+
+def _fit(text: str, width: float) -> str:
+    """``text``, cut with an ellipsis where it is wider than ``width`` pixels."""
+    if _font(FONT).getlength(text) <= width:
+        return text
+    while text and _font(FONT).getlength(text + "…") > width:
+        text = text[:-1]
+    return text + "…"
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten; 1e-3 for anything smaller, so that a bar has two different ends."""
+    value = max(value, 1e-3)
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value * 0.999))

@@ -1,0 +1,147 @@
+"""Temperature files are bit-exact; pictures show the right colours at the right places."""
+
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from heatsplat.contracts import ThermalRange
+from heatsplat.io.pictures import (
+    GAP,
+    UNKNOWN,
+    Bar,
+    _ticks,
+    colorize,
+    comparison_picture,
+    temperature_picture,
+    write_png,
+)
+from heatsplat.io.tiff import read_temperature, write_temperature
+from heatsplat.io.video import write_video
+
+RANGE = ThermalRange(10.0, 50.0)
+
+
+def test_temperatures_survive_bit_by_bit(tmp_path):
+    celsius = torch.linspace(-40, 1200, 35 * 21).reshape(35, 21, 1).sin() * 300
+    celsius[3, 4] = float("nan")
+    path = tmp_path / "new" / "t.tiff"
+    write_temperature(path, celsius)
+    assert np.array_equal(read_temperature(path), celsius[..., 0].numpy(), equal_nan=True)
+    theirs = np.asarray(Image.open(path))  # another library reads it too
+    assert np.array_equal(theirs, celsius[..., 0].numpy(), equal_nan=True)
+
+
+def test_temperature_files_are_checked(tmp_path):
+    with pytest.raises(ValueError, match=r"is \[H, W\] or \[H, W, 1\], got \[3, 4, 2\]"):
+        write_temperature(tmp_path / "t.tiff", np.zeros((3, 4, 2)))
+    with pytest.raises(ValueError, match=r"name the file \.tiff"):
+        write_temperature(tmp_path / "t.png", np.zeros((3, 4)))
+    with pytest.raises(ValueError, match="cannot be read as an image"):
+        read_temperature(tmp_path / "missing.tiff")
+    cv2.imwrite(str(tmp_path / "grey.tiff"), np.zeros((3, 4), dtype=np.uint8))
+    with pytest.raises(ValueError, match="holds uint8"):
+        read_temperature(tmp_path / "grey.tiff")
+
+
+def test_colours_are_those_of_matplotlib():
+    values = np.linspace(10, 50, 256).reshape(16, 16)
+    expected = matplotlib.colormaps["inferno"](np.arange(256), bytes=True)[:, :3].reshape(16, 16, 3)
+    assert np.abs(colorize(values, 10, 50).astype(int) - expected).max() == 0
+    ends = colorize(np.array([[-99.0, 99.0, np.nan]]), 10, 50)[0]
+    assert (ends[0] == expected[0, 0]).all()
+    assert (ends[1] == expected[-1, -1]).all()
+    assert tuple(ends[2]) == UNKNOWN
+    flat = colorize(np.full((2, 2), 7.0), 7.0, 7.0)
+    assert (flat == flat[0, 0]).all()
+
+
+def test_ticks_lie_at_round_numbers_within_the_bar():
+    assert _ticks(Bar(10, 50, "°C"))[-1] == (50.0, "50 °C")
+    assert [text for _, text in _ticks(Bar(-0.2, 0.2, "°C"))] == ["−0.2", "−0.1", "0.0", "0.1", "0.2 °C"]
+    assert [text for _, text in _ticks(Bar(17.1, 31.0, "°C"))] == ["17.5", "20.0", "22.5", "25.0", "27.5", "30.0 °C"]
+    for low, high in ((0, 1e-3), (-40, 900), (21.34, 21.41), (0, 3e4)):
+        values = [value for value, _ in _ticks(Bar(low, high, ""))]
+        assert 3 <= len(values) <= 8
+        assert low - 1e-9 <= min(values) and max(values) <= high + 1e-9
+        labels = [float(text.replace("−", "-")) for _, text in _ticks(Bar(low, high, ""))]
+        assert labels == pytest.approx(values, rel=1e-6, abs=1e-9)
+    assert _ticks(Bar(5, 5, "°C")) == [(5, "5 °C")]
+
+
+def test_the_picture_holds_the_image_and_the_bar():
+    celsius = np.full((65, 80), 10.0)
+    celsius[:, 40:] = 50.0
+    picture = temperature_picture(celsius, 10, 50, "t = 5 s")
+    assert picture.dtype == np.uint8 and picture.shape[0] % 2 == 0 and picture.shape[1] % 2 == 0
+    cold, warm = colorize(np.array([[10.0, 50.0]]), 10, 50)[0]
+    row = picture[picture.shape[0] // 2]  # 65 rows enlarged 4 times
+    assert (row[GAP : GAP + 160] == cold).all()
+    assert (row[GAP + 160 : GAP + 320] == warm).all()
+    longer = temperature_picture(celsius, 10, 50, "a title that is far too long " * 9)
+    assert longer.shape == picture.shape  # frames of a video must not change their size with their title
+
+
+def test_comparison_shows_signed_errors_in_celsius():
+    target = torch.full((65, 40, 1), 0.25)
+    target[:, :20] = 0.5
+    prediction = target.clone()
+    prediction[:32] += 0.05  # 2 °C too warm above
+    prediction[33:] -= 0.05
+    mask = torch.ones(65, 40, dtype=torch.bool)
+    mask[:, 30:] = False
+    picture = comparison_picture(target, prediction, RANGE, mask, title="frame")
+    step = 160 + GAP
+    middle = picture.shape[0] // 2
+    red, blue = colorize(np.array([[2.0, -2.0]]), -2, 2, "RdBu_r")[0]
+    columns = {tuple(c) for c in picture[middle - 60].tolist()}
+    assert tuple(red) in columns and tuple(blue) not in columns
+    assert tuple(blue) in {tuple(c) for c in picture[middle + 80].tolist()}
+    assert tuple(picture[middle, GAP + 155]) == UNKNOWN  # masked in the ground truth
+    assert tuple(picture[middle, step + GAP + 155]) != UNKNOWN  # and shown in the render
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_comparison_without_range_or_pixels(channels):
+    image = torch.rand(20, 30, channels, generator=torch.Generator().manual_seed(1))
+    same = comparison_picture(image, image)
+    assert same.ndim == 3 and (same < 255).any()
+    empty = comparison_picture(torch.full_like(image, float("nan")), image, RANGE)
+    assert empty.shape[0] == same.shape[0]
+    with pytest.raises(ValueError, match="of one shape"):
+        comparison_picture(image, image[:-1])
+
+
+def test_png_round_trip(tmp_path):
+    picture = temperature_picture(np.linspace(0, 1, 600).reshape(20, 30), 0, 1, unit="")
+    write_png(tmp_path / "a" / "p.png", picture)
+    assert (cv2.imread(str(tmp_path / "a" / "p.png"))[..., ::-1] == picture).all()
+
+
+def test_video_round_trip(tmp_path):
+    y = np.linspace(0, 1, 64)[:, None] * np.ones((1, 48))
+    frames = [temperature_picture(y * (0.2 + 0.1 * i), 0, 1, f"t = {i} s") for i in range(5)]
+    path = tmp_path / "v" / "time.mp4"
+    assert write_video(path, iter(frames), fps=10) == 5
+    video = cv2.VideoCapture(str(path))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+    read = []
+    while (got := video.read())[0]:
+        read.append(got[1][..., ::-1])
+    assert len(read) == 5
+    assert np.abs(read[3].astype(int) - frames[3]).mean() < 6  # lossy, yet the same picture
+    assert np.abs(read[0].astype(int) - frames[4]).mean() > 6
+
+
+def test_videos_are_checked(tmp_path):
+    frame = np.zeros((16, 16, 3), dtype=np.uint8)
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_video(tmp_path / "v.mp4", [])
+    with pytest.raises(ValueError, match=r"video frame 1 is uint8 \[16, 18, 3\], the first was uint8 \[16, 16, 3\]"):
+        write_video(tmp_path / "v.mp4", [frame, np.zeros((16, 18, 3), dtype=np.uint8)])
+    with pytest.raises(ValueError, match=r"name the file \.mp4"):
+        write_video(tmp_path / "v.avi", [frame])
+    with pytest.raises(ValueError, match="even sides"):
+        write_video(tmp_path / "v.mp4", [frame[:15]])
