@@ -1,0 +1,212 @@
+"""Any scene with images/ and a COLMAP sparse/0: the loader for one's own recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
+from datamodules.bounds import read_bounds
+from datamodules.formats.colmap import SparseModel, find_model, read_model
+from datamodules.formats.images import ImageIndex, read_image
+from datamodules.formats.radiometric import has_temperatures, read_celsius
+from datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
+
+BOUNDS_FILE = "temperature_bounds.json"
+
+
+class Colmap(SceneDataModule):
+    """Images, a sparse model, and as much about temperature and time as there is.
+
+    Temperatures come from the first of: 16-bit counts in ``raw``; radiometric JPEGs (FLIR, DJI) among the images;
+    bounds that say what black and white stand for; none. Times come from the first of: a table, a pattern, DJI file
+    names; none.
+
+    Args:
+        images: folder of the thermal images.
+        rgb: folder of visible images of the same cameras and names, or None.
+        raw: folder of 16-bit counts with the same names, used in place of the images' greys, or None.
+        raw_scale, raw_offset_c: °C = raw_scale * counts + raw_offset_c.
+        radiometric: "auto" reads temperatures out of radiometric JPEGs, "never" takes their pictures as greys.
+        bounds_c: [min, max] in °C that 0 and 1 stand for; None takes temperature_bounds.json or the data's own range.
+        time_regex: picks the time out of an image name (first group), or None.
+        time_format: strptime format of it, HHMMSSmmm, or None for a number of seconds.
+        time_csv: table of times, relative to the scene or the working directory, or None.
+        time_csv_name, time_csv_time: its columns of image names and of times (seconds or ISO date-times).
+        ambient_c: temperature of the surroundings in °C, or None.
+        metres_per_unit: scale of the sparse model, or None when unknown.
+        shared: options of every loader (``SceneDataModule``).
+    """
+
+    def __init__(
+        self,
+        *,
+        images: str = "images",
+        rgb: str | None = None,
+        raw: str | None = None,
+        raw_scale: float = 1.0 / 64.0,
+        raw_offset_c: float = -273.15,
+        radiometric: str = "auto",
+        bounds_c: Sequence[float] | None = None,
+        time_regex: str | None = None,
+        time_format: str | None = None,
+        time_csv: str | None = None,
+        time_csv_name: str = "file",
+        time_csv_time: str = "time_s",
+        ambient_c: float | None = None,
+        metres_per_unit: float | None = None,
+        **shared: Any,
+    ) -> None:
+        super().__init__(**shared)
+        if radiometric not in ("auto", "never"):
+            raise SceneError(f"data.radiometric must be auto or never, got {radiometric!r}")
+        if bounds_c is not None and len(bounds_c) != 2:
+            raise SceneError(f"data.bounds_c needs two values [min, max] in °C, got {list(bounds_c)}")
+        self.images = images
+        self.rgb = rgb
+        self.raw = raw
+        self.counts = Counts(raw_scale, raw_offset_c)
+        self.radiometric = radiometric
+        self.bounds_c = bounds_c
+        self.time_regex = time_regex
+        self.time_format = time_format
+        self.time_csv = time_csv
+        self.time_csv_columns = (time_csv_name, time_csv_time)
+        self.ambient_c = ambient_c
+        self.metres_per_unit = metres_per_unit
+
+    def load(self) -> SceneData:
+        folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)")
+        model = read_model(folder)
+        index = image_index(folder, self.images, "data.images")
+        raw = image_index(folder, self.raw, "data.raw") if self.raw else None
+        rgb = image_index(folder, self.rgb, "data.rgb") if self.rgb else None
+        masks = ImageIndex(folder / self.masks)
+
+        files = {name: (raw or index).find(name) for name in model.names}
+        kept, notes = match_model(model, files, (raw or index), self.raw or self.images)
+        read, counts, encoding = self._reader(raw, index, [files[i] for i in kept])
+        notes["encoding"] = encoding
+        times, notes["time_source"] = self._times(folder, kept)
+        bounds, bounds_source = self._bounds(folder)
+        if bounds:
+            notes["bounds_source"] = bounds_source
+        frames = []
+        for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
+            if name not in kept:
+                continue
+            rgb_file = rgb.find(name) if rgb else None
+            frames.append(
+                RawFrame(
+                    name=name,
+                    viewmat=viewmat,
+                    lens=lens,
+                    read=partial(read, (raw or index).folder / files[name]),
+                    time_s=times[name] if times else None,
+                    read_rgb=partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
+                    read_mask=self.mask_reader(masks, name),
+                )
+            )
+        if masked := sum(f.read_mask is not None for f in frames):
+            notes["masks"] = f"{masked} of {len(frames)} images have a mask in {self.masks}/ ({self.mask_keep} counts)"
+        if rgb:
+            notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
+        return self.finish(
+            folder.name,
+            frames,
+            model.points,
+            point_colors=model.colors,
+            thermal_range=bounds,
+            counts=counts,
+            ambient_c=self.ambient_c,
+            metres_per_unit=self.metres_per_unit,
+            notes=notes,
+        )
+
+    def _reader(
+        self, raw: ImageIndex | None, index: ImageIndex, files: Sequence[str]
+    ) -> tuple[Callable[[Path], np.ndarray], Counts | None, str]:
+        """How an image file becomes stored numbers, what they mean, and a sentence about it."""
+        if raw:
+            c = self.counts
+            return read_image, c, f"16-bit counts in {self.raw}/: °C = {c.scale:g} * counts {c.offset_c:+g}"
+        if self.radiometric == "auto":
+            having = [file for file in files if has_temperatures(index.folder / file)]
+            if having and len(having) < len(files):
+                lacking = next(file for file in files if file not in set(having))
+                raise SceneError(
+                    f"{len(having)} of {len(files)} images are radiometric JPEGs, {lacking} is not; "
+                    "remove the others, or take all as greys with data.radiometric=never"
+                )
+            if having:
+                return read_celsius, CELSIUS, "temperatures of radiometric JPEGs (emissivity 1, no atmosphere)"
+        return read_image, None, "greys, linear between the bounds where there are any"
+
+    def _bounds(self, folder: Path) -> tuple[ThermalRange | None, str]:
+        if self.bounds_c is not None:
+            return ThermalRange(float(self.bounds_c[0]), float(self.bounds_c[1])), "data.bounds_c"
+        file = folder / BOUNDS_FILE
+        return (read_bounds(file)[0], file.name) if file.is_file() else (None, "")
+
+    def _times(self, folder: Path, names: Sequence[str]) -> tuple[dict[str, float] | None, str]:
+        """Seconds by image name, or None, and where they come from."""
+        if self.time_csv:
+            path = folder / Path(self.time_csv).expanduser()
+            path = path if path.is_file() else Path(self.time_csv).expanduser().absolute()
+            table = times_from_csv(path, *self.time_csv_columns)
+            missing = [name for name in names if stem_of(name) not in table]
+            if missing:
+                raise SceneError(
+                    f"data.time_csv: {path} has no row for {missing[0]} ({len(missing)} of {len(names)} images); "
+                    f"column {self.time_csv_columns[0]} must hold the image names"
+                )
+            return {name: table[stem_of(name)] for name in names}, f"{path.name}, column {self.time_csv_columns[1]}"
+        if self.time_regex:
+            times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
+            return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
+        times = {name: dji_time(name) for name in names}
+        if all(t is not None for t in times.values()):
+            return times, "DJI file names (whole seconds, the camera's clock)"  # type: ignore[return-value]
+        return None, "none (set data.time_regex or data.time_csv)"
+
+
+def image_index(folder: Path, images: str, key: str) -> ImageIndex:
+    """Files of an image folder of a scene. Raises SceneError naming the option ``key`` when the folder has none."""
+    index = ImageIndex(folder / images)
+    if not index.names:
+        what = "holds no image" if index.folder.is_dir() else "does not exist"
+        raise SceneError(f"{key}={images}: {index.folder} {what}")
+    return index
+
+
+def match_model(
+    model: SparseModel, files: dict[str, str | None], index: ImageIndex, folder: str
+) -> tuple[list[str], dict[str, Any]]:
+    """Names of the model that have a file, and notes about those that do not and about files that are not registered.
+
+    Raises:
+        SceneError: no name of the model has a file.
+    """
+    kept = [name for name in model.names if files[name] is not None]
+    if not kept:
+        raise SceneError(
+            f"none of the {len(model.names)} images of the sparse model {model.folder} is in {index.folder}: the model "
+            f"has names like {model.names[0]!r}, the folder like {index.names[0]!r}"
+        )
+    notes: dict[str, Any] = {"registered": len(model.names)}
+    if missing := [name for name in model.names if files[name] is None]:
+        notes["images_missing"] = (
+            f"{len(missing)} registered images have no file in {folder}/, dropped: {_some(missing)}"
+        )
+    if unregistered := index.unused(f for f in files.values() if f):
+        notes["images_unregistered"] = f"{len(unregistered)} files are not in the model, unused: {_some(unregistered)}"
+    return kept, notes
+
+
+def _some(names: Sequence[str], most: int = 5) -> str:
+    return ", ".join(names[:most]) + (" ..." if len(names) > most else "")

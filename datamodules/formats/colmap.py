@@ -1,0 +1,128 @@
+"""COLMAP sparse models, binary or text: reading them into plain arrays and writing them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+# cv2 first: pycolmap brings its own libpng symbols, and cv2 aborts on its first PNG if it is loaded after them.
+import cv2  # noqa: F401, I001
+import numpy as np
+import pycolmap
+
+from datamodules.formats.lens import MODELS, Lens, lens_of
+from heatsplat.contracts import SceneError
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """What heatsplat takes from a sparse model.
+
+    Args:
+        folder: where it lies.
+        names: image names as the model has them, sorted.
+        viewmats: world-to-camera [4, 4] float64 of each name.
+        lenses: lens of each name.
+        points: [P, 3] float64.
+        colors: [P, 3] float64 in [0, 1].
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    viewmats: tuple[np.ndarray, ...]
+    lenses: tuple[Lens, ...]
+    points: np.ndarray
+    colors: np.ndarray
+
+
+def find_model(scene: Path) -> Path | None:
+    """The folder of the sparse model in a scene folder (sparse/0, sparse, colmap/sparse/0, colmap/sparse), or None."""
+    for place in PLACES:
+        if any((scene / place / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
+            return scene / place
+    return None
+
+
+def read_model(scene: Path) -> SparseModel:
+    """The sparse model of a scene folder.
+
+    Raises:
+        SceneError: there is none, a file of it is missing, empty or damaged, or a camera model is not supported.
+    """
+    folder = find_model(scene)
+    if folder is None:
+        raise SceneError(
+            f"no sparse model in {scene}: looked for cameras.bin or cameras.txt in {', '.join(PLACES)}. "
+            "Reconstruct the scene with COLMAP first, or point data.root and data.scene at the folder above sparse/."
+        )
+    suffix = "bin" if (folder / "cameras.bin").is_file() else "txt"
+    for part in ("cameras", "images", "points3D"):
+        file = folder / f"{part}.{suffix}"
+        if not file.is_file():
+            raise SceneError(f"sparse model {folder} has no {file.name}; copy or export it again")
+        if file.stat().st_size == 0:  # pycolmap ends the process on it
+            raise SceneError(f"sparse model {folder}: {file.name} is empty (0 bytes); copy or export it again")
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except Exception as error:
+        if "amera model" in str(error):
+            raise SceneError(
+                f"sparse model {folder}: cameras.{suffix} names a camera model that COLMAP does not know; "
+                f"supported are {', '.join(MODELS)}"
+            ) from error
+        raise SceneError(f"sparse model {folder} is damaged: {str(error).strip().splitlines()[0]}") from error
+    lenses = {
+        key: lens_of(c.model.name, list(c.params), c.width, c.height, f"{folder}, camera {key}")
+        for key, c in model.cameras.items()
+    }
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    if not images:
+        raise SceneError(f"sparse model {folder} has no registered image; reconstruct the scene again")
+    bottom = np.array([[0.0, 0.0, 0.0, 1.0]])
+    points = list(model.points3D.values())
+    return SparseModel(
+        folder=folder,
+        names=tuple(image.name for image in images),
+        viewmats=tuple(np.vstack([image.cam_from_world().matrix(), bottom]) for image in images),
+        lenses=tuple(lenses[image.camera_id] for image in images),
+        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255.0,
+    )
+
+
+def write_model(
+    folder: Path,
+    viewmats: Mapping[str, np.ndarray],
+    cameras: Sequence[tuple[str, Sequence[float], int, int]],
+    points: np.ndarray,
+    colors: np.ndarray,
+    *,
+    camera_of: Mapping[str, int] | None = None,
+    text: bool = False,
+) -> None:
+    """Writes a sparse model.
+
+    Args:
+        folder: the model's own folder (scene/sparse/0), made where missing.
+        viewmats: image name -> world-to-camera [4, 4], OpenCV axes.
+        cameras: (COLMAP model name, its parameters, width, height) of each camera.
+        points: [P, 3] world coordinates.
+        colors: [P, 3] uint8.
+        camera_of: image name -> position in ``cameras``; the first camera for all when left out.
+        text: True for .txt files, False for .bin.
+    """
+    model = pycolmap.Reconstruction()
+    for i, (kind, params, width, height) in enumerate(cameras):
+        camera = pycolmap.Camera(model=kind, width=width, height=height, params=list(params), camera_id=i + 1)
+        model.add_camera_with_trivial_rig(camera)
+    for i, (name, viewmat) in enumerate(viewmats.items()):
+        camera_id = 1 + (camera_of[name] if camera_of else 0)
+        pose = pycolmap.Rigid3d(np.asarray(viewmat, dtype=np.float64)[:3])
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1), pose)
+    for xyz, color in zip(points, colors, strict=True):
+        model.add_point3D(np.asarray(xyz, dtype=np.float64), pycolmap.Track(), np.asarray(color, dtype=np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder))

@@ -1,0 +1,167 @@
+"""Which frames are held out for testing: pure functions from names or an order to (train, test) positions.
+
+Positions index the frames as they were passed. ``order`` lists positions in time order (name order without times).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from heatsplat.contracts import SceneError
+
+Positions = tuple[list[int], list[int]]
+
+TRAIN_WORDS = ("train",)
+TEST_WORDS = ("test", "eval", "val")
+
+
+def _complement(count: int, test: Sequence[int]) -> Positions:
+    held_out = set(test)
+    return [i for i in range(count) if i not in held_out], sorted(held_out)
+
+
+def every_nth(names: Sequence[str], n: int = 8) -> Positions:
+    """Every n-th name in plain string order is test, the first one included (3DGS, Thermal3D-GS)."""
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    return _complement(len(names), order[::n])
+
+
+def quarter_centre(order: Sequence[int]) -> Positions:
+    """The middle eighth of each quarter of the recording is test (RHD's split, as ETGS's code does it).
+
+    Frames are cut into four parts of n // 4 (the last takes the rest); in a part of m frames the max(1, m // 8) frames
+    that begin at (m - count) // 2 are test.
+    """
+    n = len(order)
+    test: list[int] = []
+    for part in range(4):
+        frames = order[part * (n // 4) : (part + 1) * (n // 4) if part < 3 else n]
+        count = min(len(frames), max(1, len(frames) // 8))
+        start = (len(frames) - count) // 2
+        test += frames[start : start + count]
+    return _complement(n, test)
+
+
+def block(order: Sequence[int], fraction: float = 0.125, position: float = 0.5) -> Positions:
+    """One contiguous stretch of the recording is test: the hard case for a model of time.
+
+    Args:
+        order: positions in time order.
+        fraction: share of the frames to hold out, in (0, 1).
+        position: where the stretch lies: 0 at the beginning, 1 at the end (extrapolation), 0.5 in the middle.
+    """
+    if not 0 < fraction < 1 or not 0 <= position <= 1:
+        raise SceneError(
+            f"data.split=block needs data.split_fraction in (0, 1) and data.split_position in [0, 1], "
+            f"got {fraction} and {position}"
+        )
+    count = min(max(1, round(fraction * len(order))), len(order))
+    start = round(position * (len(order) - count))
+    return _complement(len(order), order[start : start + count])
+
+
+def subset_of_words(words: Sequence[str], name: str, rule: str) -> str:
+    """The subset that ``words`` speak of, "train" or "test". Raises SceneError naming ``name`` when it is neither."""
+    lowered = [word.lower() for word in words]
+    is_train = any(key in word for word in lowered for key in TRAIN_WORDS)
+    is_test = any(key in word for word in lowered for key in TEST_WORDS)
+    if is_train == is_test:
+        raise SceneError(
+            f"data.split={rule}: {name} says neither 'train' nor 'eval' or 'test' (or both). "
+            "Choose another rule, for instance data.split=every_8th."
+        )
+    return "train" if is_train else "test"
+
+
+def by_name(names: Sequence[str]) -> Positions:
+    """Frames whose file name holds "train" are training frames, "eval" or "test" are test frames (ThermoScenes)."""
+    return by_subset([subset_of_words([PurePosixPath(name).stem], name, "names") for name in names])
+
+
+def by_folder(names: Sequence[str]) -> Positions:
+    """Frames in a folder named train are training frames, in test, eval or val test frames (RGBT-Scenes)."""
+    return by_subset([subset_of_words(PurePosixPath(name).parts[:-1], name, "folders") for name in names])
+
+
+def by_subset(subsets: Sequence[str | None]) -> Positions:
+    """Positions by what the data set itself says of each frame: "train", "test", or None for a frame left out."""
+    return [i for i, s in enumerate(subsets) if s == "train"], [i for i, s in enumerate(subsets) if s == "test"]
+
+
+def by_list(names: Sequence[str], path: Path) -> Positions:
+    """Positions by a file: test names one per line, or JSON {"train": [...], "test": [...]} (no "train": all others).
+
+    Names may be given with or without their folder and extension.
+    """
+    if not path.is_file():
+        raise SceneError(f"data.split_file: there is no file {path}")
+    text = path.read_text()
+    if path.suffix.lower() == ".json":
+        lists = json.loads(text)
+        if "test" not in lists:
+            raise SceneError(f'data.split_file: {path} holds no list "test"; it has {", ".join(lists) or "nothing"}')
+    else:
+        lists = {"test": [line.strip() for line in text.splitlines() if line.strip()]}
+    known: dict[str, int] = {}
+    for i, name in enumerate(names):
+        for key in (name, PurePosixPath(name).name, PurePosixPath(name).stem):
+            known.setdefault(key, i)
+
+    def positions(listed: Sequence[str]) -> list[int]:
+        unknown = [name for name in listed if name not in known]
+        if unknown:
+            raise SceneError(
+                f"data.split_file: {path} lists {unknown[0]!r}, which is no frame of the scene "
+                f"({len(unknown)} such names; the scene's names look like {names[0]!r})"
+            )
+        return sorted({known[name] for name in listed})
+
+    test = positions(lists["test"])
+    return (positions(lists["train"]), test) if "train" in lists else _complement(len(names), test)
+
+
+@dataclass(frozen=True)
+class SplitRule:
+    """A split as it stands in a configuration.
+
+    Args:
+        rule: every_8th, quarter_centre, block, names, folders, json (what the data set itself lists) or list.
+        fraction, position: of ``block``.
+        file: of ``list``.
+    """
+
+    rule: str
+    fraction: float = 0.125
+    position: float = 0.5
+    file: Path | None = None
+
+    RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list")
+
+    def __call__(self, names: Sequence[str], order: Sequence[int], subsets: Sequence[str | None]) -> Positions:
+        """(train, test) positions. Raises SceneError when the rule is unknown or leaves one of the two empty."""
+        rules = {
+            "every_8th": lambda: every_nth(names, 8),
+            "quarter_centre": lambda: quarter_centre(order),
+            "block": lambda: block(order, self.fraction, self.position),
+            "names": lambda: by_name(names),
+            "folders": lambda: by_subset(subsets) if any(subsets) else by_folder(names),
+            "json": lambda: by_subset(subsets),
+            "list": lambda: by_list(names, self._file()),
+        }
+        if self.rule not in rules:
+            raise SceneError(f"data.split={self.rule} is no split; choose one of {', '.join(self.RULES)}")
+        train, test = rules[self.rule]()
+        if not train or not test:
+            raise SceneError(
+                f"data.split={self.rule} leaves {len(train)} training and {len(test)} test frames of {len(names)}; "
+                f"choose another of {', '.join(self.RULES)}"
+            )
+        return train, test
+
+    def _file(self) -> Path:
+        if self.file is None:
+            raise SceneError("data.split=list needs data.split_file: a file with one test name per line")
+        return self.file

@@ -1,0 +1,114 @@
+"""Times of frames from file names and tables: pure functions to seconds (float64), on whatever clock the source has."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+
+from heatsplat.contracts import SceneError
+
+DAY_S = 86400.0
+DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")
+
+
+def _seconds_since_1970(moment: datetime) -> float:
+    # Clock times without a zone are read as UTC: only differences count, and they must not jump with daylight saving.
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def seconds_of_day(digits: str) -> float:
+    """Seconds since midnight of nine digits HHMMSSmmm. Raises ValueError when they are no time of day."""
+    if not re.fullmatch(r"\d{9}", digits):
+        raise ValueError(f"{digits!r} is not nine digits HHMMSSmmm")
+    hours, minutes, seconds, thousandths = int(digits[:2]), int(digits[2:4]), int(digits[4:6]), int(digits[6:])
+    if hours > 23 or minutes > 59 or seconds > 59:
+        raise ValueError(f"{digits!r} is no time of day")
+    return hours * 3600 + minutes * 60 + seconds + thousandths / 1000
+
+
+def unrolled_midnight(times_s: Sequence[float]) -> tuple[list[float], bool]:
+    """Times of day as times of one recording, and whether it passed midnight.
+
+    Sorted names do not tell: a recording from 23:50 to 00:10 sorts as 00:10 .. 23:50. It passed midnight when the
+    longest pause within the day is more than twice the pause across midnight; what lies before that pause is then the
+    next day.
+    """
+    ordered = sorted(times_s)
+    pauses = [b - a for a, b in zip(ordered, ordered[1:], strict=False)]
+    if not pauses:
+        return list(times_s), False
+    longest = max(pauses)
+    if longest <= 2 * (ordered[0] + DAY_S - ordered[-1]):
+        return list(times_s), False
+    last_of_next_day = ordered[pauses.index(longest)]
+    return [t + DAY_S if t <= last_of_next_day else t for t in times_s], True
+
+
+def dji_time(name: str) -> float | None:
+    """Seconds of a DJI name such as DJI_20240806173449_0008_T.JPG (whole seconds, the camera's clock), or None."""
+    match = DJI_NAME.search(PurePosixPath(name).name)
+    return _seconds_since_1970(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
+
+
+def time_by_pattern(name: str, regex: str, form: str | None) -> float:
+    """Seconds from the part of a file name that a regular expression picks.
+
+    Args:
+        name: file name; its last component is searched.
+        regex: expression whose first group is the time (the whole match without a group).
+        form: strptime format of that part, "HHMMSSmmm" for nine digits of a time of day, or None for seconds.
+
+    Raises:
+        SceneError: the name does not match or the part is no time.
+    """
+    match = re.search(regex, PurePosixPath(name).name)
+    if match is None:
+        raise SceneError(f"data.time_regex {regex!r} does not match the image name {name}")
+    part = match[1] if match.re.groups else match[0]
+    try:
+        if form is None:
+            return float(part)
+        return seconds_of_day(part) if form == "HHMMSSmmm" else _seconds_since_1970(datetime.strptime(part, form))
+    except ValueError as error:
+        raise SceneError(f"image name {name}: {part!r} is no time of the form {form or 'seconds'} ({error})") from error
+
+
+def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, float]:
+    """Seconds by file stem from a table; the time column holds seconds or ISO 8601 date-times.
+
+    Raises:
+        SceneError: no such file or column, or a cell that is neither.
+    """
+    if not path.is_file():
+        raise SceneError(f"data.time_csv: there is no file {path}")
+    with path.open(newline="") as file:
+        rows = csv.DictReader(file)
+        columns = rows.fieldnames or []
+        for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
+            if column not in columns:
+                raise SceneError(f"data.{key}={column}: {path} has no such column; it has {', '.join(columns)}")
+        times: dict[str, float] = {}
+        for number, row in enumerate(rows, start=2):
+            cell = row[time_column] or ""
+            try:
+                seconds = float(cell)
+            except ValueError:
+                try:
+                    seconds = _seconds_since_1970(datetime.fromisoformat(cell.strip()))
+                except ValueError as error:
+                    raise SceneError(
+                        f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
+                        "such as 2024-08-06T15:35:05.376"
+                    ) from error
+            times[stem_of(row[name_column])] = seconds
+    return times
+
+
+def stem_of(name: str) -> str:
+    """File name without folder and extension."""
+    base = PurePosixPath(name.replace("\\", "/")).name
+    head, dot, tail = base.rpartition(".")
+    return head if dot and tail.isalnum() and not tail.isdigit() else base
