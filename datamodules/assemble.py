@@ -1,0 +1,421 @@
+"""From raw records to a SceneData: the one place where time gets its origin, and images their grid.
+
+A loader (one file per data set) finds files and fills ``RawFrame`` records; ``build_scene`` does everything that is the
+same for all of them. A scene that never was on disk goes the same way: ``read`` may return an array from memory.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datamodules.formats.images import (
+    PSEUDO_COLOUR_LEVELS,
+    colour_levels,
+    resized,
+    resized_mask,
+    split_alpha,
+    to_grey,
+    undistorted,
+    undistorted_mask,
+)
+from datamodules.formats.lens import Lens
+from datamodules.splits import SplitRule
+from heatsplat.contracts import Camera, Environment, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+
+log = logging.getLogger(__name__)
+
+MAX_VAL_VIEWS = 8
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One image as a loader found it, before anything is resampled, shifted or split.
+
+    Args:
+        name: file name relative to the image folder; splits and messages use it.
+        viewmat: world-to-camera [4, 4] float64, OpenCV axes.
+        lens: intrinsics and distortion, for whatever image size they were written down for.
+        read: returns the stored thermal pixels [H, W] or [H, W, 3 or 4] (RGB, RGBA), uint8, uint16 or float32. Integers
+            span their type (0 .. 255 is 0 .. 1) unless the scene has ``Counts``; float32 holds °C, NaN where unknown.
+        time_s: seconds on any clock, float64, or None.
+        read_rgb: returns a visible image of the same camera, or None.
+        read_mask: returns [H, W] bool for the stored thermal image, True where a pixel counts, or None.
+        subset: "train" or "test" where the data set itself says so (folder, list), else None.
+        environment: weather at that time, or None.
+    """
+
+    name: str
+    viewmat: np.ndarray
+    lens: Lens
+    read: Callable[[], np.ndarray]
+    time_s: float | None = None
+    read_rgb: Callable[[], np.ndarray] | None = None
+    read_mask: Callable[[], np.ndarray] | None = None
+    subset: str | None = None
+    environment: Environment | None = None
+
+
+@dataclass(frozen=True)
+class Counts:
+    """The linear map from stored numbers to temperature: °C = ``scale`` * stored + ``offset_c``."""
+
+    scale: float
+    offset_c: float
+
+    def __post_init__(self) -> None:
+        if self.scale <= 0:
+            raise SceneError(f"data.raw_scale must be positive (°C per count), got {self.scale}")
+
+
+CELSIUS = Counts(scale=1.0, offset_c=0.0)
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """Pixels of one view on their final grid, in the stored type, with what is needed to decode them."""
+
+    frame: Frame
+    thermal: np.ndarray
+    rgb: np.ndarray | None
+    mask: np.ndarray | None
+    zero: float
+    full: float
+    channels: int
+
+    def decode(self) -> View:
+        # numpy, not torch: a thread pool costs more than it gains on one image, and much more on a busy machine.
+        unit = np.subtract(self.thermal, self.zero, dtype=np.float32)
+        unit /= np.float32(self.full)
+        np.clip(unit, 0.0, 1.0, out=unit)
+        if unit.ndim == 2:
+            unit = unit[..., None] if self.channels == 1 else np.repeat(unit[..., None], self.channels, axis=2)
+        rgb = None
+        if self.rgb is not None:
+            full = np.float32(np.iinfo(self.rgb.dtype).max)
+            rgb = torch.from_numpy(np.divide(self.rgb, full, dtype=np.float32))
+        mask = None if self.mask is None else torch.from_numpy(self.mask)
+        return View(frame=self.frame, thermal=torch.from_numpy(unit), rgb=rgb, mask=mask)
+
+
+def build_scene(
+    name: str,
+    frames: Sequence[RawFrame],
+    points: np.ndarray,
+    *,
+    split: SplitRule,
+    point_colors: np.ndarray | None = None,
+    thermal_range: ThermalRange | None = None,
+    counts: Counts | None = None,
+    ambient_c: float | None = None,
+    metres_per_unit: float | None = None,
+    downscale: float = 1.0,
+    thermal_channels: int = 1,
+    alpha_mask: bool = False,
+    notes: Mapping[str, Any] | None = None,
+    probes: np.ndarray | None = None,
+    truth: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> SceneData:
+    """The scene of raw frames and points, in heatsplat's conventions; every assumption stands in its notes.
+
+    In this order: sort by time (by name without times), split, subtract the time of the first training frame, subtract
+    a float64 origin where float32 could not hold the coordinates, undistort, downscale, keep the stored integer type.
+
+    Args:
+        name: scene name.
+        frames: at least one training and one test frame under ``split``.
+        points: [P, 3] in the world of the frames' ``viewmat``, at least 4 finite ones.
+        split: which frames are held out.
+        point_colors: [P, 3] in [0, 1], or None.
+        thermal_range: bounds in °C; with ``counts`` and without bounds they are taken from the training images.
+        counts: map from stored numbers to °C, for raw sensor data; None when integers span their type.
+        ambient_c: temperature of the surroundings, or None.
+        metres_per_unit: scale of the world, or None.
+        downscale: factor >= 1; images become round(W / d) x round(H / d) by area averages.
+        thermal_channels: 1, or 3 to keep pseudo-colour (which has no temperature: the range is dropped).
+        alpha_mask: True to leave out pixels whose alpha is below one half; otherwise alpha is ignored.
+        notes: what the loader found, kept and added to.
+        probes: [n, 3] in the same world as ``points``, or None.
+        truth: function (points [n, 3], times [F]) -> °C [n, F] in the world and on the clock of ``frames``, or None.
+
+    Raises:
+        SceneError: something cannot be used as it is.
+    """
+    notes = dict(notes or {})
+    if not frames:
+        raise SceneError(f"scene {name} has no frames")
+    if not downscale >= 1:
+        raise SceneError(f"data.downscale must be 1 or larger, got {downscale}")
+    if thermal_channels not in (1, 3):
+        raise SceneError(f"data.thermal_channels must be 1 or 3, got {thermal_channels}")
+
+    frames, times, time_notes = _in_order(frames)
+    notes |= time_notes
+    order = list(range(len(frames)))
+    train, test = split([f.name for f in frames], order, [f.subset for f in frames])
+    train, test = sorted(train), sorted(test)
+    first_s = times[train[0]] if times else None
+    val = [test[i] for i in _evenly(len(test), MAX_VAL_VIEWS)]
+    notes |= {
+        "split": split.rule,
+        "train_views": len(train),
+        "test_views": len(test),
+        "val_views": f"{len(val)} of the test views, evenly spaced; they draw curves and select nothing",
+    }
+    if left_out := len(frames) - len(set(train) | set(test)):
+        notes["split_left_out"] = f"{left_out} frames are in neither list and are not used"
+
+    points, point_colors, point_notes = _checked_points(name, points, point_colors)
+    notes |= point_notes
+    origin = _origin_of(frames, points)
+    if origin.any():
+        notes["origin"] = origin.tolist()
+        notes["recentred"] = "coordinates too large for float32: 'origin' (world units) was subtracted from the scene"
+
+    used = sorted(set(train) | set(test))
+    prepared = {i: _prepare(frames[i], downscale, thermal_channels, alpha_mask) for i in used}
+    kinds = {p.thermal.dtype.kind for p in prepared.values()}
+    if len(kinds) > 1:
+        raise SceneError(f"scene {name} mixes float images (°C) with integer images; convert them to one kind")
+    if kinds == {"f"}:
+        counts = counts or CELSIUS
+        notes["encoding"] = "float pixels are temperatures in °C"
+    if counts and thermal_range is None:
+        thermal_range = _range_of([prepared[i] for i in train], counts)
+        notes["bounds_source"] = "0.1 and 99.9 percentile of the training images: none were given"
+    colour = {frames[i].name: p.colour for i, p in prepared.items() if p.colour > PSEUDO_COLOUR_LEVELS}
+    if colour and thermal_range is not None and thermal_channels == 1:
+        raise SceneError(
+            f"image {next(iter(colour))} of scene {name} is pseudo-colour (its channels differ by "
+            f"{max(colour.values()):.0f} grey levels on average), so its values are no temperatures although the scene "
+            "has bounds. Point the loader at grey images, or train on the colours with data.thermal_channels=3 (no °C)."
+        )
+    if thermal_channels == 3 and thermal_range is not None:
+        thermal_range = None
+        notes["bounds_ignored"] = "three thermal channels are pseudo-colour, which has no temperature"
+    if colour and thermal_channels == 1:
+        notes["pseudo_colour"] = f"{len(colour)} images are pseudo-colour; their luma is used and is no temperature"
+    notes |= _image_notes(prepared, downscale)
+
+    stored: dict[int, _Stored] = {}
+    for i in used:
+        p, raw = prepared.pop(i), frames[i]
+        viewmat = raw.viewmat.astype(np.float64, copy=True)
+        viewmat[:3, 3] += viewmat[:3, :3] @ origin
+        camera = Camera(torch.from_numpy(viewmat), torch.from_numpy(p.lens.matrix()), p.lens.width, p.lens.height)
+        time_s = None if times is None else times[i] - first_s
+        frame = Frame(name=raw.name, frame_id=i, camera=camera, time_s=time_s, environment=raw.environment)
+        zero, full = _scaling(p.thermal.dtype, counts, thermal_range)
+        stored[i] = _Stored(frame, p.thermal, p.rgb, p.mask, zero, full, thermal_channels)
+    if counts:
+        notes["clipped_fraction"] = _clipped_fraction(list(stored.values()))
+    if thermal_range is None:
+        notes["thermal_range_c"] = "none: image values are no temperatures, and errors in °C are undefined"
+    else:
+        notes["thermal_range_c"] = [thermal_range.min_c, thermal_range.max_c]
+
+    def views(positions: Sequence[int]) -> ViewSet:
+        items = [stored[i] for i in positions]
+        return ViewSet([item.frame for item in items], lambda k: items[k].decode())
+
+    shift = torch.from_numpy(origin)
+    return SceneData(
+        name=name,
+        train=views(train),
+        val=views(val),
+        test=views(test),
+        points=torch.from_numpy((points - origin).astype(np.float32)),
+        point_colors=None if point_colors is None else torch.from_numpy(point_colors.astype(np.float32)),
+        thermal_range=thermal_range,
+        ambient_c=ambient_c,
+        metres_per_unit=metres_per_unit,
+        notes=notes,
+        probes=None if probes is None else torch.from_numpy((probes - origin).astype(np.float32)),
+        truth=truth and (lambda where, when: truth(where + shift.to(where), when + (first_s or 0.0))),
+    )
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    thermal: np.ndarray
+    rgb: np.ndarray | None
+    mask: np.ndarray | None
+    lens: Lens
+    found: dict[str, Any]
+    colour: float
+
+
+def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool) -> _Prepared:
+    """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them."""
+    pixels, alpha = split_alpha(frame.read())
+    height, width = pixels.shape[:2]
+    colour = colour_levels(pixels)
+    found = {
+        "size": f"{width}x{height}",
+        "type": str(pixels.dtype),
+        "channels": ("L" if pixels.ndim == 2 else "RGB") + ("A" if alpha is not None else ""),
+        "model": frame.lens.model,
+        "distorted": frame.lens.is_distorted,
+        "rescaled": (frame.lens.width, frame.lens.height) != (width, height),
+        "nan": 0,
+        "rgb_resized": False,
+    }
+    mask = alpha if alpha_mask else None
+    if frame.read_mask is not None:
+        given = frame.read_mask()
+        if given.shape != (height, width):
+            raise SceneError(
+                f"mask of {frame.name} is {given.shape[1]}x{given.shape[0]} but the image is {width}x{height}; "
+                "masks must have the size of the stored image"
+            )
+        mask = given if mask is None else mask & given
+    if pixels.ndim == 3 and (channels == 1 or pixels.dtype.kind == "f"):
+        pixels = to_grey(pixels)
+    if pixels.dtype.kind == "f":
+        finite = np.isfinite(pixels)
+        found["nan"] = int(finite.size - finite.sum())
+        if found["nan"]:
+            if not finite.any():
+                raise SceneError(f"image {frame.name} holds no finite pixel; remove it from the scene")
+            # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
+            pixels = np.where(finite, pixels, np.median(pixels[finite]))
+            mask = finite if mask is None else mask & finite
+    rgb = None
+    if frame.read_rgb is not None:
+        rgb, _ = split_alpha(frame.read_rgb())
+        rgb = rgb if rgb.ndim == 3 else np.repeat(rgb[..., None], 3, axis=2)
+        found["rgb_resized"] = rgb.shape[:2] != (height, width)
+        rgb = resized(rgb, width, height)
+    lens = frame.lens.resized(width, height)
+    if lens.is_distorted:
+        pixels, mask = undistorted(pixels, lens), undistorted_mask(mask, lens)
+        rgb = None if rgb is None else undistorted(rgb, lens)
+    small = (max(1, round(width / downscale)), max(1, round(height / downscale)))
+    pixels = resized(pixels, *small)
+    rgb = None if rgb is None else np.ascontiguousarray(resized(rgb, *small))
+    mask = None if mask is None else resized_mask(mask, *small)
+    if mask is not None and mask.all():
+        mask = None
+    return _Prepared(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] | None, dict[str, Any]]:
+    """Frames by (time, name), their times or None, and what to note about them."""
+    known = [f.time_s for f in frames if f.time_s is not None]
+    if len(known) < len(frames):
+        notes: dict[str, Any] = {"time": "none: only static methods apply"}
+        if known:
+            notes["time"] = f"none: only {len(known)} of {len(frames)} frames have a time, so no time is used"
+        return sorted(frames, key=lambda f: f.name), None, notes
+    frames = sorted(frames, key=lambda f: (f.time_s, f.name))
+    times = [float(f.time_s) for f in frames]
+    if not np.isfinite(times).all():
+        raise SceneError(f"frame {frames[int(np.argmin(np.isfinite(times)))].name} has a time that is no finite number")
+    notes = {"duration_s": times[-1] - times[0]}
+    if repeated := len(times) - len(set(times)):
+        notes["duplicate_times"] = f"{repeated} frames share their time with another one; all are kept"
+        log.warning("%d frames share their time with another one; all are kept", repeated)
+    return frames, times, notes
+
+
+def _checked_points(
+    name: str, points: np.ndarray, colors: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
+    """Finite points [P, 3] float64 with their colours. Raises SceneError when fewer than 4 are left."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    finite = np.isfinite(points).all(axis=1)
+    notes: dict[str, Any] = {"points": int(finite.sum())}
+    if not finite.all():
+        notes["points_dropped"] = f"{int((~finite).sum())} points with NaN or infinite coordinates"
+    if finite.sum() < 4:
+        raise SceneError(
+            f"scene {name} has {int(finite.sum())} finite points, at least 4 are needed to start from; "
+            "check points3D in the sparse model"
+        )
+    return points[finite], None if colors is None else np.asarray(colors)[finite], notes
+
+
+def _origin_of(frames: Sequence[RawFrame], points: np.ndarray) -> np.ndarray:
+    """What to subtract from all coordinates [3] float64: zero unless float32 would lose the scene's detail.
+
+    float32 resolves 1.2e-7 of a coordinate. The rule asks for 1e-5 of the scene's size (cameras, or points if they
+    spread further), which UTM coordinates of a scene of 100 m miss by a factor of 100.
+    """
+    centers = np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frames])
+    centroid = np.median(centers, axis=0)
+    radius = np.linalg.norm(centers - centroid, axis=1).max()
+    spread = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    size = max(radius, spread)
+    if np.linalg.norm(centroid) * np.finfo(np.float32).eps <= 1e-5 * size:
+        return np.zeros(3)
+    return np.round(centroid)
+
+
+def _range_of(prepared: Sequence[_Prepared], counts: Counts) -> ThermalRange:
+    """Bounds that hold 99.8 % of the unmasked pixels; the rest clips, so that a hot pixel does not flatten a scene."""
+    values = np.concatenate([(p.thermal if p.mask is None else p.thermal[p.mask]).ravel()[::7] for p in prepared])
+    low, high = np.percentile(values.astype(np.float64), [0.1, 99.9]) if values.size else (0.0, 0.0)
+    if not low < high:
+        raise SceneError(f"the training images are constant ({low}), so no temperature range can be taken from them")
+    return ThermalRange(counts.scale * low + counts.offset_c, counts.scale * high + counts.offset_c)
+
+
+def _scaling(dtype: np.dtype, counts: Counts | None, bounds: ThermalRange | None) -> tuple[float, float]:
+    """(zero, full): an image value in [0, 1] is (stored - zero) / full."""
+    if counts is None or bounds is None:
+        return 0.0, float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
+    return (bounds.min_c - counts.offset_c) / counts.scale, bounds.span_k / counts.scale
+
+
+def _clipped_fraction(stored: Sequence[_Stored]) -> float:
+    """Share of all pixels that lie outside the bounds and are clipped to them."""
+    outside = sum(int(((s.thermal < s.zero) | (s.thermal > s.zero + s.full)).sum()) for s in stored)
+    return outside / sum(s.thermal.size for s in stored)
+
+
+def _image_notes(prepared: Mapping[int, _Prepared], downscale: float) -> dict[str, Any]:
+    """What the images of a scene have in common and where they differ."""
+    found = [p.found for p in prepared.values()]
+
+    def tally(key: str) -> str:
+        counted = Counter(str(f[key]) for f in found)
+        return next(iter(counted)) if len(counted) == 1 else ", ".join(f"{k} ({n})" for k, n in counted.items())
+
+    grids = Counter(f"{p.lens.width}x{p.lens.height}" for p in prepared.values())
+    notes: dict[str, Any] = {
+        "image_size": tally("size"),
+        "pixel_type": tally("type"),
+        "channels": tally("channels"),
+        "camera_model": tally("model"),
+        "downscale": downscale,
+        "grid": ", ".join(grids),
+    }
+    if rescaled := sum(f["rescaled"] for f in found):
+        notes["intrinsics_rescaled"] = (
+            f"{rescaled} images differ in size from their camera; intrinsics follow the image"
+        )
+    if distorted := sum(f["distorted"] for f in found):
+        notes["distortion"] = f"{distorted} images undistorted onto a pinhole of the same focal length"
+    if nan := sum(f["nan"] for f in found):
+        notes["nan_pixels"] = f"{nan} pixels are NaN or infinite and masked"
+        log.warning("%d pixels are NaN or infinite and masked", nan)
+    if rgb := sum(f["rgb_resized"] for f in found):
+        notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
+    if masked := [p.mask for p in prepared.values() if p.mask is not None]:
+        share = sum(int((~m).sum()) for m in masked) / sum(
+            p.thermal.shape[0] * p.thermal.shape[1] for p in prepared.values()
+        )
+        notes["masked_fraction"] = share
+    return notes
+
+
+def _evenly(count: int, most: int) -> list[int]:
+    """At most ``most`` positions out of ``count``, evenly spaced, both ends included."""
+    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))})
