@@ -11,6 +11,7 @@ from torch import Tensor
 log = logging.getLogger(__name__)
 
 LOWEST_HZ = 1e-5  # ETGS Eq. 27
+SAME_MOMENT_S = 1e-6  # timestamps closer than this are one moment: clocks since 1970 in float64 resolve 2e-7 s
 NARROWEST_BAND = 1.2  # the highest frequency is at least this times the lowest (ETGS Eq. 34)
 
 
@@ -60,14 +61,11 @@ def frequency_grid(timestamps: Tensor, count: int, tau_min: float, gain: float) 
         raise ValueError(f"tau_min must be a number of seconds above 0, got {tau_min}")
     lowest = max(1 / gaps.sum().item(), LOWEST_HZ)
     sampled = 0.5 / gaps.min().item()
-    followed = math.sqrt(1 / gain**2 - 1) / (2 * math.pi * tau_min)
+    followed = math.sqrt((1 - gain) * (1 + gain)) / gain / (2 * math.pi * tau_min)
     highest = max(min(sampled, followed), NARROWEST_BAND * lowest)
     steps = torch.arange(int(count), dtype=torch.float64) / max(count - 1, 1)
     omega = 2 * math.pi * lowest * (highest / lowest) ** steps
-    # Neighbours closer than rounding are the same frequency twice, which would make their gains arbitrary.
-    apart = torch.ones_like(omega, dtype=torch.bool)
-    apart[1:] = omega[1:] > omega[:-1] * (1 + 1e-12)
-    return omega[apart]
+    return omega.unique()
 
 
 def _positive_gaps(timestamps: Tensor) -> Tensor:
@@ -75,4 +73,4 @@ def _positive_gaps(timestamps: Tensor) -> Tensor:
     if not times.isfinite().all():
         raise ValueError("timestamps must be finite numbers of seconds; a frame without a time cannot be used here")
     gaps = times.sort().values.diff()
-    return gaps[gaps > 0]
+    return gaps[gaps > SAME_MOMENT_S]

@@ -1,10 +1,9 @@
 """Newton's law of cooling with harmonic sources, in closed form: dT/dt = -a (T - T_ambient) + sum of sources.
 
 The response from rest to the source e^{iωt} is K(t) = ∫_0^t e^{-a(t-s)} e^{iωs} ds = (e^{iωt} - e^{-at}) / (a + iω);
-its real part answers cos ωt and its imaginary part sin ωt. Printed as it stands (ETGS, ICLR 2026, Eq. 8, with τ = 1/a)
-it
-divides nothing by nothing in every limit: in float32 it was measured to be wrong by 600 %. Written in the dimensionless
-x = ωt and y = at, with functions that stay of order one,
+its real part answers cos ωt and its imaginary part sin ωt. As printed (ETGS, ICLR 2026, Eq. 8, with τ = 1/a) it becomes
+0/0 or inf - inf in every limit; in float32 it was measured to be wrong by 600 %. Written in the dimensionless x = ωt
+and y = at, with functions that stay of order one,
 
     φ = (1 - e^{-y})/y,   sinc = sin x / x,   cosc = (1 - cos x)/x,   q = y²/(x² + y²),   o = 1 - q,   p = xy/(x² + y²)
     response to cos = t [q φ + o sinc - p cosc]
@@ -116,7 +115,7 @@ def temperature(
 
 
 def relax(time: Tensor, ambient: Tensor, initial: Tensor, rate: Tensor) -> Tensor:
-    """Temperature of bodies without a source, [N]: initial at first, ambient in the end. Arguments as ``temperature``."""
+    """Temperature of bodies without a source, [N]: first initial, in the end ambient. Arguments as ``temperature``."""
     y = bounded_rate(rate, time) * time.to(rate)
     # Each side from its own end, so that t = 0 returns the initial temperature exactly and t = ∞ the ambient.
     early, late = initial - (initial - ambient) * -torch.expm1(-y), ambient + (initial - ambient) * torch.exp(-y)

@@ -73,9 +73,9 @@ class PerGaussian:
     Args:
         initial: [N, ...] starting values.
         lr: learning rate.
-        l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled weight
-            decay of 2 * l2 is exactly its gradient).
-        l2_mean: divides l2 by the current number of Gaussians, so that the penalty is a mean over them instead of a sum.
+        l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled
+            weight decay of 2 * l2 is exactly its gradient).
+        l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them.
     """
 
     initial: Tensor
@@ -135,7 +135,7 @@ class ThermalModel(nn.Module, ABC):
         return None
 
     def effects(self) -> dict[str, dict]:
-        """The physical effects that the model simulates, by catalogue name, each with its settings (for metrics.json)."""
+        """The physical effects that the model simulates: catalogue name -> settings (for metrics.json)."""
         return {}
 
     @property

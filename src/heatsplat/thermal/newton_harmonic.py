@@ -1,4 +1,4 @@
-"""ETGS: every Gaussian relaxes to the ambient temperature (Newton) and is heated by a sum of harmonics, in closed form."""
+"""ETGS: every Gaussian relaxes to the ambient temperature and is heated by a sum of harmonics, in closed form."""
 
 from __future__ import annotations
 
@@ -21,10 +21,7 @@ PARAMS = ("rate", "faithful")
 REDUCTIONS = ("sum", "mean_over_gaussians")
 CLIPS = ("straight_through", "hard", "none")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
-LOG_RATES = (
-    -80.0,
-    30.0,
-)  # of the rate per span; wide enough to mean never and at once, narrow enough for float32 squares
+LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
 
 class NewtonHarmonic(ThermalModel):
@@ -34,8 +31,8 @@ class NewtonHarmonic(ThermalModel):
     which an optimiser can so evade. ``param="rate"`` learns the three ratios; ``param="faithful"`` learns the paper's
     four and fixes the scale by a weak prior that keeps C near 1.
 
-    **Convention:** inside, time is counted in observed spans and temperature in image units u = (T - Tmin)/(Tmax -
-    Tmin); so are rates and gains, and so is the penalty. A scene without a range is modelled in image values, with no
+    **Convention:** inside, time is counted in observed spans and temperature in image units, 0 at Tmin and 1 at Tmax;
+    so are rates and gains, and so is the penalty. A scene without a range is modelled in image values, with no
     temperature in kelvin.
 
     Tensors: "initial_state" [N], "source_gains" [N, 2, K] (sin, cos; absent without frequencies) and "log_rate" [N], or
@@ -44,8 +41,7 @@ class NewtonHarmonic(ThermalModel):
     Args:
         frequencies: harmonics asked for; the grid may hold fewer. 0 is pure relaxation, without any tensor of a source.
         param: "rate" or "faithful".
-        tau_min_s: shortest time constant in seconds that bounds the frequencies; None takes max(median gap, span /
-            200).
+        tau_min_s: shortest time constant, bounds the frequencies; None takes max(median gap of the times, span / 200).
         frequency_gain: steady-state amplitude below which a frequency is left out, in (0, 1].
         source_l2: weight of the penalty on gains.
         l2_reduction: "sum" over Gaussians and frequencies (the paper; grows with the number of Gaussians) or
