@@ -1,0 +1,349 @@
+"""ETGS's thermal model: what it learns, what it refuses, what is absent, and what a checkpoint carries."""
+
+import io
+import logging
+import math
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.physics.relaxation import temperature
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.newton_harmonic import NewtonHarmonic
+
+RANGE = ThermalRange(20.0, 70.0)
+SPAN_S = 400.0
+
+
+def scene(times=None, thermal_range=RANGE, ambient_c=26.0):
+    times = torch.linspace(0, SPAN_S, 81).tolist() if times is None else times
+    camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
+    frames = [Frame(f"{i}.png", i, camera, time) for i, time in enumerate(times)]
+    views = ViewSet(frames, lambda i: None)
+    return SceneData("kettle", views, views, views, torch.zeros(4, 3), None, thermal_range, ambient_c)
+
+
+def seeds(count=6):
+    generator = torch.Generator().manual_seed(0)
+    return Seeds(torch.randn(count, 3, generator=generator), torch.rand(count, 1, generator=generator), generator)
+
+
+def splats_of(model, start, dtype=torch.float32):
+    count = len(start.means)
+    tensors = {"means": start.means, "log_scales": torch.zeros(count, 3), "quats": torch.ones(count, 4)}
+    tensors |= {"opacity_logits": torch.zeros(count, 1)}
+    tensors |= {name: item.initial for name, item in model.per_gaussian(start).items()}
+    return Splats({name: tensor.to(dtype) for name, tensor in tensors.items()})
+
+
+def ready(start=None, scene_data=None, dtype=torch.float32, **options):
+    model = NewtonHarmonic(**options)
+    model.prepare(scene_data or scene())
+    return model, splats_of(model, start or seeds(), dtype)
+
+
+def stir(splats, size=0.3):
+    """The same splats with random thermal tensors."""
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for name in splats.names:
+            tensor = splats[name]
+            tensor += size * torch.randn(tensor.shape, generator=generator)
+    return splats
+
+
+@pytest.mark.parametrize("param", ["rate", "faithful"])
+def test_it_starts_at_the_seed_values_and_relaxes_to_the_ambient(param):
+    start = seeds()
+    model, splats = ready(start, param=param)
+    first = model.features(splats, Query(time_s=0.0)).features
+    torch.testing.assert_close(first, start.values)
+    late = model.features(splats, Query(time_s=100 * SPAN_S)).features
+    torch.testing.assert_close(late, torch.full_like(late, (26.0 - 20.0) / 50.0))
+
+
+def test_values_are_the_closed_form_in_seconds_and_celsius():
+    """Undoes the normalisation by hand: rates per second, gains in °C per second."""
+    model, splats = ready(dtype=torch.float64)
+    stir(splats, 0.1)
+    time_s = 137.0
+    gains = splats["source_gains"].detach() * RANGE.span_k / SPAN_S
+    expected = temperature(
+        torch.tensor(time_s, dtype=torch.float64),
+        torch.tensor(26.0, dtype=torch.float64),
+        RANGE.to_celsius(splats["initial_state"].detach()),
+        splats["log_rate"].detach().exp() / SPAN_S,
+        model.omega / SPAN_S,
+        gains[:, 0],
+        gains[:, 1],
+    )
+    torch.testing.assert_close(model.temperature(splats, time_s).detach(), expected + 273.15, rtol=0, atol=1e-5)
+
+
+def test_frequencies_span_one_cycle_to_the_half_power_point():
+    model, _ = ready(tau_min_s=10.0)
+    assert model.omega.shape == (24,)
+    assert (model.omega[0] / SPAN_S).item() == pytest.approx(2 * math.pi / SPAN_S)
+    assert (model.omega[-1] / SPAN_S).item() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("frequencies", [1, 3, 24])
+@pytest.mark.parametrize("param", ["rate", "faithful"])
+def test_gradients_in_float32_are_those_of_float64(frequencies, param):
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        model, splats = ready(dtype=dtype, frequencies=frequencies, param=param, ambient="learned")
+        stir(splats)
+        weights = torch.linspace(-1, 1, 4)
+        emitted = model.features(splats, Query(torch.tensor([4, 1, 5, 0]), time_s=77.0)).features[:, 0]
+        (emitted * weights).sum().backward()
+        names = set(splats.names) - {"means", "log_scales", "quats", "opacity_logits"}
+        found[dtype] = {name: splats[name].grad for name in names} | {"ambient": model.ambient.grad}
+    for name, exact in found[torch.float64].items():
+        torch.testing.assert_close(found[torch.float32][name].double(), exact.double(), rtol=2e-5, atol=2e-6, msg=name)
+        assert exact.abs().max() > 0, name
+
+
+def test_rows_out_of_view_are_not_read_and_get_no_gradient():
+    model, splats = ready()
+    stir(splats)
+    seen = torch.tensor([5, 2])
+    expected = model.features(splats, Query(time_s=50.0)).features[seen]
+    unseen = torch.tensor([0, 1, 3, 4])
+    with torch.no_grad():
+        splats["source_gains"][unseen] = torch.nan
+        splats["initial_state"][unseen] = torch.nan
+    emitted = model.features(splats, Query(seen, time_s=50.0)).features
+    assert torch.equal(emitted, expected)
+    emitted.sum().backward()
+    for name in ("source_gains", "initial_state", "log_rate"):
+        gradient = splats[name].grad
+        assert not gradient[unseen].any(), name
+        assert gradient[seen].abs().flatten(1).max(1).values.all() if gradient.ndim > 1 else gradient[seen].all(), name
+
+
+def fit(model, splats, declared, observed, times_s, steps):
+    groups = [{"params": [splats[name]], "lr": item.lr, "weight_decay": 2 * item.l2} for name, item in declared.items()]
+    optimizer = torch.optim.Adam(groups, eps=1e-15)
+    for step in range(steps):
+        if step == steps // 2:
+            for group in optimizer.param_groups:
+                group["lr"] /= 10
+        shown = step * 37 % len(times_s)
+        error = model.features(splats, Query(time_s=times_s[shown])).features[:, 0] - observed[shown]
+        optimizer.zero_grad()
+        error.square().mean().backward()
+        optimizer.step()
+
+
+def test_it_recovers_the_rates_of_cooling_bodies():
+    start = Seeds(torch.zeros(20, 3), torch.linspace(0.5, 1, 20)[:, None], torch.Generator())
+    model, splats = ready(start, frequencies=0, lr_rate=2e-2)
+    rates = torch.linspace(1.0, 12.0, 20)
+    times_s = torch.linspace(0, SPAN_S, 81).tolist()
+    initial, ambient = start.values[:, 0], 0.12
+    observed = [ambient + (initial - ambient) * torch.exp(-rates * time / SPAN_S) for time in times_s]
+    fit(model, splats, model.per_gaussian(start), observed, times_s, steps=1500)
+    torch.testing.assert_close(splats["log_rate"].detach().exp(), rates, rtol=0.02, atol=0)
+
+
+def test_it_learns_a_driven_temperature_at_unseen_times():
+    """A thermostat between two frequencies of the grid: half a degree of 50 off, and four without a source."""
+    count, times_s = 12, torch.linspace(0, SPAN_S, 81).tolist()
+    phase = torch.linspace(0, 3, count)
+    observed = [0.5 + 0.2 * torch.sin(2 * math.pi * 3.3 * time / SPAN_S + phase) for time in times_s]
+    error = {}
+    for frequencies in (0, 24):
+        start = Seeds(torch.zeros(count, 3), observed[0][:, None].clone(), torch.Generator())
+        model, splats = ready(start, frequencies=frequencies, tau_min_s=5.0, source_l2=0.0, lr_gain=2e-2)
+        fit(model, splats, model.per_gaussian(start), observed[::2], times_s[::2], steps=1500)
+        shown = torch.stack([model.features(splats, Query(time_s=time)).features[:, 0] for time in times_s[1::2]])
+        error[frequencies] = (shown - torch.stack(observed[1::2])).abs().mean().item()
+    assert error[24] < 0.01
+    assert error[0] > 0.08
+
+
+def test_without_frequencies_the_source_is_absent():
+    model, splats = ready(frequencies=0)
+    assert "source_gains" not in splats
+    assert model.effects() == {"relaxation": {"param": "rate", "ambient": "fixed"}}
+    assert model.cost < NewtonHarmonic().cost + 1
+    with_source, _ = ready(frequencies=24)
+    assert with_source.effects()["harmonic_source"] == {"frequencies": 24}
+    assert with_source.cost > 10 * model.cost
+
+
+def test_zero_gains_equal_no_frequencies():
+    start = seeds()
+    with_source, splats = ready(start)
+    without, plain = ready(start, frequencies=0)
+    query = Query(time_s=33.0)
+    assert torch.equal(with_source.features(splats, query).features, without.features(plain, query).features)
+
+
+@pytest.mark.parametrize("times", [[5.0], [3.0, 3.0, 3.0]])
+def test_one_moment_leaves_relaxation_and_says_so(times, caplog):
+    model, splats = ready(scene_data=scene(times))
+    assert model.omega.numel() == 0
+    assert "source_gains" not in splats
+    assert "one moment only" in caplog.text
+    assert model.features(splats, Query(time_s=3.0)).features.isfinite().all()
+
+
+def test_a_scene_without_times_is_refused():
+    model = NewtonHarmonic()
+    with pytest.raises(SceneError, match="NewtonHarmonic needs time, which scene 'kettle' does not have"):
+        model.check(scene([0.0, None, 2.0]))
+    with pytest.raises(SceneError, match="needs time"):
+        model.prepare(scene([None, None]))
+
+
+def test_a_query_without_time_is_refused():
+    model, splats = ready()
+    with pytest.raises(ValueError, match="give time_s"):
+        model.features(splats, Query())
+
+
+def test_a_scene_without_range_is_modelled_in_image_values(caplog):
+    start = seeds()
+    model, splats = ready(start, scene(thermal_range=None))
+    assert "no temperature range" in caplog.text
+    assert "it is learned" in caplog.text
+    assert model.temperature(splats, 1.0) is None
+    assert model.ambient.item() == pytest.approx(start.values.median().item())
+    torch.testing.assert_close(model.features(splats, Query(time_s=0.0)).features, start.values)
+
+
+def test_ambient_measured_learned_or_given(caplog):
+    fixed, _ = ready()
+    assert [*fixed.parameters()] == []
+    assert fixed.ambient.item() == pytest.approx(0.12)
+    given, _ = ready(ambient=45.0)
+    assert given.ambient.item() == pytest.approx(0.5)
+    learned, splats = ready(ambient="learned")
+    assert learned.ambient.item() == pytest.approx(0.12)
+    assert [*learned.parameters()] == [learned.ambient]
+    learned.features(splats, Query(time_s=200.0)).features.sum().backward()
+    assert learned.ambient.grad.item() == pytest.approx(6 * (1 - math.exp(-2)), rel=1e-5)
+    assert caplog.text == ""
+    missing, _ = ready(scene_data=scene(ambient_c=None))
+    assert isinstance(missing.ambient, torch.nn.Parameter)
+    assert "no measured ambient temperature: it is learned" in caplog.text
+    with pytest.raises(SceneError, match="ambient=30.0 is in °C, but scene 'kettle' has no temperature range"):
+        ready(scene_data=scene(thermal_range=None), ambient=30.0)
+
+
+def test_clipping_straight_through_hard_and_none():
+    start = Seeds(torch.zeros(3, 3), torch.tensor([[-0.5], [0.5], [1.5]]), torch.Generator())
+    expected = {
+        "straight_through": ([0.0, 0.5, 1.0], [1, 1, 1]),
+        "hard": ([0.0, 0.5, 1.0], [0, 1, 0]),
+        "none": ([-0.5, 0.5, 1.5], [1, 1, 1]),
+    }
+    for clip, (values, gradients) in expected.items():
+        model, splats = ready(start, clip=clip)
+        emitted = model.features(splats, Query(time_s=0.0)).features
+        emitted.sum().backward()
+        assert emitted[:, 0].tolist() == values
+        assert splats["initial_state"].grad.tolist() == gradients
+
+
+def test_faithful_form_has_a_gauge_that_only_its_prior_sees():
+    """C, h, A and B times a factor: the same image, a smaller penalty on A and B; only the prior on C holds it."""
+    model, splats = ready(param="faithful", dtype=torch.float64)
+    stir(splats)
+    query = Query(time_s=91.0)
+    before = model.features(splats, query).features
+    factor = 0.1
+    with torch.no_grad():
+        splats["log_capacity"].add_(math.log(factor))
+        splats["log_conductance"].add_(math.log(factor))
+        splats["source_gains"].mul_(factor)
+    torch.testing.assert_close(model.features(splats, query).features, before, rtol=1e-12, atol=1e-12)
+    declared = model.per_gaussian(seeds())
+    assert declared["log_capacity"].l2 > 0
+    assert declared["source_gains"].l2 > 0
+    assert declared["log_conductance"].l2 == declared["initial_state"].l2 == 0
+
+
+def test_faithful_and_rate_form_agree():
+    faithful, splats = ready(param="faithful", dtype=torch.float64)
+    stir(splats)
+    rate, same = ready(dtype=torch.float64)
+    capacity = splats["log_capacity"].detach().exp()
+    with torch.no_grad():
+        same["initial_state"].copy_(splats["initial_state"])
+        same["log_rate"].copy_(splats["log_conductance"] - splats["log_capacity"])
+        same["source_gains"].copy_(splats["source_gains"] / capacity[:, None, None])
+    torch.testing.assert_close(faithful.temperature(splats, 60.0), rate.temperature(same, 60.0), rtol=1e-12, atol=0)
+
+
+def test_the_penalty_is_a_sum_or_a_mean():
+    summed = ready()[0].per_gaussian(seeds())["source_gains"]
+    meant = ready(l2_reduction="mean_over_gaussians")[0].per_gaussian(seeds())["source_gains"]
+    assert (summed.l2, summed.l2_mean) == (1e-5, False)
+    assert (meant.l2, meant.l2_mean) == (1e-5, True)
+
+
+@pytest.mark.parametrize("log_rate", [math.log(1e-30), -1e4, 1e4])
+def test_extreme_rates_stay_finite(log_rate):
+    model, splats = ready()
+    with torch.no_grad():
+        splats["log_rate"].fill_(log_rate)
+        splats["source_gains"].fill_(0.1)
+    for time_s in (-SPAN_S, 0.0, 1e-3, SPAN_S):
+        splats.zero_grad()
+        emitted = model.features(splats, Query(time_s=time_s)).features
+        emitted.sum().backward()
+        assert emitted.isfinite().all()
+        assert all(splats[name].grad.isfinite().all() for name in ("log_rate", "source_gains", "initial_state"))
+
+
+def test_a_checkpoint_carries_grid_range_span_and_ambient():
+    model, splats = ready(ambient="learned")
+    stir(splats)
+    with torch.no_grad():
+        model.ambient.fill_(0.33)
+    file = io.BytesIO()
+    torch.save({"model": model.state_dict(), "splats": splats.state_dict()}, file)
+    file.seek(0)
+    stored = torch.load(file, weights_only=True)
+    other, loaded = ready(
+        scene_data=scene(torch.linspace(0, 9.0, 81).tolist(), ThermalRange(0, 1), 0.5), ambient="learned"
+    )
+    other.load_state_dict(stored["model"])
+    loaded.load_state_dict(stored["splats"])
+    assert torch.equal(other.temperature(loaded, 123.0), model.temperature(splats, 123.0))
+    assert set(stored["model"]) == {"omega", "span_s", "range_c", "ambient"}
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"param": "tau"}, "param must be one of rate, faithful, got 'tau'"),
+        ({"clip": "soft"}, "clip must be one of"),
+        ({"l2_reduction": "mean"}, "l2_reduction must be one of sum, mean_over_gaussians"),
+        ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
+    ],
+)
+def test_unknown_options_are_named(option, message):
+    with pytest.raises(ValueError, match=message):
+        NewtonHarmonic(**option)
+
+
+def test_the_configuration_holds_the_defaults(request):
+    config = OmegaConf.load(request.config.rootpath / "conf/thermal/newton_harmonic.yaml")
+    model, default = instantiate(config), NewtonHarmonic()
+    settings = {key: value for key, value in vars(default).items() if isinstance(value, (int, float, str, type(None)))}
+    assert settings
+    for key, value in settings.items():
+        assert getattr(model, key) == pytest.approx(value) if isinstance(value, float) else getattr(model, key) == value
+
+
+def test_messages_are_warnings(caplog):
+    ready(scene_data=scene(ambient_c=None))
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
