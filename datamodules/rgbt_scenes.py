@@ -1,0 +1,80 @@
+"""RGBT-Scenes, the data set of ThermalGaussian: paired visible and pseudo-colour thermal images, no temperatures."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from datamodules.base import RawFrame, SceneDataModule
+from datamodules.colmap import image_index, match_model
+from datamodules.formats.colmap import SparseModel, find_model, read_model
+from datamodules.formats.images import ImageIndex, read_image
+from heatsplat.contracts import SceneData
+
+SUBSETS = {"train": "train", "test": "test", "eval": "test", "val": "test"}
+
+
+class RGBTScenes(SceneDataModule):
+    """root/scene with rgb/{train,test}, thermal/{train,test} and one sparse/0 for both.
+
+    Args:
+        rgb: True to load the visible images as well.
+        shared: options of every loader (``SceneDataModule``).
+    """
+
+    def __init__(self, *, split: str = "folders", thermal_channels: int = 3, rgb: bool = True, **shared: Any) -> None:
+        super().__init__(split=split, thermal_channels=thermal_channels, **shared)
+        self.rgb = rgb
+
+    def load(self) -> SceneData:
+        folder = self.scene_folder(is_paired, "thermal/ or a sparse model (sparse/0)")
+        model = read_model(folder)
+        frames, notes = paired_frames(self, folder, model, self.rgb)
+        return self.finish(folder.name, frames, model.points, point_colors=model.colors, notes=notes)
+
+
+def is_paired(folder: Path) -> bool:
+    """True for a folder in this layout."""
+    return (folder / "thermal").is_dir() and find_model(folder) is not None
+
+
+def paired_frames(
+    module: SceneDataModule, folder: Path, model: SparseModel, with_rgb: bool
+) -> tuple[list[RawFrame], dict[str, Any]]:
+    """Frames of a scene in this layout with the subset that their folder says, and notes.
+
+    Raises:
+        SceneError: no image of the model is in thermal/.
+    """
+    thermal = image_index(folder, "thermal", "the folder of thermal images")
+    rgb = ImageIndex(folder / "rgb")
+    masks = ImageIndex(folder / module.masks)
+    files: dict[str, str | None] = {}
+    subsets: dict[str, str | None] = {}
+    for name in model.names:
+        places = [(thermal.find(f"{place}/{name}"), subset) for place, subset in SUBSETS.items()]
+        places.append((thermal.find(name), None))
+        files[name], subsets[name] = next((p for p in places if p[0]), (None, None))
+    kept, notes = match_model(model, files, thermal, "thermal")
+    frames = []
+    for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
+        if name not in kept:
+            continue
+        file = files[name]
+        rgb_file = rgb.find(file) if with_rgb else None
+        frames.append(
+            RawFrame(
+                name=name,
+                viewmat=viewmat,
+                lens=lens,
+                read=partial(read_image, thermal.folder / file),
+                read_rgb=partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
+                read_mask=module.mask_reader(masks, name),
+                subset=subsets[name],
+            )
+        )
+    if with_rgb:
+        notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
+    notes["time_source"] = "none: the data set has no times"
+    return frames, notes
