@@ -1,5 +1,6 @@
 """The photometric loss: against other libraries, against float64 autograd, and on images that break naive forms."""
 
+import numba
 import pytest
 import torch
 from torch.nn import functional
@@ -175,11 +176,46 @@ def test_an_empty_mask_is_a_loss_of_zero(dtype):
 
 def test_weight_zero_leaves_ssim_out(monkeypatch):
     prediction, target = images(12, 12, 1, dtype=torch.float32)
-    for name in ("ssim_map",):
+    for name in ("ssim_map", "_Fused.apply", "_padded"):
         monkeypatch.setattr(f"heatsplat.losses.photometric.{name}", lambda *_: pytest.fail("SSIM was computed"))
     value, gradient = loss_and_gradient(Photometric(0.0), prediction, target)
     assert value == {"l1": pytest.approx((prediction - target).abs().mean().item(), rel=1e-6)}
     assert torch.allclose(gradient, (prediction - target).sign() / prediction.numel())
+
+
+def test_the_number_of_threads_changes_no_bit():
+    prediction, target = images(67, 45, 3, dtype=torch.float32)
+    mask = torch.rand(67, 45, generator=torch.Generator().manual_seed(3)) > 0.1
+    before, results = numba.get_num_threads(), []
+    try:
+        for threads in {1, min(2, numba.config.NUMBA_NUM_THREADS)}:
+            numba.set_num_threads(threads)
+            results.append(loss_and_gradient(Photometric(0.2), prediction, target, mask))
+    finally:
+        numba.set_num_threads(before)
+    assert results[0][0] == results[-1][0]
+    assert torch.equal(results[0][1], results[-1][1])
+
+
+def test_each_term_has_its_own_gradient():
+    """The kernel gets the upstream gradients of the two terms, which a schedule may scale apart."""
+    prediction, target = images(21, 18, 1)
+
+    def gradient(dtype):
+        image = prediction.to(dtype).requires_grad_()
+        terms = Photometric(0.4)(inputs(image, target.to(dtype)))
+        (3.0 * terms["dssim"] - 0.5 * terms["l1"]).backward()
+        return image.grad
+
+    assert relative(gradient(torch.float32), gradient(torch.float64)) < 1e-4
+
+
+def test_images_need_not_be_contiguous():
+    prediction, target = images(18, 21, 2, dtype=torch.float32)
+    turned = [image.transpose(0, 1).contiguous().transpose(0, 1) for image in (prediction, target)]
+    expected = loss_and_gradient(Photometric(0.2), prediction, target)
+    got = loss_and_gradient(Photometric(0.2), *turned)
+    assert got[0] == expected[0] and torch.equal(got[1], expected[1])
 
 
 def test_errors_name_what_does_not_fit():

@@ -6,10 +6,15 @@ are also the oracle of the fused kernel that ``Photometric`` uses on the CPU.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from heatsplat.kernels import ssim as kernel
 from heatsplat.losses.compose import LossInputs
 
 WINDOW = 11  # taps of the Gaussian window
@@ -44,24 +49,22 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
         mask: [H, W] bool, True where a pixel counts.
     """
     channels = prediction.shape[-1]
-    inside = torch.ones_like(prediction) if mask is None else mask[..., None].expand_as(prediction).to(prediction)
-    shift = _mean(target.detach(), mask)
-    x = torch.where(inside > 0, prediction - shift, 0.0)
-    y = torch.where(inside > 0, target - shift, 0.0)
-    taps = window(prediction.dtype, prediction.device)
+    counts = torch.ones_like(target[..., :1], dtype=torch.bool) if mask is None else mask[..., None]
+    shift = _mean(target.detach(), mask).mean()
+    x, y = (_padded(torch.where(counts, image - shift, 0.0), 0.0) for image in (prediction, target))
+    beyond = _padded(1.0 - counts.expand_as(target).to(target), 1.0)
+    taps = window(prediction.dtype, prediction.device).expand(channels, 1, 1, WINDOW)
+    blurred = functional.conv2d(torch.cat((x, y, x * x, y * y, x * y, beyond)), taps, groups=channels)
+    blurred = functional.conv2d(blurred, taps.transpose(2, 3), groups=channels)
+    x_mean, y_mean, xx, yy, xy, outside = blurred.permute(
+        0, 2, 3, 1
+    )  # outside: share of the window that does not count
 
-    stacked = torch.stack((x, y, x * x, y * y, x * y, inside)).permute(0, 3, 1, 2)
-    horizontal = taps.expand(channels, 1, 1, WINDOW)
-    blurred = functional.conv2d(stacked, horizontal, padding=(0, WINDOW // 2), groups=channels)
-    blurred = functional.conv2d(blurred, horizontal.transpose(2, 3), padding=(WINDOW // 2, 0), groups=channels)
-    x_mean, y_mean, xx, yy, xy, covered = blurred.permute(0, 2, 3, 1)
-
-    outside = 1.0 - covered  # the share of the window that lies outside, where images minus shift are -shift
-    dx, dy = x_mean - shift * outside, y_mean - shift * outside
-    x_variance = xx + shift**2 * outside - dx * dx
-    y_variance = yy + shift**2 * outside - dy * dy
-    covariance = xy + shift**2 * outside - dx * dy
-    x_mean, y_mean = x_mean + shift * covered, y_mean + shift * covered
+    x_mean, y_mean = x_mean - shift * outside, y_mean - shift * outside
+    x_variance = xx + shift**2 * outside - x_mean**2
+    y_variance = yy + shift**2 * outside - y_mean**2
+    covariance = xy + shift**2 * outside - x_mean * y_mean
+    x_mean, y_mean = x_mean + shift, y_mean + shift
     luminance = (2 * x_mean * y_mean + C1) / (x_mean**2 + y_mean**2 + C1)
     return luminance * (2 * covariance + C2) / (x_variance + y_variance + C2)
 
@@ -95,13 +98,15 @@ class Photometric:
             )
         if mask is not None and mask.shape != target.shape[:2]:
             raise ValueError(f"mask must be {list(target.shape[:2])} like the images, got {list(mask.shape)}")
+        on_cpu = prediction.device.type == "cpu" and prediction.dtype == target.dtype == torch.float32
+        if on_cpu and self.dssim_weight > 0.0:
+            difference, dissimilarity = _Fused.apply(prediction, target, mask)
+            return {"l1": self.l1_weight * difference, "dssim": self.dssim_weight * dissimilarity}
         if mask is not None:
-            prediction = torch.where(mask[..., None], prediction, 0.0)
-            target = torch.where(mask[..., None], target, 0.0)
+            prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))
         terms = {"l1": self.l1_weight * _mean(l1(prediction, target), mask).mean()}
         if self.dssim_weight > 0.0:
-            dissimilarity = _mean(1.0 - ssim_map(prediction, target, mask), mask).mean()
-            terms["dssim"] = self.dssim_weight * dissimilarity
+            terms["dssim"] = self.dssim_weight * _mean(1.0 - ssim_map(prediction, target, mask), mask).mean()
         return terms
 
 
@@ -110,3 +115,55 @@ def _mean(image: Tensor, mask: Tensor | None) -> Tensor:
     if mask is None:
         return image.mean((0, 1))
     return torch.where(mask[..., None], image, 0.0).sum((0, 1)) / mask.sum().clamp(min=1)
+
+
+def _padded(image: Tensor, value: float) -> Tensor:
+    """An image [H, W, C] with a border of half a window, [1, C, H + 10, W + 10]."""
+    return functional.pad(image.permute(2, 0, 1)[None], (WINDOW // 2,) * 4, value=value)
+
+
+_TAPS = window().numpy()
+
+
+class _Fused(torch.autograd.Function):
+    """Mean |x - y| and 1 - mean SSIM by the kernel; the gradient goes to the prediction only."""
+
+    @staticmethod
+    def forward(ctx, prediction, target, mask):
+        prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
+        height, width, channels = prediction.shape
+        valid, outside = _everywhere(height, width, channels) if mask is None else _coverage(mask, channels)
+        shape = height, width * channels, channels, _TAPS
+        planes = torch.empty(5, *kernel.plane_shape(height, width, channels))
+        images = [image.view(-1).numpy() for image in (prediction, target)]
+        scratch = [plane.view(-1).numpy() for plane in (planes[0], planes[1], planes[2:])]
+        sums = kernel.forward(*images, valid.numpy(), outside.numpy(), *shape, *scratch)
+        ctx.save_for_backward(prediction, target, valid, planes)
+        ctx.shape, ctx.count = shape, max(prediction.numel() if mask is None else int(mask.sum()) * channels, 1)
+        return prediction.new_tensor(sums[0] / ctx.count), prediction.new_tensor(sums[1] / ctx.count)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_difference, v_dissimilarity):
+        prediction, target, valid, planes = ctx.saved_tensors
+        v_prediction = torch.empty_like(prediction)
+        images = [image.view(-1).numpy() for image in (prediction, target, valid)]
+        scratch = [plane.view(-1).numpy() for plane in (planes[0], planes[1], planes[2:], v_prediction)]
+        weights = [np.float32(weight.item() / ctx.count) for weight in (v_difference, v_dissimilarity)]
+        kernel.backward(*images, *ctx.shape, *scratch[:3], *weights, scratch[3])
+        return v_prediction, None, None
+
+
+def _coverage(mask: Tensor, channels: int) -> tuple[Tensor, Tensor]:
+    """1 where a number of the image counts, and the share of its window that does not, each [H·W·C]."""
+    height, width = mask.shape
+    valid = mask[..., None].expand(height, width, channels).to(torch.float32).reshape(-1)
+    outside = torch.empty_like(valid)
+    kernel.coverage(valid.numpy(), height, width * channels, channels, _TAPS, outside.numpy())
+    return valid, outside
+
+
+@lru_cache(maxsize=4)
+def _everywhere(height: int, width: int, channels: int) -> tuple[Tensor, Tensor]:
+    """``_coverage`` of an image without a mask; the same at every step."""
+    return _coverage(torch.ones(height, width, dtype=torch.bool), channels)

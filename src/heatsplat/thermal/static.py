@@ -7,6 +7,7 @@ from torch import Tensor
 
 from heatsplat.contracts import KELVIN_AT_0_C, SceneData, ThermalRange
 from heatsplat.geometry import spherical_harmonics
+from heatsplat.kernels import spherical_harmonics as kernel
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
 
@@ -67,14 +68,11 @@ class Static(ThermalModel):
             self.active_degree = min(self.degree, step // self.degree_every)
 
     def features(self, splats: Splats, query: Query) -> Emission:
-        coefficients = query.rows(splats["sh0"])
         if self.active_degree == 0:
-            return Emission((spherical_harmonics.evaluate(coefficients, coefficients, 0) + 0.5).clamp(min=0.0))
+            return Emission((spherical_harmonics.C0 * query.rows(splats["sh0"])[:, 0] + 0.5).clamp(min=0.0))
         if query.camera is None:
             raise ValueError(f"static emission of degree {self.active_degree} depends on the view: give a camera")
-        directions = query.rows(splats.means) - query.camera.center.to(splats.means)
-        coefficients = torch.cat((coefficients, query.rows(splats["sh_rest"])), 1)
-        values = spherical_harmonics.evaluate(coefficients, directions, self.active_degree)
+        values = _harmonics(splats, query, self.active_degree)
         return Emission((values + 0.5).clamp(min=0.0))
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
@@ -91,3 +89,38 @@ class Static(ThermalModel):
         (channels,) = self.modality_channels
         basis = {0: 0, 1: 12, 2: 27, 3: 48}[self.degree]  # normalising the direction and the polynomials in it
         return basis + self.bands * channels
+
+
+def _harmonics(splats: Splats, query: Query, degree: int) -> Tensor:
+    """Sums of harmonics of the direction from the camera, [n, C]: by the fused kernel, or in plain torch."""
+    center = query.camera.center.to(splats.means)
+    if center.device.type == "cpu" and center.dtype == torch.float32:
+        return _FusedHarmonics.apply(splats["sh0"], splats["sh_rest"], splats.means, center, query.ids, degree)
+    coefficients = torch.cat((query.rows(splats["sh0"]), query.rows(splats["sh_rest"])), 1)
+    return spherical_harmonics.evaluate(coefficients, query.rows(splats.means) - center, degree)
+
+
+class _FusedHarmonics(torch.autograd.Function):
+    """The kernel with its gradients; ids are unique, as a renderer's visible ids are."""
+
+    @staticmethod
+    def forward(ctx, constant, rest, means, center, ids, degree):
+        ids = torch.arange(len(means)) if ids is None else ids
+        values = constant.new_empty(len(ids), constant.shape[2])
+        arrays = [tensor.detach().contiguous() for tensor in (constant, rest, means, center, ids)]
+        kernel.forward(arrays[0][:, 0].numpy(), *(array.numpy() for array in arrays[1:]), degree, values.numpy())
+        ctx.save_for_backward(*arrays[1:])
+        ctx.degree = degree
+        return values
+
+    @staticmethod
+    def backward(ctx, v_values):
+        rest, means, center, ids = ctx.saved_tensors
+        make = torch.empty_like if len(ids) == len(means) else torch.zeros_like  # rows out of view get no gradient
+        v_constant, v_rest, v_means = make(rest[:, 0]), make(rest), make(means)
+        kernel.backward(
+            *(tensor.numpy() for tensor in (rest, means, center, ids)),
+            ctx.degree,
+            *(tensor.numpy() for tensor in (v_values.contiguous(), v_constant, v_rest, v_means)),
+        )
+        return v_constant[:, None], v_rest, v_means, None, None, None
