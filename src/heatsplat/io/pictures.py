@@ -15,6 +15,8 @@ from typing import Any
 import cv2
 import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 
@@ -193,6 +195,13 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
                 draw.text((left + BAR + 6, row), text, font=_font(FONT), fill=INK, anchor="lm")
         x += step + GAP
     return np.asarray(page)
+
+
+def figure_picture(figure: Figure) -> np.ndarray:
+    """A matplotlib figure as pixels, uint8 RGB. Figures are made as objects (``Figure(...)``); pyplot keeps global state."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:

@@ -16,6 +16,8 @@ from typing import Any
 import heatsplat
 from heatsplat.metrics import DEFINITIONS
 
+METRICS_FILE = "metrics.json"
+
 # Keys that every metrics.json has, null with a reason where a run could not measure them.
 TEST = tuple(DEFINITIONS)
 COST = (

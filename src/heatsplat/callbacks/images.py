@@ -1,0 +1,70 @@
+"""Panels that people look at: ground truth, render and error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+
+from heatsplat.callbacks.board import board
+from heatsplat.contracts import Frame
+from heatsplat.io.pictures import comparison_picture, write_png
+from heatsplat.metrics import mae_c, psnr
+
+
+class ImagePanels(pl.Callback):
+    """Draws ground truth | render | error in °C of a few views into TensorBoard and as PNG into renders/.
+
+    The same validation views every time (renders/val holds their latest state, TensorBoard all of them), and test views
+    at the end (renders/test).
+
+    Args:
+        val_views: how many validation views, spread evenly; 0 for none.
+        test_views: how many test views, spread evenly; -1 for all, 0 for none.
+    """
+
+    def __init__(self, val_views: int = 3, test_views: int = 8) -> None:
+        self.val_views, self.test_views = val_views, test_views
+
+    def on_validation_batch_end(
+        self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        count = min(len(module.scene.val), int(trainer.num_val_batches[0]))
+        if not trainer.sanity_checking and batch_idx in spread(count, self.val_views):
+            self._draw("val", module, outputs, trainer.global_step)
+
+    def on_test_batch_end(
+        self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
+    ) -> None:
+        count = min(len(module.scene.test), int(trainer.num_test_batches[0]))
+        if batch_idx in spread(count, count if self.test_views < 0 else self.test_views):
+            self._draw("test", module, outputs, trainer.global_step)
+
+    def _draw(self, split: str, module: pl.LightningModule, outputs: dict[str, Any], step: int) -> None:
+        view = outputs["view"]
+        prediction, target = outputs["prediction"].float().cpu(), view.image(module.modality).cpu()
+        mask = None if view.mask is None else view.mask.cpu()
+        thermal_range = module.scene.thermal_range if module.modality == "thermal" else None
+        title = [view.frame.name]
+        if view.frame.time_s is not None:
+            title.append(f"t = {view.frame.time_s:.4g} s")
+        scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
+        if thermal_range is not None and target.shape[-1] == 1:
+            scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
+        title += [text.format(value) for value, text in scores if value is not None]
+        picture = comparison_picture(target, prediction, thermal_range, mask, title="   ·   ".join(title))
+        write_png(module.output_dir / "renders" / split / f"{file_stem(view.frame)}.png", picture)
+        writer = board(module)
+        if writer is not None:
+            writer.add_image(f"{split}/{file_stem(view.frame)}", picture, step, dataformats="HWC")
+
+
+def spread(count: int, chosen: int) -> list[int]:
+    """Positions of ``chosen`` of ``count`` things, evenly spread, first one included."""
+    return [i * count // chosen for i in range(min(count, chosen))] if count > chosen else list(range(count))
+
+
+def file_stem(frame: Frame) -> str:
+    """A file name for pictures of a frame, unique in its scene whatever folders the images came from."""
+    return f"{frame.frame_id:04d}_{Path(frame.name).stem}"

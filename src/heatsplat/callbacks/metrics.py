@@ -1,0 +1,188 @@
+"""Scores of the validation and test views: per image, their means, and their course over steps and seconds."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import pytorch_lightning as pl
+from torch import Tensor
+
+from heatsplat.callbacks.board import board
+from heatsplat.contracts import SceneData
+from heatsplat.io.results import write_atomically
+from heatsplat.metrics import DEFINITIONS, LpipsUnavailable, Scorer, load_lpips, mean_of_images, scene_threshold
+
+CURVE_FILE = "curve.csv"
+TEST_FILE = "test_per_image.csv"
+CURVE_COLUMNS = ("step", "train_seconds", "gaussians", *DEFINITIONS)
+
+
+class QualityMetrics(pl.Callback):
+    """Scores what the camera would record, clamped to [0, 1], against what it did record.
+
+    Validation: means over the views as ``val/*`` against steps and as ``val_by_seconds/*`` against seconds of training
+    (evaluation excluded), and a row in curve.csv. Test: means into ``module.results.test``, every image's scores into
+    test_per_image.csv, what the scores mean into ``module.results.definitions``.
+
+    Args:
+        lpips_net: "alex" or "vgg"; values of one net say nothing about the other's. None leaves LPIPS out.
+        lpips_weights: file of the backbone's weights; None looks in torch's hub folder.
+        lpips_in_validation: LPIPS costs more than all other scores together, so validation goes without it by default.
+        cold_scene: the scene's object is colder than its surroundings (for ThermoNeRF's region of interest).
+    """
+
+    def __init__(
+        self,
+        lpips_net: str | None = "alex",
+        lpips_weights: str | None = None,
+        lpips_in_validation: bool = False,
+        cold_scene: bool = False,
+    ) -> None:
+        self.lpips_net, self.lpips_weights = lpips_net, lpips_weights
+        self.lpips_in_validation, self.cold_scene = lpips_in_validation, cold_scene
+        self.curve: list[dict[str, float | None]] = []
+        self._scorer = Scorer()
+        self._rows: list[dict[str, Any]] = []
+        self._no_lpips = "not asked for"
+
+    # Scores of one image ---------------------------------------------------------------------------------------------
+
+    def _begin(self, module: pl.LightningModule, lpips: bool, threshold: float | None = None) -> None:
+        """Makes the scorer of one pass over views."""
+        self._rows = []
+        thermal_range = module.scene.thermal_range if module.modality == "thermal" else None
+        network = None
+        if lpips and self.lpips_net is not None:
+            try:
+                network = load_lpips(self.lpips_net, self.lpips_weights).to(module.device)
+            except LpipsUnavailable as error:
+                self._no_lpips = str(error)
+        self._scorer = Scorer(thermal_range, threshold, self.cold_scene, network)
+
+    def _score(self, module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Adds one image's row."""
+        view, prediction = outputs["view"], outputs["prediction"]
+        frame = view.frame
+        row = {"name": frame.name, "frame_id": frame.frame_id, "time_s": frame.time_s, "seconds": outputs["seconds"]}
+        self._rows.append(row | self._scorer(prediction, view.image(module.modality), view.mask))
+
+    # Validation ------------------------------------------------------------------------------------------------------
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._begin(module, self.lpips_in_validation)
+
+    def on_validation_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
+        self._score(module, outputs)
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.sanity_checking or not self._rows:
+            return
+        means = {name: mean_of_images(self._rows, name) for name in DEFINITIONS}
+        known = {name: value for name, value in means.items() if value is not None}
+        module.log_dict({f"val/{name}": value for name, value in known.items()})
+        seconds = module.results.cost.get("train_seconds")
+        writer = board(module)
+        if writer is not None and seconds is not None:
+            for name, value in known.items():
+                writer.add_scalar(f"val_by_seconds/{name}", value, round(seconds))
+        step = trainer.global_step
+        self.curve = [row for row in self.curve if row["step"] < step]
+        self.curve.append({"step": step, "train_seconds": seconds, "gaussians": len(module.splats), **means})
+        write_table(module.output_dir / CURVE_FILE, CURVE_COLUMNS, self.curve)
+
+    # Test ------------------------------------------------------------------------------------------------------------
+
+    def on_test_epoch_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        thermal = module.modality == "thermal" and module.scene.thermal_range is not None
+        threshold = scene_threshold(_all_images(module.scene)) if thermal else None
+        self._begin(module, lpips=True, threshold=threshold)
+
+    def on_test_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
+        self._score(module, outputs)
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        results, count = module.results, len(self._rows)
+        for name, definition in DEFINITIONS.items():
+            value = mean_of_images(self._rows, name) if count else None
+            results.put("test", name, value, None if value is not None else self._why_not(name, module))
+            having = sum(row[name] is not None for row in self._rows)
+            unit = f"{definition.unit}, " if definition.unit else ""
+            some = f"; mean of the {having} of {count} test images that have one" if 0 < having < count else ""
+            results.definitions[name] = f"{unit}{definition.better} is better: {definition.sentence}{some}"
+        if self._scorer.lpips is not None:
+            results.definitions["lpips"] = f"lower is better: {self._scorer.lpips.description}"
+        results.definitions["scored"] = (
+            f"the image that the camera would record, clamped to [0, 1], {module.modality}; mean of {count} test images"
+        )
+        if self._scorer.threshold is not None:
+            results.definitions["scene_threshold_c"] = module.scene.thermal_range.to_celsius(self._scorer.threshold)
+        if not count:
+            return
+        results.data["test_pixels_counted"] = mean_of_images(self._rows, "counted")
+        results.data["test_pixels_saturated"] = mean_of_images(self._rows, "saturated")
+        module.log_dict({f"test/{name}": value for name, value in results.test.items() if value is not None})
+        write_table(module.output_dir / TEST_FILE, tuple(self._rows[0]), self._rows)
+
+    def _why_not(self, name: str, module: pl.LightningModule) -> str:
+        """Why no test image has this score."""
+        if not self._rows:
+            return "no test view was rendered"
+        if name == "lpips":
+            small = "the images are smaller than the net can take"
+            return small if self._scorer.lpips is not None else self._no_lpips
+        if not any(row["counted"] for row in self._rows):
+            return "the masks leave no pixel of the test images"
+        if name == "ssim":
+            return "no window of 11 x 11 pixels lies within image and mask"
+        if module.modality != "thermal":
+            return f"{module.modality} images are no temperatures"
+        if module.scene.thermal_range is None:
+            return "the scene has no temperature bounds"
+        if self._rows[0]["mae_c"] is None and "roi" not in name:
+            return "the images have no channel of temperature (pseudo-colour), or every error exceeds the outlier rule"
+        return "no test image has a region of interest with such pixels"
+
+    # Resume ----------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"curve": [dict(row) for row in self.curve]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.curve = [dict(row) for row in state["curve"]]
+
+
+def write_table(path: Any, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes rows as CSV, as a whole or not at all: floats in full precision, None empty, infinity as ``inf``."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
+
+
+def read_table(path: Any) -> list[dict[str, float | str | None]]:
+    """Rows of a CSV that ``write_table`` wrote, numbers as floats and empty cells as None."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{key: _cell(text) for key, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _cell(text: str) -> float | str | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
+
+
+def _all_images(scene: SceneData) -> Iterable[tuple[Tensor, Tensor | None]]:
+    """Every thermal image of a scene once, with its mask; splits may share frames."""
+    seen: set[int] = set()
+    for views in (scene.train, scene.val, scene.test):
+        for i, frame in enumerate(views.frames):
+            if frame.frame_id not in seen:
+                seen.add(frame.frame_id)
+                view = views[i]
+                if view.thermal is not None and view.thermal.shape[-1] == 1:
+                    yield view.thermal, view.mask

@@ -1,0 +1,234 @@
+"""Temperature over time at points of the scene: ground truth against model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from heatsplat.callbacks.board import board
+from heatsplat.callbacks.images import spread
+from heatsplat.callbacks.metrics import write_table
+from heatsplat.contracts import Camera, Frame, SceneData, ViewSet
+from heatsplat.io.pictures import figure_picture, write_png
+
+CANDIDATES = 16  # validation cameras that are tried for a view of the probes
+OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
+NEAR_PIXELS = 0.02  # "close": of the image's width
+NEAR_DEPTH = 0.93  # "well in front": nearer than this times the probe's depth
+DOTS = 200  # training images that are sampled where the true curve is not known
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A point whose temperature is drawn: its place, the frame whose camera looks at it, and the pixel it falls on."""
+
+    point: Tensor
+    frame: Frame
+    row: int
+    column: int
+
+
+class TemperatureCurves(pl.Callback):
+    """Draws the temperature of probe points over time into TensorBoard and renders/probes.png, the numbers into .csv.
+
+    The model's curve is the value of the rendered pixel on which the probe falls, seen from one validation camera at
+    all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
+    of the probe, each from its own camera. Probes are the scene's, or points of its cloud spread over the image. Models
+    that know no time, and scenes without times, have no curves.
+
+    Args:
+        count: how many probes to draw at most.
+        times: how many times the model is rendered at, between the first and the last frame.
+    """
+
+    def __init__(self, count: int = 6, times: int = 32) -> None:
+        self.count, self.times = count, times
+        self._probes: list[Probe] | None = None
+        self._dots: list[tuple[list[float], list[float]]] = []
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking:
+            self._draw(module, trainer.global_step, "probes")
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._draw(module, trainer.global_step, "test/probes")
+
+    def _draw(self, module: pl.LightningModule, step: int, tag: str) -> None:
+        scene = module.scene
+        known = scene.metadata
+        if "time" not in module.thermal.needs or "time" not in known or not self.count:
+            return
+        if self._probes is None:
+            self._probes = find_probes(scene, self.count)
+            self._dots = (
+                [recorded(probe, scene, module.modality) for probe in self._probes] if scene.truth is None else []
+            )
+        span = [t for views in (scene.train, scene.val, scene.test) for t in views.times_s if t is not None]
+        if not self._probes or min(span) == max(span):
+            return
+        times = torch.linspace(min(span), max(span), self.times, dtype=torch.float64)
+        model = self._rendered(module, times)
+        truth = None
+        if scene.truth is not None:
+            truth = scene.truth(torch.stack([probe.point for probe in self._probes]), times).double().cpu().numpy()
+        unit = "°C" if scene.thermal_range is not None and module.modality == "thermal" else "image value"
+        to_unit = scene.thermal_range.to_celsius if unit == "°C" else lambda value: value
+        model = to_unit(model)
+        dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
+        picture = figure_picture(_figure(times.numpy(), model, truth, dots, unit, f"{scene.name}, step {step}"))
+        write_png(module.output_dir / "renders" / "probes.png", picture)
+        self._write(module, times.tolist(), model, truth)
+        writer = board(module)
+        if writer is not None:
+            writer.add_image(tag, picture, step, dataformats="HWC")
+
+    def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
+        """Image values of the probes' pixels, [n, F] float64; one render per camera and time serves all its probes."""
+        values = np.empty((len(self._probes), len(times)))
+        weather = _weather(module.scene)
+        for frame_id in {probe.frame.frame_id for probe in self._probes}:
+            seen = [i for i, probe in enumerate(self._probes) if probe.frame.frame_id == frame_id]
+            frame = self._probes[seen[0]].frame
+            for j, time_s in enumerate(times.tolist()):
+                at_time = replace(frame, time_s=time_s, environment=_nearest(weather, time_s))
+                image = module.predict(at_time).mean(-1)
+                rows, columns = ([getattr(self._probes[i], axis) for i in seen] for axis in ("row", "column"))
+                values[seen, j] = image[rows, columns].double().cpu().numpy()
+        return values
+
+    def _write(
+        self, module: pl.LightningModule, times: list[float], model: np.ndarray, truth: np.ndarray | None
+    ) -> None:
+        columns = ["time_s", *(f"probe_{i + 1}" for i in range(len(model)))]
+        columns += [] if truth is None else [f"truth_{i + 1}" for i in range(len(truth))]
+        stacked = np.concatenate([[times], model, *([] if truth is None else [truth])])
+        rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
+        write_table(module.output_dir / "renders" / "probes.csv", columns, rows)
+
+
+def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64; where the depth is not positive they lie
+    behind the camera and the pixel means nothing."""
+    view = points.double().cpu() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    homogeneous = view @ camera.K.T
+    return homogeneous[:, :2] / view[:, 2:].clamp_min(1e-12), view[:, 2]
+
+
+def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:
+    """Which points [n, 3] the camera sees, [n] bool: in the image and not behind points of the cloud [P, 3]."""
+    pixels, depths = project(points, camera)
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    inside = (depths > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1)
+    others, other_depths = project(cloud, camera)
+    for i in inside.nonzero()[:, 0].tolist():
+        near = ((others - pixels[i]).abs() < NEAR_PIXELS * camera.width).all(1)
+        hiding = near & (other_depths > 0) & (other_depths < NEAR_DEPTH * depths[i])
+        inside[i] = int(hiding.sum()) < OCCLUDERS
+    return inside
+
+
+def find_probes(scene: SceneData, count: int) -> list[Probe]:
+    """The scene's probes, or points of its cloud, each with a validation camera that sees it; unseen ones are left out.
+
+    Cameras are chosen greedily, the one that sees most first, so that few renders serve many probes.
+    """
+    views: ViewSet = scene.val if len(scene.val) else scene.train
+    frames = [views.frames[i] for i in spread(len(views), CANDIDATES)]
+    cloud = scene.points[:: max(1, len(scene.points) // 20_000)]
+    points = scene.probes[:count] if scene.probes is not None else _spread_points(frames, cloud, count)
+    if not len(points) or not frames:
+        return []
+    seen = torch.stack([seen_by(frame.camera, points, cloud) for frame in frames])
+    chosen: dict[int, Frame] = {}
+    left = torch.ones(len(points), dtype=torch.bool)
+    while bool((seen & left).any()):
+        best = int((seen & left).sum(1).argmax())
+        for i in (seen[best] & left).nonzero()[:, 0].tolist():
+            chosen[i] = frames[best]
+        left &= ~seen[best]
+    probes = []
+    for i, frame in sorted(chosen.items()):
+        column, row = project(points[i : i + 1], frame.camera)[0][0].tolist()
+        probes.append(Probe(points[i].detach().cpu(), frame, int(row), int(column)))
+    return probes
+
+
+def _spread_points(frames: Sequence[Frame], cloud: Tensor, count: int) -> Tensor:
+    """Points of the cloud far from each other in the image of the camera that sees most of it, [n, 3]."""
+    if not frames or not len(cloud):
+        return cloud[:0]
+    sample = cloud[:: max(1, len(cloud) // 500)]
+    visible = [sample[seen_by(frame.camera, sample, cloud)] for frame in frames[:4]]
+    best = max(range(len(visible)), key=lambda i: len(visible[i]))
+    points = visible[best]
+    if not len(points):
+        return points
+    pixels, _ = project(points, frames[best].camera)
+    picked = [int((pixels - pixels.mean(0)).norm(dim=1).argmin())]
+    while len(picked) < min(count, len(points)):
+        picked.append(int(torch.cdist(pixels, pixels[picked]).amin(1).argmax()))
+    return points[picked]
+
+
+def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float], list[float]]:
+    """What training images recorded of a probe: times in seconds and image values, from the cameras that see it."""
+    cloud = scene.points[:: max(1, len(scene.points) // 5_000)]
+    times, values = [], []
+    for i in spread(len(scene.train), DOTS):
+        frame = scene.train.frames[i]
+        if not bool(seen_by(frame.camera, probe.point[None], cloud)[0]):
+            continue
+        column, row = (int(x) for x in project(probe.point[None], frame.camera)[0][0].tolist())
+        view = scene.train[i]
+        value = view.image(modality)[row, column].mean().item()
+        if np.isfinite(value) and (view.mask is None or bool(view.mask[row, column])):
+            times.append(frame.time_s)
+            values.append(value)
+    return times, values
+
+
+def _weather(scene: SceneData) -> list[tuple[float, object]]:
+    """Times and environments of all frames that have both."""
+    frames = [frame for views in (scene.train, scene.val, scene.test) for frame in views.frames]
+    return [(f.time_s, f.environment) for f in frames if f.time_s is not None and f.environment is not None]
+
+
+def _nearest(weather: list[tuple[float, object]], time_s: float):
+    """The environment closest in time, or None."""
+    return min(weather, key=lambda pair: abs(pair[0] - time_s))[1] if weather else None
+
+
+def _figure(
+    times: np.ndarray,
+    model: np.ndarray,
+    truth: np.ndarray | None,
+    dots: Sequence[tuple[Sequence[float], Sequence[float]]],
+    unit: str,
+    title: str,
+) -> Figure:
+    """Curves of all probes: lines are the model, dashes the truth, dots what images recorded."""
+    span = times[-1] - times[0]
+    divisor, word = next(
+        (d, w) for limit, d, w in ((300, 1, "s"), (3 * 3600, 60, "min"), (np.inf, 3600, "h")) if span < limit
+    )
+    figure = Figure(figsize=(9, 4.2), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    for i, curve in enumerate(model):
+        color = f"C{i}"
+        axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=f"probe {i + 1}")
+        if truth is not None:
+            axes.plot(times / divisor, truth[i], color=color, linewidth=1.2, linestyle=(0, (4, 2)), alpha=0.8)
+        elif dots:
+            axes.scatter(np.asarray(dots[i][0]) / divisor, dots[i][1], color=color, s=9, alpha=0.55, linewidths=0)
+    against = "dashes: truth" if truth is not None else "dots: training images" if dots else "no truth known"
+    axes.set(xlabel=f"time ({word})", ylabel=f"temperature ({unit})" if unit == "°C" else unit)
+    axes.set_title(f"{title}   (lines: model, {against})", fontsize=10)
+    axes.grid(alpha=0.25)
+    axes.legend(fontsize=8, ncols=2)
+    return figure

@@ -1,0 +1,234 @@
+"""The end of a run: metrics.json, report.md, hyperparameters beside the scores, and a table on the screen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from heatsplat.callbacks.metrics import CURVE_FILE, TEST_FILE, read_table
+from heatsplat.contracts import SceneData
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import COST, METRICS_FILE, TEST, RunResults, collect_versions, write_atomically
+from heatsplat.metrics import DEFINITIONS
+
+REPORT_FILE = "report.md"
+CURVES_FILE = "renders/curves.png"
+
+COST_UNITS = {
+    "train_seconds": "s",
+    "steps_per_second": "1/s",
+    "render_fps": "1/s",
+    "peak_memory_mb": "MB",
+    "gaussians": "",
+    "warmup_seconds": "s",
+    "evaluation_seconds": "s",
+    "wall_seconds": "s",
+}
+# Parts of the configuration that say what was learned and how; the others say where and when, or repeat these.
+HYPERPARAMETERS = (
+    "name", "seed", "max_steps", "data", "thermal", "sensor", "renderer", "density", "loss", "init", "optim", "effects",
+)  # fmt: skip
+
+
+class Report(pl.Callback):
+    """Writes what a run found, once its test is over. Must stand after the callbacks that measure.
+
+    * metrics.json: every number, or null with the reason (``heatsplat.io.results``).
+    * report.md: the same for people, with pictures, readable without any tool.
+    * TensorBoard's table of hyperparameters with the final scores and costs, so that runs can be compared.
+    * The table on the screen.
+
+    Args:
+        pictures: test pictures in the report.
+        show: print the table.
+    """
+
+    def __init__(self, pictures: int = 4, show: bool = True) -> None:
+        self.pictures, self.show = pictures, show
+
+    def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        folder, results = module.output_dir, module.results
+        results.run = describe_run(trainer, module) | results.run
+        results.data = describe_data(module.scene, module.modality) | results.data
+        results.effects = results.effects or dict(module.thermal.effects())
+        results.versions = collect_versions()
+        results.write(folder / METRICS_FILE)
+        curves = draw_curves(folder)
+        pictures = sorted((folder / "renders" / "test").glob("*.png"))
+        shown = [pictures[i * len(pictures) // self.pictures] for i in range(self.pictures)]
+        shown = list(dict.fromkeys(shown)) if pictures else []
+        probes = folder / "renders" / "probes.png"
+        write_atomically(
+            folder / REPORT_FILE, report(results, folder, shown, curves, probes if probes.exists() else None)
+        )
+        if trainer.logger is not None:
+            scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
+            finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
+            trainer.logger.log_hyperparams(hyperparameters(module.config), finite)
+        if self.show:
+            show(results, folder, shown[0] if shown else None)
+
+
+# What is written -----------------------------------------------------------------------------------------------------
+
+
+def describe_run(trainer: pl.Trainer, module: pl.LightningModule) -> dict[str, Any]:
+    """What was run, for metrics.json."""
+    return {
+        "method": module.config.get("name"),
+        "scene": module.scene.name,
+        "modality": module.modality,
+        "seed": module.config.get("seed"),
+        "steps": trainer.global_step or None,
+        "thermal_model": type(module.thermal).__name__,
+        "multiply_adds_per_gaussian": module.thermal.cost,
+        "device": str(module.device),
+    }
+
+
+def describe_data(scene: SceneData, modality: str) -> dict[str, Any]:
+    """What the data are, for metrics.json: counts, sizes and ranges, then what the loader found and assumed."""
+    frames = [frame for views in (scene.train, scene.val, scene.test) for frame in views.frames]
+    sizes = sorted({f"{frame.camera.width}x{frame.camera.height}" for frame in frames})
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    bounds = scene.thermal_range
+    return {
+        "views": {"train": len(scene.train), "val": len(scene.val), "test": len(scene.test)},
+        "image_sizes": sizes[:10],
+        "seconds": max(times) - min(times) if times else None,
+        "points": len(scene.points),
+        "thermal_range_c": None if bounds is None else [bounds.min_c, bounds.max_c],
+        "ambient_c": scene.ambient_c,
+        "metres_per_unit": scene.metres_per_unit,
+        **scene.notes,
+    }
+
+
+def hyperparameters(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that say what was learned and how, flat: "thermal.frequencies" -> 24."""
+    flat: dict[str, Any] = {}
+
+    def add(path: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                add(
+                    f"{path}.{key}" if key != "_target_" else path,
+                    item if key != "_target_" else str(item).split(".")[-1],
+                )
+        else:
+            flat[path] = value if isinstance(value, (int, float, str, bool)) else str(value)
+
+    for name in HYPERPARAMETERS:
+        if name in config:
+            add(name, config[name])
+    return flat
+
+
+def draw_curves(folder: Path) -> Path | None:
+    """Draws scores against seconds of training, and returns the picture's path, or None without a course to draw."""
+    if not (folder / CURVE_FILE).exists():
+        return None
+    rows = [row for row in read_table(folder / CURVE_FILE) if row["train_seconds"] is not None]
+    scores = [("psnr", "PSNR (dB)"), ("ssim", "SSIM"), ("mae_c", "MAE (°C)")]
+    scores = [(name, label) for name, label in scores if any(row[name] is not None for row in rows)]
+    if len(rows) < 2 or not scores:
+        return None
+    figure = Figure(figsize=(3.6 * len(scores), 3), dpi=110, layout="constrained")
+    for i, (name, label) in enumerate(scores):
+        axes = figure.add_subplot(1, len(scores), i + 1)
+        points = [(row["train_seconds"], row[name]) for row in rows if row[name] is not None]
+        axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=f"C{i}")
+        axes.set(xlabel="seconds of training", ylabel=f"{label}, validation")
+        axes.grid(alpha=0.25)
+    write_png(folder / CURVES_FILE, figure_picture(figure))
+    return folder / CURVES_FILE
+
+
+def report(
+    results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None, probes: Path | None
+) -> str:
+    """report.md: scores beside cost, the course, pictures by relative path, data, effects, versions."""
+    content = results.as_json()
+    run, reasons = content["run"], content["reasons"]
+    lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
+    lines += ["## Scores and what they cost", "", "| score | value | | cost | value |", "|---|---|---|---|---|"]
+    left = [(name, _number(content["test"][name]), unit_of(name, content)) for name in content["test"]]
+    right = [(name, _number(content["cost"][name]), COST_UNITS.get(name, "")) for name in content["cost"]]
+    blank = ("", "", "")
+    for i in range(max(len(left), len(right))):
+        a, b = left[i] if i < len(left) else blank, right[i] if i < len(right) else blank
+        lines.append(f"| {a[0]} | {' '.join(a[1:]).strip()} | | {b[0]} | {' '.join(b[1:]).strip()} |")
+    missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
+    if missing:
+        lines += ["", "Not to be had:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
+    if curves is not None:
+        lines += [
+            "",
+            "## Quality against time",
+            "",
+            f"![scores against seconds]({curves.relative_to(folder).as_posix()})",
+        ]
+        lines += ["", f"The numbers are in [{CURVE_FILE}]({CURVE_FILE})."]
+    if pictures:
+        lines += ["", "## Test views", ""]
+        for path in pictures:
+            lines += [f"![{path.stem}]({path.relative_to(folder).as_posix()})", ""]
+        if (folder / TEST_FILE).exists():
+            lines.append(f"Every test image's scores are in [{TEST_FILE}]({TEST_FILE}).")
+    if probes is not None:
+        lines += ["", "## Temperature over time", "", f"![probes]({probes.relative_to(folder).as_posix()})"]
+    lines += ["", "## The run", "", *_bullets(run)]
+    lines += ["", "## Effects that were simulated", "", *(_bullets(content["effects"]) or ["None."])]
+    lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
+    lines += ["", "## What the scores mean", "", *_bullets(content["definitions"])]
+    lines += ["", "## Versions", "", *_bullets(content["versions"]), ""]
+    return "\n".join(lines)
+
+
+def unit_of(name: str, content: Mapping[str, Any]) -> str:
+    """The unit of a score, empty where it has none or the value is missing."""
+    return DEFINITIONS[name].unit if name in DEFINITIONS and content["test"][name] is not None else ""
+
+
+def _number(value: float | None) -> str:
+    """Four significant digits, whole numbers as they are, and a dash for what could not be had."""
+    if value is None:
+        return "–"
+    if float(value).is_integer() or abs(value) >= 1e4:
+        return f"{value:,.0f}"
+    return f"{value:.4g}"
+
+
+def _bullets(values: Mapping[str, Any]) -> list[str]:
+    """A list of names and values for Markdown, one level of nesting in line."""
+    lines = []
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{key} {item}" for key, item in value.items()) or "on"
+        lines.append(f"- {name}: {'–' if value is None else value}")
+    return lines
+
+
+def show(results: RunResults, folder: Path, picture: Path | None, console: Console | None = None) -> None:
+    """Prints scores beside cost and where the report and a picture lie."""
+    content = results.as_json()
+    console = console or Console()
+    run = content["run"]
+    table = Table(title=f"{run.get('method') or run.get('thermal_model')} on {run.get('scene')}", title_justify="left")
+    for column, justify in (("score", "left"), ("", "right"), ("cost", "left"), (" ", "right")):
+        table.add_column(column, justify=justify)
+    scores = [(name, f"{_number(content['test'][name])} {unit_of(name, content)}".strip()) for name in TEST]
+    costs = [(name, f"{_number(content['cost'][name])} {COST_UNITS[name]}".strip()) for name in COST]
+    for i in range(max(len(scores), len(costs))):
+        table.add_row(*(scores[i] if i < len(scores) else ("", "")), *(costs[i] if i < len(costs) else ("", "")))
+    console.print(table)
+    console.print(f"report:  {folder / REPORT_FILE}", soft_wrap=True)
+    if picture is not None:
+        console.print(f"picture: {picture}", soft_wrap=True)

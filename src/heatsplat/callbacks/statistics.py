@@ -1,0 +1,52 @@
+"""How the splats and the loss terms are doing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+
+from heatsplat.callbacks.board import board
+
+HISTOGRAM_ROWS = 20_000  # a histogram of more Gaussians looks the same and takes longer
+
+
+class SplatStatistics(pl.Callback):
+    """Writes loss terms, learning rates by group, the number of Gaussians and, less often, histograms to TensorBoard.
+
+    Args:
+        every: steps between entries.
+        histogram_every: steps between histograms of sizes and opacities; 0 for none.
+    """
+
+    def __init__(self, every: int = 50, histogram_every: int = 1000) -> None:
+        self.every, self.histogram_every = every, histogram_every
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, module: pl.LightningModule, outputs: dict[str, Any], *_: Any
+    ) -> None:
+        step = trainer.global_step
+        if step % self.every and step != 1:
+            return
+        writer = board(module)
+        if writer is None:
+            return
+        terms = {"total": outputs["loss"], **outputs.get("terms", {})}
+        # One transfer for all terms: on a GPU each would wait for the queue.
+        values = torch.stack([term.detach().reshape(()).float() for term in terms.values()]).tolist()
+        for name, value in zip(terms, values, strict=True):
+            writer.add_scalar(f"loss/{name}", value, step)
+        for number, group in enumerate(trainer.optimizers[0].param_groups):
+            writer.add_scalar(f"learning_rate/{group.get('name', number)}", group["lr"], step)
+        writer.add_scalar("splats/count", len(module.splats), step)
+        if self.histogram_every and step % self.histogram_every == 0:
+            self._histograms(module, writer, step)
+
+    @torch.no_grad()
+    def _histograms(self, module: pl.LightningModule, writer: Any, step: int) -> None:
+        """Histograms of sizes (logarithm to base ten of the semi-axes, world units) and opacities of a sample."""
+        stride = max(1, len(module.splats) // HISTOGRAM_ROWS)
+        writer.add_histogram("splats/log10_scale", module.splats.scales[::stride].log10(), step)
+        for m, opacities in enumerate(module.splats.opacities):
+            writer.add_histogram(f"splats/opacity_{m}", opacities[::stride], step)

@@ -1,0 +1,188 @@
+"""What a run costs: seconds, steps and frames per second, memory."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+
+from heatsplat.callbacks.board import board
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+class CostMeter(pl.Callback):
+    """Measures what a run costs and puts it into ``module.results.cost``.
+
+    * ``train_seconds``: wall time of training steps, everything that happens in them included (data, render, backward,
+      optimiser, density control, callbacks, writing checkpoints). Excluded: validation with its pictures and curves,
+      the test, set-up, and the first ``warmup_steps`` steps after every start, in which kernels are compiled.
+    * ``steps_per_second``: the steps timed so, by their seconds.
+    * ``warmup_seconds``, ``evaluation_seconds``: the time of the excluded steps, and of validation during training.
+    * ``wall_seconds``: all of the training run, from its first step to its end.
+    * ``render_fps``: one by the median time of a rendered test view, as ``predict`` gives it.
+    * ``peak_memory_mb``: in 10^6 bytes; on a GPU what tensors took at most, otherwise the largest resident memory of
+      the process since the run's start, its libraries included.
+
+    A resumed run goes on counting where the checkpoint left off.
+
+    Args:
+        every: steps between entries in TensorBoard.
+        warmup_steps: steps that are not counted, after every start.
+        fps_views: test views over which the frame rate is measured.
+        fps_repeats: renders of each of them.
+    """
+
+    def __init__(self, every: int = 50, warmup_steps: int = 3, fps_views: int = 4, fps_repeats: int = 10) -> None:
+        self.every, self.warmup_steps = every, warmup_steps
+        self.fps_views, self.fps_repeats = fps_views, fps_repeats
+        self.seconds = {"train": 0.0, "warmup": 0.0, "evaluation": 0.0}
+        self.steps = 0
+        self.peak_mb = 0.0
+        self._since: float | None = None
+        self._phase = "train"
+        self._warming = 0
+
+    # The clock: one phase runs at a time -----------------------------------------------------------------------------
+
+    def _switch(self, phase: str | None, module: pl.LightningModule) -> None:
+        """Ends the running phase and starts another; None stops the clock."""
+        if module.device.type == "cuda":
+            torch.cuda.synchronize(module.device)
+        now = time.perf_counter()
+        if self._since is not None:
+            self.seconds[self._phase] += now - self._since
+        self._since = None if phase is None else now
+        self._phase = phase or self._phase
+
+    @property
+    def _training_phase(self) -> str:
+        return "warmup" if self._warming else "train"
+
+    def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        _reset_peak(module.device)
+
+    def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._warming = self.warmup_steps
+        self._switch(self._training_phase, module)
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
+        if self._warming:
+            self._warming -= 1
+            if not self._warming:
+                self._switch("train", module)
+            return
+        self.steps += 1
+        if trainer.global_step % self.every == 0:
+            self._publish(module)
+            writer = board(module)
+            if writer is not None:
+                for name in ("train_seconds", "steps_per_second", "peak_memory_mb"):
+                    writer.add_scalar(f"cost/{name}", module.results.cost[name], trainer.global_step)
+
+    def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self._since is not None:
+            self._switch("evaluation", module)
+            self._publish(module)
+
+    def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self._since is not None:
+            self._switch(self._training_phase, module)
+
+    def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._switch(None, module)
+        self._publish(module)
+
+    def on_exception(self, trainer: pl.Trainer, module: pl.LightningModule, exception: BaseException) -> None:
+        self._since = None
+
+    # What is reported ------------------------------------------------------------------------------------------------
+
+    def _reading(self) -> dict[str, float]:
+        """Seconds of every phase up to now, without stopping the clock."""
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return {phase: value + running * (phase == self._phase) for phase, value in self.seconds.items()}
+
+    def _publish(self, module: pl.LightningModule) -> None:
+        """Puts what is known into the results, on which other callbacks read the training seconds."""
+        put = module.results.put
+        seconds = self._reading()
+        if self.steps:
+            put("cost", "train_seconds", seconds["train"])
+            put("cost", "steps_per_second", self.steps / seconds["train"])
+        else:
+            for name in ("train_seconds", "steps_per_second"):
+                put("cost", name, None, f"the run was not longer than its {self.warmup_steps} steps of warm-up")
+        put("cost", "warmup_seconds", seconds["warmup"])
+        put("cost", "evaluation_seconds", seconds["evaluation"])
+        put("cost", "wall_seconds", sum(seconds.values()))
+        self.peak_mb = max(self.peak_mb, _peak_mb(module.device))
+        put("cost", "peak_memory_mb", self.peak_mb)
+        put("cost", "gaussians", len(module.splats))
+
+    def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if sum(self.seconds.values()) == 0:
+            for name in ("train_seconds", "steps_per_second", "warmup_seconds", "evaluation_seconds", "wall_seconds"):
+                module.results.put("cost", name, None, "this run evaluated a checkpoint and trained nothing")
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        module.results.put("cost", "gaussians", len(module.splats))
+        frames = module.scene.test.frames
+        if frames:
+            chosen = [frames[i * len(frames) // self.fps_views] for i in range(min(self.fps_views, len(frames)))]
+            module.results.put("cost", "render_fps", 1.0 / statistics.median(self._render_seconds(module, chosen)))
+        else:
+            module.results.put("cost", "render_fps", None, "the scene has no test views")
+        self.peak_mb = max(self.peak_mb, _peak_mb(module.device))
+        module.results.put("cost", "peak_memory_mb", self.peak_mb)
+
+    def _render_seconds(self, module: pl.LightningModule, frames: list) -> list[float]:
+        """Seconds of repeated renders, each frame's first one left out."""
+        cuda = module.device.type == "cuda"
+        times = []
+        for frame in frames:
+            for repeat in range(self.fps_repeats + 1):
+                start = time.perf_counter()
+                module.predict(frame)
+                if cuda:
+                    torch.cuda.synchronize(module.device)
+                if repeat:
+                    times.append(time.perf_counter() - start)
+        return times
+
+    # Resume ----------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seconds": self._reading(), "steps": self.steps, "peak_mb": self.peak_mb}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.seconds, self.steps, self.peak_mb = dict(state["seconds"]), state["steps"], state["peak_mb"]
+
+
+def _reset_peak(device: torch.device) -> None:
+    """Forgets earlier peaks, so that the runs of one process (a sweep) do not inherit each other's."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return
+    try:
+        CLEAR.write_text("5")  # Linux: sets the peak to what is resident now
+    except OSError:
+        return
+
+
+def _peak_mb(device: torch.device) -> float:
+    """Peak memory in 10^6 bytes: allocated tensors on a GPU, resident memory of the process otherwise."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    try:
+        line = next(line for line in STATUS.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024 / 1e6
+    except (OSError, StopIteration):
+        # Bytes on macOS, KiB elsewhere; cannot be reset, so a sweep's later runs may show an earlier run's peak.
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
