@@ -1,0 +1,107 @@
+"""The embedded synthetic scene: known geometry, materials, temperatures and times, in memory or on disk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+
+from datamodules.base import RawFrame, SceneDataModule
+from datamodules.synthetic_scene.film import SIZES, Recording, film
+from datamodules.synthetic_scene.presets import PRESETS
+from datamodules.synthetic_scene.scene import Scene
+from heatsplat.contracts import SceneData, SceneError
+
+
+class Synthetic(SceneDataModule):
+    """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
+
+    Args:
+        scene: name of a preset: static, cooling, heated, ... (``datamodules.synthetic_scene.presets``).
+        size: tiny, demo or large.
+        frames: number of frames; None for that of the size.
+        noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
+        scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
+        root: not used; the name is there so that every data set takes the same keys.
+        **options: of ``SceneDataModule``: downscale, split, seed, ...
+    """
+
+    def __init__(
+        self,
+        *,
+        scene: str = "cooling",
+        size: str = "demo",
+        frames: int | None = None,
+        noise_k: float = 0.05,
+        scene_seed: int = 0,
+        root: str | None = None,
+        **options,
+    ) -> None:
+        super().__init__(root=root, scene=scene, **options)
+        if scene not in PRESETS:
+            raise SceneError(
+                f"data.scene={scene}: there is no such synthetic preset; choose one of {', '.join(PRESETS)}"
+            )
+        if size not in SIZES:
+            raise SceneError(f"data.size={size}: choose one of {', '.join(SIZES)}")
+        if frames is not None and frames < 2:
+            raise SceneError(f"data.frames={frames}: a scene needs at least 2 frames, one to train and one to test")
+        if not noise_k >= 0:
+            raise SceneError(f"data.noise_k={noise_k}: the noise is a standard deviation in kelvin, 0 or more")
+        self.size = SIZES[size] if frames is None else replace(SIZES[size], frames=frames)
+        self.noise_k = noise_k
+        self.scene_seed = scene_seed
+
+    def load(self) -> SceneData:
+        """The recording as a scene; its truth and probes come from the solver."""
+        recording = film(Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
+        preset = recording.scene.preset
+        probes, probe_names = probe_points(recording)
+        return self.finish(
+            self.scene_name,
+            [
+                RawFrame(
+                    name=f"frame_{frame:05d}.png",
+                    viewmat=recording.viewmats[frame],
+                    lens=recording.lens,
+                    read=partial(recording.grey, frame, np.uint16),
+                    read_rgb=partial(recording.rgb.__getitem__, frame),
+                    time_s=float(time_s),
+                )
+                for frame, time_s in enumerate(recording.times_s)
+            ],
+            recording.points,
+            point_colors=recording.point_colors,
+            thermal_range=recording.thermal_range,
+            ambient_c=preset.ambient_c,
+            metres_per_unit=1.0,
+            notes={
+                "source": f"synthetic preset {self.scene_name}, scene_seed {self.scene_seed}",
+                "noise_k": self.noise_k,
+                "heat": (
+                    f"conduction into {len(recording.scene.materials)} materials by implicit finite volumes, converged "
+                    f"to {1e3 * recording.scene.responses.error:.2f} mK; linear exchange with the surroundings"
+                ),
+                "probes": probe_names,
+            },
+            probes=probes,
+            truth=recording.scene.truth,
+        )
+
+
+def probe_points(recording: Recording) -> tuple[np.ndarray, list[str]]:
+    """One point [n, 3] on each surface that the frames show, and the name of the surface.
+
+    It is the sparse point nearest to the mean of all sparse points of its surface, moved onto the surface.
+    """
+    scene = recording.scene
+    on_surface, which = scene.nearest(torch.from_numpy(recording.points))
+    probes, names = [], []
+    for number, surface in enumerate(scene.preset.surfaces):
+        own = on_surface[which == number]
+        if len(own):
+            probes.append(own[(own - own.mean(0)).norm(dim=1).argmin()].numpy())
+            names.append(surface.name)
+    return np.stack(probes), names

@@ -1,0 +1,1 @@
+"""A small world whose geometry, materials, temperatures and times are known: solved, ray-traced and filmed."""

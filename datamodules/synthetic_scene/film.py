@@ -1,0 +1,274 @@
+"""Filming a scene with a hand-held thermal camera: the path, exact pixels, and the noise of the sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datamodules.formats.lens import Lens
+from datamodules.synthetic_scene.scene import Scene
+from datamodules.synthetic_scene.shapes import trace
+from heatsplat.contracts import ThermalRange
+from heatsplat.training.rng import generator_for
+
+# A pixel is resampled on 3 x 3 rays where it differs by this much from the mean of its neighbours, in kelvin: one ray
+# is right to second order on a smooth surface, but not at an edge.
+_EDGE_K = 0.05
+_FIELD_OF_VIEW_DEG = 48.0
+# The path circles about this point, metres.
+_LOOK_AT = (0.0, 0.15, 0.3)
+# Frames come faster at the start, when things change fastest: time grows as this power of the frame number.
+_HASTE = 1.25
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large a recording is: image size in pixels, frames, and points of its sparse model."""
+
+    width: int
+    height: int
+    frames: int
+    points: int
+
+
+SIZES = {
+    "tiny": Size(64, 52, 19, 600),
+    "demo": Size(160, 128, 72, 4000),
+    "large": Size(512, 410, 240, 20000),
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the camera brought home, and what is known besides.
+
+    Args:
+        scene: what was filmed.
+        lens: intrinsics and distortion of every frame.
+        viewmats: [F, 4, 4] float64 world-to-camera, OpenCV axes, metres.
+        times_s: [F] float64, whole milliseconds, increasing from the start of the record.
+        celsius: [F, H, W] float32 temperatures with noise.
+        rgb: [F, H, W, 3] uint8 visible images of the same camera.
+        thermal_range: whole degrees that enclose all noise-free temperatures with at least half a degree to spare.
+        points: [P, 3] float64 points seen in the frames, a few millimetres off their surfaces.
+        point_colors: [P, 3] in [0, 1].
+    """
+
+    scene: Scene
+    lens: Lens
+    viewmats: np.ndarray
+    times_s: np.ndarray
+    celsius: np.ndarray
+    rgb: np.ndarray
+    thermal_range: ThermalRange
+    points: np.ndarray
+    point_colors: np.ndarray
+
+    def grey(self, frame: int, dtype: type = np.uint8) -> np.ndarray:
+        """Stored image [H, W] of a frame: ``thermal_range`` over the whole of an integer type, rounded and clipped."""
+        full = np.iinfo(dtype).max
+        unit = self.thermal_range.to_unit(self.celsius[frame].astype(np.float64))
+        return np.clip(np.rint(unit * full), 0, full).astype(dtype)
+
+
+def film(
+    scene: Scene,
+    size: Size,
+    seed: int = 0,
+    noise_k: float = 0.05,
+    distortion: Sequence[float] = (),
+    pixel_aspect: float = 1.0,
+) -> Recording:
+    """A recording of ``scene``; the same arguments give the same bits.
+
+    Args:
+        scene: what to film.
+        size: images, frames and points.
+        seed: of the hand's motion, the noise and the choice of points.
+        noise_k: standard deviation of the noise of a pixel (NETD) in kelvin; 0 for clean images.
+        distortion: k1 k2 p1 p2 of OpenCV's model, or nothing for a pinhole.
+        pixel_aspect: fy / fx.
+    """
+    lens = _lens(size, distortion, pixel_aspect)
+    times = frame_times(size.frames, scene.preset.duration_s, seed)
+    viewmats = camera_path(times, scene.preset.duration_s, seed)
+    rays = pixel_rays(lens, _pixel_centres(lens))
+    celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
+    rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
+    lows, highs = np.empty(size.frames), np.empty(size.frames)
+
+    def shoot(frame: int) -> None:
+        temperature, color = expose(scene, lens, rays, viewmats[frame], float(times[frame]))
+        lows[frame], highs[frame] = temperature.min().item(), temperature.max().item()
+        if noise_k:
+            generator = generator_for(seed, frame, "camera noise")
+            temperature = temperature + noise_k * torch.randn(temperature.shape, generator=generator)
+        celsius[frame] = temperature.numpy()
+        rgb[frame] = (color * 255.0).round().to(torch.uint8).numpy()
+
+    # One frame per thread: torch's own threads wait for each other after every small operation, which made this ten
+    # times slower on a busy machine.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(shoot, range(size.frames)))
+    finally:
+        torch.set_num_threads(threads)
+    points, colors = sparse_points(scene, lens, viewmats, size.points, seed)
+    return Recording(
+        scene=scene,
+        lens=lens,
+        viewmats=viewmats.numpy(),
+        times_s=times,
+        celsius=celsius,
+        rgb=rgb,
+        thermal_range=ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5)),
+        points=points.numpy(),
+        point_colors=colors.numpy(),
+    )
+
+
+def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
+    focal = 0.5 * size.width / math.tan(math.radians(0.5 * _FIELD_OF_VIEW_DEG))
+    return Lens(
+        fx=focal,
+        fy=focal * pixel_aspect,
+        cx=0.5 * size.width,
+        cy=0.5 * size.height,
+        width=size.width,
+        height=size.height,
+        distortion=tuple(distortion),
+        model="OPENCV" if distortion else "PINHOLE",
+    )
+
+
+def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
+    """Times [count] of frames taken by hand: uneven, increasing, whole milliseconds in 0 .. duration_s."""
+    jitter = torch.rand(count, generator=generator_for(seed, 0, "frame times"), dtype=torch.float64).numpy()
+    moments = np.arange(count) + 0.6 * (jitter - 0.5)
+    moments = np.clip(moments, 0.0, count - 1) / max(count - 1, 1)
+    return np.round(moments**_HASTE * duration_s, 3)
+
+
+def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
+    """World-to-camera matrices [F, 4, 4] of a hand that sweeps to and fro before the objects.
+
+    Every direction is visited several times during the record, so that a view does not tell the time.
+    """
+    generator = generator_for(seed, 0, "camera path")
+    t = torch.from_numpy(times_s) / duration_s
+
+    def sway(cycles: float) -> Tensor:
+        phase = torch.rand((), generator=generator, dtype=torch.float64)
+        return torch.sin(2.0 * math.pi * (cycles * t + phase))
+
+    azimuth = torch.deg2rad(38.0 * sway(5.3) + 3.0 * sway(23.0))
+    elevation = torch.deg2rad(26.0 + 12.0 * sway(3.4) + 2.0 * sway(19.0))
+    radius = 2.15 + 0.2 * sway(2.3)
+    roll = torch.deg2rad(3.0 * sway(11.0))
+    aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.06 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
+    flat = radius * torch.cos(elevation)
+    center = aim + torch.stack(
+        [flat * torch.sin(azimuth), -flat * torch.cos(azimuth), radius * torch.sin(elevation)], dim=1
+    )
+
+    forward = torch.nn.functional.normalize(aim - center, dim=1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=1)
+    down = torch.linalg.cross(forward, right)
+    c, s = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
+    rotation = torch.stack([c * right + s * down, c * down - s * right, forward], dim=1)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(len(times_s), 1, 1)
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3] = -(rotation @ center[:, :, None])[:, :, 0]
+    return viewmats
+
+
+def _pixel_centres(lens: Lens) -> Tensor:
+    """Pixel positions [H * W, 2] (x, y), row by row."""
+    y, x = torch.meshgrid(
+        torch.arange(lens.height, dtype=torch.float64), torch.arange(lens.width, dtype=torch.float64), indexing="ij"
+    )
+    return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
+
+
+def pixel_rays(lens: Lens, pixels: Tensor) -> Tensor:
+    """Directions [n, 3] in camera axes, z = 1, of the rays that a lens brings to ``pixels`` [n, 2].
+
+    Distortion is inverted by Newton's method on the distorted position; its polynomial is OpenCV's
+    (docs.opencv.org, "Camera Calibration and 3D Reconstruction").
+    """
+    target = (pixels - pixels.new_tensor([lens.cx, lens.cy])) / pixels.new_tensor([lens.fx, lens.fy])
+    x, y = target[:, 0], target[:, 1]
+    if lens.distortion:
+        k1, k2, p1, p2 = lens.distortion
+        for _ in range(12):
+            r2 = x * x + y * y
+            radial, slope = 1 + r2 * (k1 + k2 * r2), k1 + 2 * k2 * r2
+            error_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - target[:, 0]
+            error_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - target[:, 1]
+            xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+            yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+            xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+            determinant = xx * yy - xy * xy
+            x, y = x - (yy * error_x - xy * error_y) / determinant, y - (xx * error_y - xy * error_x) / determinant
+    return torch.stack([x, y, torch.ones_like(x)], dim=1)
+
+
+def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
+    """Temperatures [H, W] in °C, float64, and colours [H, W, 3] in [0, 1] that a noise-free camera would record.
+
+    Args:
+        rays: [H * W, 3] what ``pixel_rays`` returns for the pixel centres of ``lens``.
+        viewmat: [4, 4] world-to-camera.
+        time_s: seconds from the start of the record.
+    """
+    when = torch.tensor([time_s], dtype=torch.float64)
+
+    def look(directions: Tensor) -> tuple[Tensor, Tensor]:
+        points, which = hits(scene, viewmat, directions)
+        return scene.celsius(scene.heat_at(points, which), when)[:, 0], scene.color(points, which)
+
+    celsius, color = look(rays)
+    image = celsius.reshape(1, 1, lens.height, lens.width)
+    around = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    edges = ((image - around).abs() > _EDGE_K).reshape(-1).nonzero()[:, 0]
+    third = torch.tensor([-1 / 3, 0.0, 1 / 3], dtype=torch.float64)
+    within = torch.cartesian_prod(third, third)
+    fine_celsius, fine_color = look(pixel_rays(lens, (_pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
+    celsius[edges] = fine_celsius.reshape(-1, len(within)).mean(1)
+    color[edges] = fine_color.reshape(-1, len(within), 3).mean(1)
+    return celsius.reshape(lens.height, lens.width), color.reshape(lens.height, lens.width, 3)
+
+
+def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """First points [n, 3] on the rays ``directions`` [n, 3] (camera axes), and their surfaces [n] (-1: none)."""
+    rotation = viewmat[:3, :3]
+    center = -rotation.T @ viewmat[:3, 3]
+    world = directions @ rotation
+    distance, which = trace(scene.shapes, center.expand_as(world), world)
+    missed = torch.isinf(distance)
+    return center + distance.masked_fill(missed, 0.0)[:, None] * world, which.masked_fill(missed, -1)
+
+
+def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, 3 mm off their surface."""
+    generator = generator_for(seed, 0, "sparse points")
+    frames = torch.randint(len(viewmats), (count,), generator=generator)
+    extent = torch.tensor([lens.width, lens.height], dtype=torch.float64)
+    rays = pixel_rays(lens, torch.rand(count, 2, generator=generator, dtype=torch.float64) * extent)
+    points, which = torch.empty(count, 3, dtype=torch.float64), torch.empty(count, dtype=torch.int64)
+    for frame in frames.unique().tolist():
+        here = frames == frame
+        points[here], which[here] = hits(scene, viewmats[frame], rays[here])
+    found = which >= 0
+    colors = scene.color(points, which)[found]
+    noise = 0.003 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    return (points + noise)[found], colors

@@ -1,0 +1,202 @@
+"""The scenes themselves: what stands where, of which material, how warm it starts and what heats it.
+
+A new scene is one more entry in ``PRESETS``; a new object is one more ``Surface``. Lengths are metres, z is up, cameras
+look towards +y.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from datamodules.synthetic_scene.heat import Material, Waveform, periodic
+from datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
+
+# Directions (cycles per wavelength) and phases of the smooth part of every pattern: three waves that share no axis.
+_WAVES = ((0.83, 0.31, 0.46), (-0.37, 0.78, 0.51), (0.29, -0.55, 0.78))
+_PHASES = (0.4, 2.1, 4.4)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A quantity that varies over a surface: level + swing · (smooth waves in [-1, 1]) ± step (a 3D chessboard).
+
+    **Convention:** points are given in the shape's own axes; the middle of a tile lies at the shape's origin, so that a
+    plane or a cap through it is no border between tiles.
+
+    Args:
+        level: mean value.
+        swing: largest deviation of the smooth part.
+        wavelength_m: its wavelength.
+        step: half the jump across the border of two tiles; 0 for none.
+        tile_m: edge of a tile.
+    """
+
+    level: float
+    swing: float = 0.0
+    wavelength_m: float = 1.0
+    step: float = 0.0
+    tile_m: float = 0.4
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Values [n] at ``points`` [n, 3]."""
+        value = torch.full_like(points[:, 0], self.level)
+        if self.swing:
+            waves = points.new_tensor(_WAVES) * (2.0 * math.pi / self.wavelength_m)
+            phases = waves @ points.T + points.new_tensor(_PHASES)[:, None]
+            value += self.swing * torch.sin(phases).mean(0)
+        if self.step:
+            tile = (points.T / self.tile_m + 0.5).floor().sum(0)
+            value += self.step * (1.0 - 2.0 * torch.remainder(tile, 2.0))
+        return value
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One object of a scene.
+
+    Args:
+        name: unique within the scene.
+        shape: its geometry.
+        material: what it is made of.
+        absorbs: absorbed share of the lamp's flux over the surface, in [0, 1]; dark paint in the colour image too.
+        color: its colour where it absorbs nothing, in [0, 1].
+    """
+
+    name: str
+    shape: Shape
+    material: Material
+    absorbs: Pattern = Pattern(0.6)
+    color: Point = (0.8, 0.8, 0.8)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A driven source of heat: a spot light with a soft edge that casts shadows.
+
+    Args:
+        position, aim: where it is and the point it looks at.
+        half_angle_deg: half its beam, at half its flux.
+        flux_w_m2: flux at ``aim`` on a surface that faces the lamp.
+        waveform: its level over time; it must end at the end of the record.
+    """
+
+    position: Point
+    aim: Point
+    half_angle_deg: float
+    flux_w_m2: float
+    waveform: Waveform
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A scene.
+
+    Args:
+        start_k: excess over ambient at time 0 by name of surface, throughout its depth; without a name at ambient.
+        lamp: what heats the scene, or None.
+        held: True where every point is supplied with the heat that it loses, so that nothing changes.
+        surfaces: its objects.
+        ambient_c: temperature of the surroundings in °C.
+        duration_s: length of the record in seconds.
+    """
+
+    start_k: Mapping[str, Pattern] = field(default_factory=dict)
+    lamp: Lamp | None = None
+    held: bool = False
+    surfaces: tuple[Surface, ...] = ()
+    ambient_c: float = 22.0
+    duration_s: float = 1800.0
+
+    def __post_init__(self) -> None:
+        names = [surface.name for surface in self.surfaces]
+        if len(set(names)) != len(names):
+            raise ValueError(f"preset has two surfaces of one name: {sorted(names)}")
+        if unknown := set(self.start_k) - set(names):
+            raise ValueError(f"preset starts surfaces that it does not have: {sorted(unknown)}; it has {sorted(names)}")
+        if self.held and self.lamp is not None:
+            raise ValueError("a preset is either held steady or heated by a lamp, not both")
+
+
+# Exchange coefficients are those of a room with moving air, radiation included. Depths are chosen so that the time
+# constants ρc·depth/h span 4 minutes (plastic) to an hour (floor) and the Biot numbers h·depth/k 0.001 (aluminium, a
+# single exponential) to 2 (wood, far from one).
+WOOD = Material(conductivity=0.16, heat_capacity=0.9e6, depth_m=0.016, exchange=20.0)
+ALUMINIUM = Material(conductivity=200.0, heat_capacity=2.4e6, depth_m=0.006, exchange=20.0)
+STEEL = Material(conductivity=45.0, heat_capacity=3.7e6, depth_m=0.005, exchange=20.0)
+CERAMIC = Material(conductivity=1.5, heat_capacity=2.0e6, depth_m=0.010, exchange=20.0)
+RUBBER = Material(conductivity=0.25, heat_capacity=1.6e6, depth_m=0.008, exchange=20.0)
+PLASTIC = Material(conductivity=0.3, heat_capacity=1.6e6, depth_m=0.003, exchange=20.0)
+PLASTER = Material(conductivity=0.4, heat_capacity=1.0e6, depth_m=0.0125, exchange=15.0)
+STONE = Material(conductivity=1.4, heat_capacity=2.0e6, depth_m=0.030, exchange=15.0)
+
+TABLE_TOP = (
+    Surface("floor", Plane((0, 0, 0), (0, 0, 1)), STONE, Pattern(0.55, 0.1, 1.1, 0.15, 0.45), (0.75, 0.72, 0.68)),
+    Surface("wall", Plane((0, 1.0, 0), (0, -1, 0)), PLASTER, Pattern(0.5, 0.1, 1.2, 0.12, 0.5), (0.9, 0.88, 0.82)),
+    Surface("left_wall", Plane((-1.7, 0, 0), (1, 0, 0)), PLASTER, Pattern(0.5, 0.15, 1.2), (0.82, 0.88, 0.9)),
+    Surface("right_wall", Plane((1.7, 0, 0), (-1, 0, 0)), PLASTER, Pattern(0.5, 0.15, 1.2), (0.82, 0.88, 0.9)),
+    Surface(
+        "crate",
+        Box((-0.45, 0.25, 0.25), (0.5, 0.4, 0.5), 20.0),
+        WOOD,
+        Pattern(0.45, 0.1, 0.6, 0.15, 0.25),
+        (0.85, 0.6, 0.35),
+    ),
+    Surface(
+        "tower",
+        Box((0.5, 0.35, 0.35), (0.35, 0.35, 0.7), -25.0),
+        ALUMINIUM,
+        Pattern(0.5, 0.1, 0.5, 0.2, 0.23),
+        (0.8, 0.82, 0.85),
+    ),
+    Surface("carton", Box((-0.45, 0.25, 0.59), (0.24, 0.22, 0.18), 55.0), PLASTIC, Pattern(0.4, 0.1), (0.9, 0.3, 0.3)),
+    Surface("vase", Sphere((0.05, -0.15, 0.22), 0.22), CERAMIC, Pattern(0.6, 0.1, 0.4, 0.2, 0.17), (0.4, 0.6, 0.9)),
+    Surface("ball", Sphere((-0.5, -0.4, 0.15), 0.15), RUBBER, Pattern(0.55, 0.2, 0.3), (0.5, 0.85, 0.5)),
+    Surface("can", Cylinder((0.5, -0.35, 0.0), 0.14, 0.42), STEEL, Pattern(0.6, 0.0, 1.0, 0.2, 0.14), (0.9, 0.8, 0.3)),
+)
+
+# Warm out of the oven, each at its own temperature: 22 °C surroundings, up to about 62 °C.
+_WARM = {
+    "floor": Pattern(8.0, 6.0, 1.1, 1.0, 0.45),
+    "wall": Pattern(11.0, 7.0, 1.0, 1.5, 0.5),
+    "left_wall": Pattern(9.0, 6.0, 1.3),
+    "right_wall": Pattern(13.0, 6.0, 1.3),
+    "crate": Pattern(27.0, 7.0, 0.6, 3.0, 0.25),
+    "tower": Pattern(33.0, 5.0, 0.5, 2.5, 0.23),
+    "carton": Pattern(36.0, 4.0, 0.3),
+    "vase": Pattern(30.0, 6.0, 0.4, 3.0, 0.17),
+    "ball": Pattern(22.0, 8.0, 0.3),
+    "can": Pattern(19.0, 4.0, 0.5, 3.0, 0.14),
+}
+
+# The room of the heated scene has not quite settled when the record starts.
+_LUKEWARM = {
+    "floor": Pattern(2.5, 2.0, 0.8),
+    "wall": Pattern(3.0, 2.5, 1.0),
+    "left_wall": Pattern(3.0, 2.0, 1.3),
+    "right_wall": Pattern(3.0, 2.0, 1.3),
+    "crate": Pattern(4.0, 2.0, 0.5),
+    "tower": Pattern(1.5, 1.0, 0.5),
+    "carton": Pattern(6.0, 1.0, 0.3),
+    "vase": Pattern(5.0, 2.0, 0.4),
+    "ball": Pattern(2.0, 1.0, 0.3),
+    "can": Pattern(6.0, 1.5, 0.5),
+}
+
+_LAMP = Lamp(
+    position=(-0.7, -1.6, 1.7),
+    aim=(0.0, 0.1, 0.25),
+    half_angle_deg=32.0,
+    flux_w_m2=900.0,
+    waveform=periodic(period_s=600.0, on_s=300.0, ramp_s=120.0, duration_s=1800.0),
+)
+
+PRESETS: dict[str, Preset] = {
+    "static": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP),
+    "cooling": Preset(start_k=_WARM, surfaces=TABLE_TOP),
+    "heated": Preset(start_k=_LUKEWARM, lamp=_LAMP, surfaces=TABLE_TOP),
+}

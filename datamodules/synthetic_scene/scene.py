@@ -1,0 +1,123 @@
+"""A preset whose heat has been solved: the temperature of every surface point at every time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from datamodules.synthetic_scene import heat
+from datamodules.synthetic_scene.presets import Preset
+from datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
+
+# Where the visible light comes from (unit length), and its share that comes from everywhere.
+_SUN = (-0.398, -0.597, 0.697)
+_SKYLIGHT = 0.4
+# Paint that absorbs all heat reflects this share of the colour that a bare surface does.
+_DARKEST = 0.3
+# Shadow rays start this far off their surface, in metres: above rounding at any size, far below any pixel.
+_OFF_SURFACE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class SurfaceHeat:
+    """What decides the temperature of n surface points over time.
+
+    Args:
+        start_k: [n] excess over ambient at time 0.
+        flux_w_m2: [n] absorbed flux when the source is at full level.
+        material: [n] position of the material in ``Scene.materials``; -1 where there is no surface.
+    """
+
+    start_k: Tensor
+    flux_w_m2: Tensor
+    material: Tensor
+
+    def where(self, keep: Tensor) -> SurfaceHeat:
+        """The heat of the points that ``keep`` selects."""
+        return SurfaceHeat(self.start_k[keep], self.flux_w_m2[keep], self.material[keep])
+
+
+class Scene:
+    """Geometry, materials and solved temperatures of a preset; float64 on the CPU.
+
+    **Convention:** times are seconds from the start of the preset's record, 0 to ``preset.duration_s``.
+    """
+
+    def __init__(self, preset: Preset) -> None:
+        self.preset = preset
+        self.shapes = [surface.shape for surface in preset.surfaces]
+        self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
+        waveform = preset.lamp.waveform if preset.lamp else heat.CONSTANT
+        self.responses = heat.solve(self.materials, waveform, preset.duration_s)
+
+    def heat_at(self, points: Tensor, which: Tensor) -> SurfaceHeat:
+        """Start, flux and material at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
+        result = SurfaceHeat(
+            torch.zeros(len(points), dtype=torch.float64),
+            torch.zeros(len(points), dtype=torch.float64),
+            torch.full((len(points),), -1),
+        )
+        for number, surface in enumerate(self.preset.surfaces):
+            here = which == number
+            if not here.any():
+                continue
+            on = points[here]
+            local = surface.shape.local(on)
+            result.material[here] = self.materials.index(surface.material)
+            if surface.name in self.preset.start_k:
+                result.start_k[here] = self.preset.start_k[surface.name](local)
+            if self.preset.held:
+                result.flux_w_m2[here] = surface.material.exchange * result.start_k[here]
+            if self.preset.lamp:
+                lit = self._lamp_flux(on, surface.shape.normals(on))
+                result.flux_w_m2[here] = surface.absorbs(local).clamp(0.0, 1.0) * lit
+        return result
+
+    def _lamp_flux(self, points: Tensor, normals: Tensor) -> Tensor:
+        """Flux [n] that the lamp at full level sends onto ``points`` [n, 3], shadows included, in W/m²."""
+        lamp = self.preset.lamp
+        position, aim = points.new_tensor(lamp.position), points.new_tensor(lamp.aim)
+        to_lamp = position - points
+        distance = dot(to_lamp, to_lamp).sqrt()
+        facing = dot(normals, to_lamp) / distance
+        axis = aim - position
+        off_axis = torch.acos((-(to_lamp @ axis) / (distance * axis.norm())).clamp(-1.0, 1.0))
+        edge = math.radians(lamp.half_angle_deg)
+        beam = torch.sigmoid((edge - off_axis) / (0.1 * edge))
+        flux = lamp.flux_w_m2 * (axis.norm() / distance) ** 2 * facing.clamp_min(0.0) * beam
+        lit = flux > 0
+        blocked, _ = trace(self.shapes, points[lit] + _OFF_SURFACE_M * normals[lit], to_lamp[lit])
+        flux[lit] = torch.where(blocked < 1.0, 0.0, flux[lit])
+        return flux
+
+    def celsius(self, surface: SurfaceHeat, times_s: Tensor) -> Tensor:
+        """Temperatures [n, F] of surface points at ``times_s`` [F], in °C; ambient where there is no surface."""
+        response = torch.from_numpy(self.responses.at(times_s.numpy()))
+        of_point = response[:, surface.material.clamp_min(0)]
+        rise = of_point[..., 0] * surface.start_k + of_point[..., 1] * surface.flux_w_m2
+        return self.preset.ambient_c + rise.T
+
+    def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The surface nearest to each point: the point on it [n, 3] and its number [n]."""
+        return nearest_surface(self.shapes, points.to("cpu", torch.float64))
+
+    def truth(self, points: Tensor, times_s: Tensor) -> Tensor:
+        """Temperatures [n, F] of the surface nearest to each of ``points`` [n, 3] at ``times_s`` [F], in °C."""
+        on_surface, which = self.nearest(points)
+        return self.celsius(self.heat_at(on_surface, which), times_s.to("cpu", torch.float64).reshape(-1))
+
+    def color(self, points: Tensor, which: Tensor) -> Tensor:
+        """Visible colour [n, 3] in [0, 1] of surface points: Lambertian, dark where the paint absorbs heat."""
+        color = torch.zeros_like(points)
+        for number, surface in enumerate(self.preset.surfaces):
+            here = which == number
+            if not here.any():
+                continue
+            on = points[here]
+            daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (surface.shape.normals(on) @ on.new_tensor(_SUN)).clamp_min(0.0)
+            albedo = 1 - (1 - _DARKEST) * surface.absorbs(surface.shape.local(on)).clamp(0.0, 1.0)
+            color[here] = (albedo * daylight)[:, None] * on.new_tensor(surface.color)
+        return color
