@@ -343,6 +343,7 @@ def test_images_and_gradients_of_plain_scenes(backend, name):
 
 @pytest.mark.parametrize("channels", [(3,), (3, 1)])
 def test_absolute_screen_gradients(backend, channels):
+    # Sums of |gradient| over pixels and modalities: gsplat composites each modality on its own and cannot do otherwise.
     scene = plain_scene(channels=channels)
     actual, expected = run(backend, scene, absgrad=True), oracle(scene, absgrad=True)
     assert_close(actual, expected)

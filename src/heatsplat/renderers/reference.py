@@ -18,7 +18,10 @@ PAIRS = 2**20  # pixels times Gaussians held at once: 8 MiB per float64 tensor a
 
 
 def render(inputs: RenderInputs) -> RenderOutput:
-    """Composited features, alpha and depth; ``heatsplat.renderers.rasterization`` has the contract."""
+    """Composited features, alpha and depth; ``heatsplat.renderers.rasterization`` has the contract.
+
+    **Convention:** absolute screen gradients are summed over pixels and modalities, as all backends do.
+    """
     ids, radii = _visible(inputs)
     screen = _project(inputs, ids)
     means2d = inputs.means.new_zeros(len(inputs.means), 2).index_copy(0, ids, screen.means)
