@@ -41,9 +41,9 @@ class Reduction:
 def degraded(scene: SceneData, degrade: str | None, upsample: str | None = None) -> SceneData:
     """The scene with training images of low resolution; validation and test keep their pixels.
 
-    **Convention:** a reduced image covers what the original covers, and its camera is ``Camera.resized``: the intrinsics
-    are exact on both grids, half pixels included. Values that bicubic lets overshoot are clamped to [0, 1]. A pixel counts
-    where all pixels that it was made from do.
+    **Convention:** a reduced image covers what the original covers, and its camera is ``Camera.resized``, so intrinsics
+    are exact on both grids, half pixels included. Values that bicubic lets overshoot are clamped to [0, 1]. A pixel
+    counts where all pixels that it was made from do.
 
     Args:
         scene: any scene. Without ``degrade`` it comes back as it is.
@@ -63,9 +63,7 @@ def degraded(scene: SceneData, degrade: str | None, upsample: str | None = None)
     reduction = Reduction.parse(degrade)
     small = [_reduced_frame(frame, reduction, degrade) for frame in scene.train.frames]
     frames = scene.train.frames if upsample else small
-    views: dict[
-        int, View
-    ] = {}  # small images are worth keeping: 16 times less memory than reducing them every step is work
+    views: dict[int, View] = {}  # small images are kept: they are few bytes, and making one takes milliseconds
 
     def reduce(position: int) -> View:
         if position not in views:
@@ -93,10 +91,10 @@ def _reduced_frame(frame: Frame, reduction: Reduction, degrade: str) -> Frame:
     width, height = frame.camera.width, frame.camera.height
     if width % reduction.factor or height % reduction.factor:
         whole = [f for f in range(2, 17) if width % f == 0 and height % f == 0]
+        remedy = f"factors that do: {', '.join(map(str, whole))}" if whole else "no factor up to 16 does"
         raise SceneError(
-            f"data.degrade={degrade}: image {frame.name} has {width} x {height} pixels, which {reduction.factor} does not "
-            f"divide; {'factors that do: ' + ', '.join(map(str, whole)) if whole else 'no factor up to 16 does'}. "
-            "data.downscale changes the size before."
+            f"data.degrade={degrade}: image {frame.name} has {width} x {height} pixels, which {reduction.factor} does "
+            f"not divide; {remedy}. data.downscale changes the size before."
         )
     return replace(frame, camera=frame.camera.resized(width // reduction.factor, height // reduction.factor))
 
