@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numba
 from numba.core import event
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
 log = logging.getLogger(__name__)
 
@@ -18,20 +18,32 @@ log = logging.getLogger(__name__)
 # nothing (measured: the image is wrong by 0.21), 'nnan' because comparisons with NaN must stay false: they cull.
 FASTMATH = {"contract", "nsz", "arcp"}
 
-# Numba's cache looks only at the file of the function itself; this makes it notice changed helpers in the other files.
+# Numba's cache looks only at the file of the function itself; with this in the names of its files it also notices changed
+# helpers in other files, and never unpickles types of another version of this package.
 _FINGERPRINT = hashlib.sha256(
     b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-).hexdigest()
+).hexdigest()[:12]
+
+
+class _CacheFiles(CompileResultCacheImpl):
+    def get_filename_base(self, fullname: str, abiflags: str) -> str:
+        return f"{super().get_filename_base(fullname, abiflags)}-{_FINGERPRINT}"
 
 
 class _Cache(FunctionCache):
-    def _index_key(self, sig, codegen):
-        return (*super()._index_key(sig, codegen), _FINGERPRINT)
+    _impl_class = _CacheFiles
 
 
 def kernel(function: Callable) -> Callable:
     """``function`` compiled for Python callers: parallel over ``prange``, without the GIL, cached on disk."""
     compiled = numba.njit(parallel=True, fastmath=FASTMATH, error_model="numpy", nogil=True)(function)
+    compiled._cache = _Cache(function)
+    return compiled
+
+
+def serial_kernel(function: Callable) -> Callable:
+    """``function`` compiled for Python callers, to run in one thread."""
+    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True)(function)
     compiled._cache = _Cache(function)
     return compiled
 

@@ -1,0 +1,368 @@
+"""Front-to-back compositing of the instances of a tile, and its gradient; a vector is a block of 4x4 pixels.
+
+Plain twin: heatsplat.renderers.reference.
+
+Pixel state lives in blocks: entry (tile, block) of a state array is one vector per modality or channel. A pixel that is
+finished keeps its transmittance with the sign flipped: the next transmittance is then negative as well, so the one
+comparison with TRANSMITTANCE_MIN turns away finished pixels and those about to finish.
+
+The backward pass walks front to back as the forward pass does, with what remains of the loss behind each Gaussian,
+
+    R = sum over later j of w_j (v . f_j) + T_final v_T,   dL/d(log alpha_i) = w_i (v . f_i) - R_i alpha_i / (1 - alpha_i),
+
+so it needs neither per-pixel lists nor divisions of transmittances. The density is exp2(-|u|^2) of whitened offsets u, so
+the gradient of everything geometric is a linear function of five moments of g = dL/d(log alpha): the sums of g u1, g u2,
+g u1^2, g u1 u2 and g u2^2 over pixels. They stay in registers over the blocks of an instance and are added up across lanes
+once per instance, into a slot of its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.layout import (
+    channels,
+    has_absgrad,
+    modalities,
+    modality_of,
+    moment_count,
+)
+from heatsplat.kernels.projection import GEOMETRY, LOG2_ALPHA_MIN, TILE
+from heatsplat.kernels.scheduling import take
+from heatsplat.kernels.simd import (
+    LANES,
+    absolute,
+    bits,
+    exp2,
+    lane_indices,
+    load,
+    lowest_bit,
+    minimum,
+    registers,
+    select,
+    splat,
+    store,
+    to_float,
+    total,
+)
+
+ALPHA_MIN = np.float32(1.0 / 255.0)
+ALPHA_MAX = np.float32(0.999)
+TRANSMITTANCE_MIN = np.float32(1e-4)
+BLOCKS = 16
+
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+
+
+@inline
+def _whitened_corner(records, record, tile_x, tile_y):
+    """u1 and u2 of the sixteen pixels of a tile's first block."""
+    x = to_float(lane_indices() & 3) + (tile_x + _HALF - records[record, 0])
+    y = to_float(lane_indices() >> 2) + (tile_y + _HALF - records[record, 1])
+    return records[record, 2] * x + records[record, 3] * y, records[record, 4] * y
+
+
+@inline
+def _whitened_block(records, record, corner_1, corner_2, block):
+    """u1 and u2 of the pixels of a block."""
+    right, down = np.float32((block & 3) * 4), np.float32((block >> 2) * 4)
+    return (
+        corner_1 + (records[record, 2] * right + records[record, 3] * down),
+        corner_2 + records[record, 4] * down,
+    )
+
+
+@inline
+def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, transmittances, image):
+    """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
+
+    Block masks are reduced to the blocks where a pixel took something, which is what the backward pass has to visit.
+    """
+    tile_x, tile_y = np.float32(tile % tiles_x * TILE), np.float32(tile // tiles_x * TILE)
+    for block in range(tile * BLOCKS, (tile + 1) * BLOCKS):
+        for modality in range(modalities(layout)):
+            store(transmittances, (block * modalities(layout) + modality) * LANES, splat(_ONE))
+        for channel in range(channels(layout)):
+            store(image, (block * channels(layout) + channel) * LANES, splat(_ZERO))
+    unfinished = 0xFFFF
+    last = begin
+    weights = registers(modalities(layout))
+    features = GEOMETRY + (modalities(layout) if modalities(layout) > 1 else 0)
+    for instance in range(begin, end):
+        blocks = np.int64(instances[instance, 2]) & unfinished
+        used = 0
+        if blocks != 0:
+            record = np.int64(instances[instance, 0])
+            corner_1, corner_2 = _whitened_corner(records, record, tile_x, tile_y)
+            while blocks != 0:
+                block = lowest_bit(blocks)
+                blocks &= blocks - 1
+                state = tile * BLOCKS + block
+                u1, u2 = _whitened_block(records, record, corner_1, corner_2, block)
+                exponent = records[record, 5] - u1 * u1 - u2 * u2
+                reached = exponent >= LOG2_ALPHA_MIN
+                density = exp2(exponent)
+                any_taken, any_finished = 0, 0
+                for modality in range(modalities(layout)):
+                    alpha = density
+                    passed = reached
+                    if modalities(layout) > 1:
+                        alpha = density * records[record, GEOMETRY + modality]
+                        passed = reached & (alpha >= ALPHA_MIN)
+                    alpha = minimum(alpha, ALPHA_MAX)
+                    place = (state * modalities(layout) + modality) * LANES
+                    before = load(transmittances, place)
+                    weight = alpha * before
+                    after = before - weight
+                    taken = passed & (after > TRANSMITTANCE_MIN)
+                    finished = passed & (after <= TRANSMITTANCE_MIN)
+                    weights[modality] = select(taken, weight, _ZERO)
+                    after = select(taken, after, before)
+                    any_taken |= bits(taken)
+                    any_finished |= bits(finished)
+                    store(transmittances, place, select(finished, -absolute(after), after))
+                for channel in range(channels(layout)):
+                    place = (state * channels(layout) + channel) * LANES
+                    colour = weights[modality_of(layout, channel)] * records[record, features + channel]
+                    store(image, place, load(image, place) + colour)
+                if any_taken != 0:
+                    used |= 1 << block
+                if any_finished != 0:
+                    alive = 0
+                    for modality in range(modalities(layout)):
+                        alive |= bits(load(transmittances, (state * modalities(layout) + modality) * LANES) > _ZERO)
+                    if alive == 0:
+                        unfinished &= ~(1 << block)
+            if used != 0:
+                last = instance + 1
+        instances[instance, 2] = used
+        if unfinished == 0:
+            break
+    return last
+
+
+@inline
+def _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth):
+    """Copies the state of a tile into the images, background added, pixel by pixel."""
+    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+    colours = features.shape[2]
+    for y in range(top, min(top + TILE, height)):
+        for x in range(left, min(left + TILE, width)):
+            block = tile * BLOCKS + (y - top) // 4 * 4 + (x - left) // 4
+            lane = (y - top) % 4 * 4 + (x - left) % 4
+            for modality in range(modalities(layout)):
+                transmittances[block, modality, lane] = abs(transmittances[block, modality, lane])
+                alpha[modality, y, x] = _ONE - transmittances[block, modality, lane]
+            for channel in range(channels(layout)):
+                if channel < colours:
+                    behind = transmittances[block, modality_of(layout, channel), lane]
+                    image[block, channel, lane] += behind * background[channel]
+                    features[y, x, channel] = image[block, channel, lane]
+                else:
+                    depth[y, x] = image[block, channel, lane]
+
+
+@kernel
+def composite(
+    layout, workers, width, height, records, instances, tile_starts, background, ticket,
+    tile_ends, transmittances, image, features, alpha, depth,
+):  # fmt: skip
+    """Composites all tiles.
+
+    Args:
+        workers: how many threads share the tiles, each taking the next one when it is done.
+        ticket: [1] int64, zero.
+        tile_ends: out [tiles], the end of the instances that mattered to a tile.
+        transmittances, image: out, state by blocks: what is left of the light, and the channels with their background.
+        features, alpha, depth: out [H, W, C], [M, H, W], [H, W] (the last only where the layout has a channel for it).
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    tiles = tile_ends.shape[0]
+    for _ in prange(workers):
+        tile = take(ticket)
+        while tile < tiles:
+            tile_ends[tile] = _composite_tile(
+                layout,
+                tile,
+                tiles_x,
+                records,
+                instances,
+                tile_starts[tile],
+                tile_starts[tile + 1],
+                transmittances,
+                image,
+            )
+            _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth)
+            tile = take(ticket)
+
+
+@inline
+def _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v_depth, v_pixels, worker):
+    """Copies the gradients of a tile's pixels into block order; pixels outside the image get zero."""
+    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+    colours = v_features.shape[2]
+    for y in range(TILE):
+        for x in range(TILE):
+            block = worker * BLOCKS + y // 4 * 4 + x // 4
+            lane = y % 4 * 4 + x % 4
+            inside = (top + y < height) & (left + x < width)
+            for channel in range(channels(layout)):
+                value = _ZERO
+                if inside:
+                    if channel < colours:
+                        value = v_features[top + y, left + x, channel]
+                    else:
+                        value = v_depth[top + y, left + x]
+                v_pixels[block, channel, lane] = value
+            for modality in range(modalities(layout)):
+                value = _ZERO
+                if inside:
+                    value = v_alpha[modality, top + y, left + x]
+                v_pixels[block, channels(layout) + modality, lane] = value
+
+
+@inline
+def _start_remainders(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
+    """Fills a worker's state with transmittance one and the whole of v . image - v_alpha T_final."""
+    size = channels(layout) + modalities(layout)
+    for block in range(BLOCKS):
+        pixels = (worker * BLOCKS + block) * size
+        final = (tile * BLOCKS + block) * modalities(layout)
+        for modality in range(modalities(layout)):
+            rest = -load(v_pixels, (pixels + channels(layout) + modality) * LANES)
+            rest = rest * load(transmittances, (final + modality) * LANES)
+            for channel in range(channels(layout)):
+                if modality_of(layout, channel) == modality:
+                    composited = load(image, ((tile * BLOCKS + block) * channels(layout) + channel) * LANES)
+                    rest = rest + composited * load(v_pixels, (pixels + channel) * LANES)
+            place = ((worker * BLOCKS + block) * modalities(layout) + modality) * 2 * LANES
+            store(state, place, splat(_ONE))
+            store(state, place + LANES, rest)
+        for channel in range(colours):
+            behind = load(transmittances, (final + modality_of(layout, channel)) * LANES)
+            v_background[tile, channel] += total(behind * load(v_pixels, (pixels + channel) * LANES))
+
+
+@inline
+def _composite_tile_backward(
+    layout, tile, tiles_x, records, instances, begin, end, v_pixels, worker, state, slots
+):  # fmt: skip
+    """Leaves the moments of instances ``begin`` to ``end`` of a tile in their gradient slots."""
+    tile_x, tile_y = np.float32(tile % tiles_x * TILE), np.float32(tile // tiles_x * TILE)
+    size = channels(layout) + modalities(layout)
+    features = GEOMETRY + (modalities(layout) if modalities(layout) > 1 else 0)
+    moments = registers(moment_count(layout))
+    weights = registers(modalities(layout))
+    along = registers(modalities(layout))
+    for instance in range(begin, end):
+        blocks = np.int64(instances[instance, 2])
+        record = np.int64(instances[instance, 0])
+        slot = np.int64(instances[instance, 1])
+        corner_1, corner_2 = _whitened_corner(records, record, tile_x, tile_y)
+        for k in range(moment_count(layout)):
+            moments[k] = splat(_ZERO)
+        while blocks != 0:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            pixels = (worker * BLOCKS + block) * size
+            u1, u2 = _whitened_block(records, record, corner_1, corner_2, block)
+            exponent = records[record, 5] - u1 * u1 - u2 * u2
+            reached = exponent >= LOG2_ALPHA_MIN
+            density = exp2(exponent)
+            for modality in range(modalities(layout)):
+                along[modality] = splat(_ZERO)
+            for channel in range(channels(layout)):
+                modality = modality_of(layout, channel)
+                v_pixel = load(v_pixels, (pixels + channel) * LANES)
+                along[modality] = along[modality] + v_pixel * records[record, features + channel]
+            gradient = splat(_ZERO)
+            for modality in range(modalities(layout)):
+                alpha = density
+                passed = reached
+                if modalities(layout) > 1:
+                    alpha = density * records[record, GEOMETRY + modality]
+                    passed = reached & (alpha >= ALPHA_MIN)
+                unclamped = alpha < ALPHA_MAX
+                alpha = minimum(alpha, ALPHA_MAX)
+                place = ((worker * BLOCKS + block) * modalities(layout) + modality) * 2 * LANES
+                before = load(state, place)
+                rest = load(state, place + LANES)
+                weight = alpha * before
+                after = before - weight
+                taken = passed & (after > TRANSMITTANCE_MIN)
+                finished = passed & (after <= TRANSMITTANCE_MIN)
+                gain = weight * along[modality]
+                rest_after = rest - gain
+                v_log_alpha = gain - rest_after * (alpha / (_ONE - alpha))
+                v_log_alpha = select(taken & unclamped, v_log_alpha, _ZERO)
+                weights[modality] = select(taken, weight, _ZERO)
+                after = select(taken, after, before)
+                store(state, place, select(finished, -absolute(after), after))
+                store(state, place + LANES, select(taken, rest_after, rest))
+                moments[5 + modality] = moments[5 + modality] + v_log_alpha
+                gradient = gradient + v_log_alpha
+                if has_absgrad(layout):
+                    g1, g2 = v_log_alpha * u1, v_log_alpha * u2
+                    k = 5 + modalities(layout) + channels(layout)
+                    moments[k] = moments[k] + absolute(g1 * records[record, 2])
+                    moments[k + 1] = moments[k + 1] + absolute(g1 * records[record, 3] + g2 * records[record, 4])
+            g1, g2 = gradient * u1, gradient * u2
+            moments[0] = moments[0] + g1
+            moments[1] = moments[1] + g2
+            moments[2] = moments[2] + g1 * u1
+            moments[3] = moments[3] + g1 * u2
+            moments[4] = moments[4] + g2 * u2
+            for channel in range(channels(layout)):
+                k = 5 + modalities(layout) + channel
+                moments[k] = moments[k] + weights[modality_of(layout, channel)] * load(
+                    v_pixels, (pixels + channel) * LANES
+                )
+        for k in range(moment_count(layout)):
+            slots[slot, k] = total(moments[k])
+
+
+@kernel
+def composite_backward(
+    layout, workers, width, height, records, instances, tile_starts, tile_ends, transmittances, image, ticket,
+    v_features, v_alpha, v_depth, v_pixels, state, slots, v_backgrounds,
+):  # fmt: skip
+    """Leaves the moments of every instance in its gradient slot, and the background's gradient tile by tile.
+
+    Args:
+        v_features, v_alpha, v_depth: gradients of the images, as in ``composite``.
+        v_pixels: scratch, flat: (channels + modalities) vectors per worker and block.
+        state: scratch, flat: transmittance and remainder per worker, block and modality.
+        slots: out, flat, ``slot_size(layout)`` numbers per instance.
+        v_backgrounds: out [tiles, C].
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    tiles = tile_ends.shape[0]
+    for worker in prange(workers):
+        tile = take(ticket)
+        while tile < tiles:
+            for channel in range(v_features.shape[2]):
+                v_backgrounds[tile, channel] = _ZERO
+            _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v_depth, v_pixels, worker)
+            _start_remainders(
+                layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_backgrounds
+            )
+            _composite_tile_backward(
+                layout,
+                tile,
+                tiles_x,
+                records,
+                instances,
+                tile_starts[tile],
+                tile_ends[tile],
+                v_pixels,
+                worker,
+                state,
+                slots,
+            )
+            for instance in range(tile_ends[tile], tile_starts[tile + 1]):
+                slot = np.int64(instances[instance, 1])
+                for k in range(moment_count(layout)):
+                    slots[slot, k] = _ZERO
+            tile = take(ticket)
