@@ -1,5 +1,6 @@
 """The static model: seeds, directions, the degree schedule, temperature and what is absent at degree 0."""
 
+import numba
 import pytest
 import torch
 
@@ -84,6 +85,22 @@ def test_float32_emission_and_gradients_agree_with_float64(degree, channels, som
     assert (results[1][0] == 0).any() or degree == 0  # the clamp is met
     for got, expected in zip(*results, strict=True):
         assert torch.allclose(got.double(), expected, atol=1e-6 * max(1.0, expected.abs().max().item()))
+
+
+def test_the_number_of_threads_changes_no_bit():
+    model, start = Static(degree=3), seeds(1100)
+    query = Query(ids=torch.arange(1, 1100, 2), camera=camera_at([0.3, 0.1, -2.0]))
+    before, results = numba.get_num_threads(), []
+    try:
+        for threads in {1, min(2, numba.config.NUMBA_NUM_THREADS)}:
+            numba.set_num_threads(threads)
+            splats = splats_of(model, start, rest=0.3)
+            emitted = model.features(splats, query).features
+            emitted.square().sum().backward()
+            results.append([emitted] + [splats[name].grad for name in ("sh0", "sh_rest", "means")])
+    finally:
+        numba.set_num_threads(before)
+    assert all(torch.equal(one, two) for one, two in zip(results[0], results[-1], strict=True))
 
 
 def test_emission_depends_on_the_direction_from_the_camera():

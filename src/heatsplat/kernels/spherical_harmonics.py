@@ -1,89 +1,104 @@
-"""Spherical harmonics of degree 0 to 3 for the Gaussians in view, forward and backward.
+"""Spherical harmonics of degree 1 to 3 for the Gaussians in view, forward and backward.
 
-The plain-torch twin is heatsplat.geometry.spherical_harmonics.evaluate, which says what the conventions are. Here
-coefficients stay where they live (no gathered copy), and a direction is found from a mean and the camera's centre.
-Every Gaussian is computed and written by one thread, so results do not depend on the number of threads.
+The plain-torch twin is heatsplat.geometry.spherical_harmonics.evaluate, which says what the conventions are. Lanes are
+sixteen Gaussians in the polynomials of the direction; sums over coefficients go row by row where they live (turning
+rows into lanes costs more than it saves). Every Gaussian is computed and written by one thread, so the number of threads
+changes no bit.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-FAST = {"contract", "nsz", "arcp"}
-BLOCK = 512  # Gaussians per parallel task: enough work to hide its start, few enough to balance 10 k of them
+from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.simd import LANES, absolute, load, maximum, select, splat, sqrt, store
 
+BLOCK = 512  # Gaussians per parallel task: enough to hide its start, few enough to share 10 k of them
+SHORTEST = np.float32(1e-37)  # directions below this have length zero, so that 1 / length is finite
 
-@njit(inline="always")
-def _direction(x, y, z):
-    """Unit vector and length of a vector; zeros for a vector of (almost) zero length."""
-    zero, one = np.float32(0.0), np.float32(1.0)
-    largest = max(abs(x), max(abs(y), abs(z)))
-    if largest < np.float32(1e-37):  # so that 1 / length is finite
-        return zero, zero, zero, zero
-    x, y, z = x / largest, y / largest, z / largest
-    length = np.sqrt(x * x + y * y + z * z)
-    inverse = one / length
-    return x * inverse, y * inverse, z * inverse, length * largest
+_f = np.float32
+_ZERO, _ONE = _f(0.0), _f(1.0)
+_A0 = _f(0.28209479177387814)
+_A1 = _f(0.4886025119029199)
+_A2, _B2, _C2 = _f(1.0925484305920792), _f(0.31539156525252005), _f(0.5462742152960396)
+_A3, _B3, _C3 = _f(0.5900435899266435), _f(2.890611442640554), _f(0.4570457994644658)
+_D3, _E3 = _f(0.3731763325901154), _f(1.445305721320277)
 
 
-@njit(inline="always")
+@inline
+def _directions(means, ids, start, stop, center, places):
+    """Unit vectors from ``center`` to the means of ``ids[start:stop]``, and 1 / length; zeros for no length."""
+    for lane in range(stop - start):
+        row = ids[start + lane]
+        for axis in range(3):
+            places[axis * LANES + lane] = means[row, axis] - center[axis]
+    x, y, z = load(places, 0), load(places, LANES), load(places, 2 * LANES)
+    largest = maximum(maximum(absolute(x), absolute(y)), absolute(z))
+    some = largest > SHORTEST
+    shrink = select(some, _ONE / largest, splat(_ZERO))
+    x, y, z = x * shrink, y * shrink, z * shrink
+    inverse = select(some, _ONE / sqrt(x * x + y * y + z * z), splat(_ZERO))
+    return x * inverse, y * inverse, z * inverse, shrink * inverse
+
+
+@inline
 def _fill_basis(x, y, z, degree, basis):
-    """Harmonics 1 .. (degree + 1)² - 1 of a unit vector; ``basis[0]`` is the first after the constant."""
-    f = np.float32
-    basis[0] = f(-0.4886025119029199) * y
-    basis[1] = f(0.4886025119029199) * z
-    basis[2] = f(-0.4886025119029199) * x
+    """Writes the harmonics after the constant one, [(degree + 1)² - 1, 16], of unit vectors."""
+    store(basis, 0, -_A1 * y)
+    store(basis, LANES, _A1 * z)
+    store(basis, 2 * LANES, -_A1 * x)
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        basis[3] = f(1.0925484305920792) * x * y
-        basis[4] = f(-1.0925484305920792) * y * z
-        basis[5] = f(0.31539156525252005) * (f(2) * zz - xx - yy)
-        basis[6] = f(-1.0925484305920792) * x * z
-        basis[7] = f(0.5462742152960396) * (xx - yy)
+        store(basis, 3 * LANES, _A2 * x * y)
+        store(basis, 4 * LANES, -_A2 * y * z)
+        store(basis, 5 * LANES, _B2 * (_f(2) * zz - xx - yy))
+        store(basis, 6 * LANES, -_A2 * x * z)
+        store(basis, 7 * LANES, _C2 * (xx - yy))
         if degree >= 3:
-            basis[8] = f(-0.5900435899266435) * y * (f(3) * xx - yy)
-            basis[9] = f(2.890611442640554) * x * y * z
-            basis[10] = f(-0.4570457994644658) * y * (f(4) * zz - xx - yy)
-            basis[11] = f(0.3731763325901154) * z * (f(2) * zz - f(3) * xx - f(3) * yy)
-            basis[12] = f(-0.4570457994644658) * x * (f(4) * zz - xx - yy)
-            basis[13] = f(1.445305721320277) * z * (xx - yy)
-            basis[14] = f(-0.5900435899266435) * x * (xx - f(3) * yy)
+            store(basis, 8 * LANES, -_A3 * y * (_f(3) * xx - yy))
+            store(basis, 9 * LANES, _B3 * x * y * z)
+            store(basis, 10 * LANES, -_C3 * y * (_f(4) * zz - xx - yy))
+            store(basis, 11 * LANES, _D3 * z * (_f(2) * zz - _f(3) * xx - _f(3) * yy))
+            store(basis, 12 * LANES, -_C3 * x * (_f(4) * zz - xx - yy))
+            store(basis, 13 * LANES, _E3 * z * (xx - yy))
+            store(basis, 14 * LANES, -_A3 * x * (xx - _f(3) * yy))
 
 
-@njit(inline="always")
-def _basis_gradient(x, y, z, degree, q):
-    """Gradient of sum_b q_b basis_b with respect to the unit vector, its three components taken as independent."""
-    f = np.float32
-    gx = f(-0.4886025119029199) * q[2]
-    gy = f(-0.4886025119029199) * q[0]
-    gz = f(0.4886025119029199) * q[1]
+@inline
+def _slope(x, y, z, degree, weights):
+    """Gradient with respect to x, y and z of the harmonics' sum with ``weights`` [15, 16]."""
+    slope_x = -_A1 * load(weights, 2 * LANES)
+    slope_y = -_A1 * load(weights, 0)
+    slope_z = _A1 * load(weights, LANES)
     if degree >= 2:
-        a, b, c = f(1.0925484305920792), f(0.31539156525252005), f(0.5462742152960396)
-        gx += a * (q[3] * y - q[6] * z) + f(2) * x * (c * q[7] - b * q[5])
-        gy += a * (q[3] * x - q[4] * z) - f(2) * y * (c * q[7] + b * q[5])
-        gz += f(4) * b * q[5] * z - a * (q[4] * y + q[6] * x)
+        w3, w4, w5 = load(weights, 3 * LANES), load(weights, 4 * LANES), load(weights, 5 * LANES)
+        w6, w7 = load(weights, 6 * LANES), load(weights, 7 * LANES)
+        slope_x = slope_x + _A2 * (w3 * y - w6 * z) + _f(2) * x * (_C2 * w7 - _B2 * w5)
+        slope_y = slope_y + _A2 * (w3 * x - w4 * z) - _f(2) * y * (_C2 * w7 + _B2 * w5)
+        slope_z = slope_z + _f(4) * _B2 * w5 * z - _A2 * (w4 * y + w6 * x)
         if degree >= 3:
+            w8, w9, w10 = load(weights, 8 * LANES), load(weights, 9 * LANES), load(weights, 10 * LANES)
+            w11, w12, w13 = load(weights, 11 * LANES), load(weights, 12 * LANES), load(weights, 13 * LANES)
+            w14 = load(weights, 14 * LANES)
             xx, yy, zz = x * x, y * y, z * z
-            d, e, h = f(-0.5900435899266435), f(2.890611442640554), f(-0.4570457994644658)
-            k, m = f(0.3731763325901154), f(1.445305721320277)
-            gx += d * (f(6) * x * y * q[8] + f(3) * (xx - yy) * q[14]) + e * y * z * q[9]
-            gx += h * (f(-2) * x * y * q[10] + (f(4) * zz - f(3) * xx - yy) * q[12])
-            gx += x * z * (f(-6) * k * q[11] + f(2) * m * q[13])
-            gy += d * (f(3) * (xx - yy) * q[8] - f(6) * x * y * q[14]) + e * x * z * q[9]
-            gy += h * ((f(4) * zz - xx - f(3) * yy) * q[10] - f(2) * x * y * q[12])
-            gy -= y * z * (f(6) * k * q[11] + f(2) * m * q[13])
-            gz += e * x * y * q[9] + f(8) * h * z * (y * q[10] + x * q[12])
-            gz += f(3) * k * (f(2) * zz - xx - yy) * q[11] + m * (xx - yy) * q[13]
-    return gx, gy, gz
+            slope_x = slope_x - _A3 * (_f(6) * x * y * w8 + _f(3) * (xx - yy) * w14) + _B3 * y * z * w9
+            slope_x = slope_x + _C3 * (_f(2) * x * y * w10 - (_f(4) * zz - _f(3) * xx - yy) * w12)
+            slope_x = slope_x + x * z * (_f(2) * _E3 * w13 - _f(6) * _D3 * w11)
+            slope_y = slope_y - _A3 * (_f(3) * (xx - yy) * w8 - _f(6) * x * y * w14) + _B3 * x * z * w9
+            slope_y = slope_y - _C3 * ((_f(4) * zz - xx - _f(3) * yy) * w10 - _f(2) * x * y * w12)
+            slope_y = slope_y - y * z * (_f(2) * _E3 * w13 + _f(6) * _D3 * w11)
+            slope_z = slope_z + _B3 * x * y * w9 - _f(8) * _C3 * z * (y * w10 + x * w12)
+            slope_z = slope_z + _f(3) * _D3 * (_f(2) * zz - xx - yy) * w11 + _E3 * (xx - yy) * w13
+    return slope_x, slope_y, slope_z
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@kernel
 def forward(constant, rest, means, center, ids, degree, values):
     """Fills ``values`` [n, C] with the sums of harmonics.
 
     Args:
-        constant: [N, C] coefficients of the constant harmonic.
+        constant: [N, 1, C] coefficients of the constant harmonic.
         rest: [N, B - 1, C] those of the further ones, at least (degree + 1)² - 1 of them.
         means: [N, 3] positions.
         center: [3] position of the camera.
@@ -94,52 +109,59 @@ def forward(constant, rest, means, center, ids, degree, values):
     count, channels = values.shape
     bands = (degree + 1) ** 2 - 1
     for block in prange((count + BLOCK - 1) // BLOCK):
-        basis = np.empty(15, np.float32)
-        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            row = ids[i]
-            x, y, z, _ = _direction(means[row, 0] - center[0], means[row, 1] - center[1], means[row, 2] - center[2])
+        places = np.zeros(3 * LANES, np.float32)
+        basis = np.empty((15, LANES), np.float32)
+        for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
+            stop = min(start + LANES, count)
+            x, y, z, _ = _directions(means, ids, start, stop, center, places)
             _fill_basis(x, y, z, degree, basis)
-            for c in range(channels):
-                total = np.float32(0.28209479177387814) * constant[row, c]
-                for b in range(bands):
-                    total += basis[b] * rest[row, b, c]
-                values[i, c] = total
+            for lane in range(stop - start):
+                row = ids[start + lane]
+                for c in range(channels):
+                    value = _A0 * constant[row, 0, c]
+                    for b in range(bands):
+                        value += basis[b, lane] * rest[row, b, c]
+                    values[start + lane, c] = value
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@kernel
 def backward(rest, means, center, ids, degree, v_values, v_constant, v_rest, v_means):
-    """Writes the rows ``ids`` of the gradients, the bands above ``degree`` as zeros; ids must not repeat.
+    """Writes the rows ``ids`` of the gradients, zeros for harmonics above ``degree``; ids must not repeat.
 
     Args:
         rest, means, center, ids, degree: as in ``forward``.
         v_values: [n, C] gradient of the values.
-        v_constant, v_rest, v_means: [N, C], [N, B - 1, C] and [N, 3] outputs.
+        v_constant, v_rest, v_means: [N, 1, C], [N, B - 1, C] and [N, 3] outputs.
     """
     count, channels = v_values.shape
     bands = (degree + 1) ** 2 - 1
     for block in prange((count + BLOCK - 1) // BLOCK):
-        basis = np.empty(15, np.float32)
-        q = np.empty(15, np.float32)  # coefficients of the harmonics, weighted by the gradient and summed over channels
-        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            row = ids[i]
-            x, y, z, length = _direction(
-                means[row, 0] - center[0], means[row, 1] - center[1], means[row, 2] - center[2]
-            )
+        places = np.zeros(3 * LANES, np.float32)
+        basis = np.empty((15, LANES), np.float32)
+        weights = np.zeros((15, LANES), np.float32)  # gradient of each harmonic's value
+        slopes = np.empty((3, LANES), np.float32)
+        for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
+            stop = min(start + LANES, count)
+            x, y, z, inverse = _directions(means, ids, start, stop, center, places)
             _fill_basis(x, y, z, degree, basis)
-            for c in range(channels):
-                v_constant[row, c] = np.float32(0.28209479177387814) * v_values[i, c]
-            for b in range(bands):
-                total = np.float32(0.0)
+            for lane in range(stop - start):
+                row = ids[start + lane]
                 for c in range(channels):
-                    v_rest[row, b, c] = basis[b] * v_values[i, c]
-                    total += rest[row, b, c] * v_values[i, c]
-                q[b] = total
-            for b in range(bands, v_rest.shape[1]):
-                for c in range(channels):
-                    v_rest[row, b, c] = np.float32(0.0)
-            inverse = np.float32(1.0) / length if length > np.float32(0.0) else np.float32(0.0)
-            gx, gy, gz = _basis_gradient(x, y, z, degree, q)
-            radial = x * gx + y * gy + z * gz  # the length of the direction does not matter
-            v_means[row, 0] = (gx - radial * x) * inverse
-            v_means[row, 1] = (gy - radial * y) * inverse
-            v_means[row, 2] = (gz - radial * z) * inverse
+                    v_constant[row, 0, c] = _A0 * v_values[start + lane, c]
+                for b in range(bands):
+                    weight = _ZERO
+                    for c in range(channels):
+                        v_rest[row, b, c] = basis[b, lane] * v_values[start + lane, c]
+                        weight += rest[row, b, c] * v_values[start + lane, c]
+                    weights[b, lane] = weight
+                for b in range(bands, v_rest.shape[1]):
+                    for c in range(channels):
+                        v_rest[row, b, c] = _ZERO
+            slope_x, slope_y, slope_z = _slope(x, y, z, degree, weights)
+            along = x * slope_x + y * slope_y + z * slope_z  # the length of a direction does not matter
+            store(slopes, 0, (slope_x - along * x) * inverse)
+            store(slopes, LANES, (slope_y - along * y) * inverse)
+            store(slopes, 2 * LANES, (slope_z - along * z) * inverse)
+            for lane in range(stop - start):
+                for axis in range(3):
+                    v_means[ids[start + lane], axis] = slopes[axis, lane]

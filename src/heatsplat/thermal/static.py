@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import KELVIN_AT_0_C, SceneData, ThermalRange
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.kernels import spherical_harmonics as kernel
+from heatsplat.kernels.compilation import announced
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+
+_COMPILING = "compiling the kernels of spherical harmonics; this takes some seconds and happens once"
 
 
 class Static(ThermalModel):
@@ -107,20 +111,19 @@ class _FusedHarmonics(torch.autograd.Function):
     def forward(ctx, constant, rest, means, center, ids, degree):
         ids = torch.arange(len(means)) if ids is None else ids
         values = constant.new_empty(len(ids), constant.shape[2])
-        arrays = [tensor.detach().contiguous() for tensor in (constant, rest, means, center, ids)]
-        kernel.forward(arrays[0][:, 0].numpy(), *(array.numpy() for array in arrays[1:]), degree, values.numpy())
-        ctx.save_for_backward(*arrays[1:])
-        ctx.degree = degree
+        arrays = [tensor.detach().contiguous().numpy() for tensor in (constant, rest, means, center, ids)]
+        with announced(_COMPILING):
+            kernel.forward(*arrays, degree, values.numpy())
+        ctx.inputs = *arrays[1:], degree
         return values
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, v_values):
-        rest, means, center, ids = ctx.saved_tensors
-        make = torch.empty_like if len(ids) == len(means) else torch.zeros_like  # rows out of view get no gradient
-        v_constant, v_rest, v_means = make(rest[:, 0]), make(rest), make(means)
-        kernel.backward(
-            *(tensor.numpy() for tensor in (rest, means, center, ids)),
-            ctx.degree,
-            *(tensor.numpy() for tensor in (v_values.contiguous(), v_constant, v_rest, v_means)),
-        )
-        return v_constant[:, None], v_rest, v_means, None, None, None
+        rest, means, _, ids, _ = ctx.inputs
+        allocate = torch.empty if len(ids) == len(means) else torch.zeros  # rows out of view get no gradient
+        v_constant = allocate(len(means), 1, v_values.shape[1])
+        gradients = v_constant, allocate(rest.shape), allocate(means.shape)
+        with announced(_COMPILING):
+            kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
+        return *gradients, None, None, None
