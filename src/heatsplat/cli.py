@@ -102,7 +102,7 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     if plain["data"].get("root") is not None:
         plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
     trainer = build(plain["trainer"], callbacks=list(build(plain["callbacks"]).values()), logger=build(plain["logger"]))
-    module = build(plain["module"], config=plain, output_dir=str(output_dir))
+    module = build(plain["module"], recipe=plain, output_dir=str(output_dir))
     results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
 
@@ -160,9 +160,9 @@ def _restored(config: DictConfig, output_dir: Path) -> tuple[Any, Any, dict[str,
     checkpoint = load_checkpoint(config.ckpt)
     if CHECKPOINT_KEY not in checkpoint:
         raise SceneError(f"{config.ckpt} was not written by heatsplat")
-    stored = checkpoint[CHECKPOINT_KEY]["config"]
+    stored = checkpoint[CHECKPOINT_KEY]["recipe"]
     changed = {key: value for key, value in OmegaConf.to_container(config.data).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
-    module = build(stored["module"], config=stored, output_dir=str(output_dir))
+    module = build(stored["module"], recipe=stored, output_dir=str(output_dir))
     return module, build(stored["data"] | changed), {**stored, "checkpoint": checkpoint}

@@ -71,7 +71,7 @@ class Report(pl.Callback):
         if trainer.logger is not None:
             scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
             finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
-            trainer.logger.log_hyperparams(hyperparameters(module.config), finite)
+            trainer.logger.log_hyperparams(hyperparameters(module.recipe), finite)
         if self.show:
             show(results, folder, shown[0] if shown else None)
 
@@ -82,10 +82,10 @@ class Report(pl.Callback):
 def describe_run(trainer: pl.Trainer, module: pl.LightningModule) -> dict[str, Any]:
     """What was run, for metrics.json."""
     return {
-        "method": module.config.get("name"),
+        "method": module.recipe.get("name"),
         "scene": module.scene.name,
         "modality": module.modality,
-        "seed": module.config.get("seed"),
+        "seed": module.recipe.get("seed"),
         "steps": trainer.global_step or None,
         "thermal_model": type(module.thermal).__name__,
         "multiply_adds_per_gaussian": module.thermal.cost,

@@ -41,7 +41,7 @@ class SplatTraining(pl.LightningModule):
         init: how splats start.
         optim: learning rates and schedule.
         seed: seed of every random draw.
-        config: the resolved configuration as plain containers; travels in the checkpoint, so that a checkpoint and its
+        recipe: the resolved configuration as plain containers; travels in the checkpoint, so that a checkpoint and its
             data are enough to evaluate or render.
         output_dir: folder of the run.
     """
@@ -56,13 +56,13 @@ class SplatTraining(pl.LightningModule):
         init: Initialisation,
         optim: Optimisation,
         seed: int = 0,
-        config: dict[str, Any] | None = None,
+        recipe: dict[str, Any] | None = None,
         output_dir: Path | str = ".",
     ) -> None:
         super().__init__()
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
-        self.seed, self.config, self.output_dir = seed, config or {}, Path(output_dir)
+        self.seed, self.recipe, self.output_dir = seed, recipe or {}, Path(output_dir)
         self.modality = thermal.modality
         self.results = RunResults()
         self.scene: SceneData | None = None
@@ -206,7 +206,7 @@ class SplatTraining(pl.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {
-            "config": self.config,
+            "recipe": self.recipe,
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
 
@@ -228,8 +228,8 @@ def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None
     """Raises SceneError when a checkpoint was written by another method than ``module`` trains."""
     if CHECKPOINT_KEY not in checkpoint:
         raise SceneError("the checkpoint was not written by heatsplat: it holds no 'heatsplat' entry")
-    stored = checkpoint[CHECKPOINT_KEY]["config"].get("name")
-    here = module.config.get("name")
+    stored = checkpoint[CHECKPOINT_KEY]["recipe"].get("name")
+    here = module.recipe.get("name")
     names = {f"splats.raw.{name}" for name in module.splats.names}
     found = {name for name in checkpoint["state_dict"] if name.startswith("splats.raw.")}
     if stored != here or names != found:
