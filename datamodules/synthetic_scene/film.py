@@ -24,7 +24,9 @@ _FIELD_OF_VIEW_DEG = 48.0
 # The path circles about this point, metres.
 _LOOK_AT = (0.0, 0.15, 0.3)
 # Frames come faster at the start, when things change fastest: time grows as this power of the frame number.
-_HASTE = 1.25
+_HASTE = 1.4
+# The camera runs this long after the heat has begun to flow, in seconds; a surface changes infinitely fast at first.
+_FIRST_FRAME_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -150,11 +152,11 @@ def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
 
 
 def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
-    """Times [count] of frames taken by hand: uneven, increasing, whole milliseconds in 0 .. duration_s."""
+    """Times [count] of frames taken by hand: uneven, increasing, whole milliseconds, from 20 s to duration_s."""
     jitter = torch.rand(count, generator=generator_for(seed, 0, "frame times"), dtype=torch.float64).numpy()
     moments = np.arange(count) + 0.6 * (jitter - 0.5)
     moments = np.clip(moments, 0.0, count - 1) / max(count - 1, 1)
-    return np.round(moments**_HASTE * duration_s, 3)
+    return np.round(_FIRST_FRAME_S + moments**_HASTE * (duration_s - _FIRST_FRAME_S), 3)
 
 
 def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
@@ -253,7 +255,7 @@ def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Ten
     rotation = viewmat[:3, :3]
     center = -rotation.T @ viewmat[:3, 3]
     world = directions @ rotation
-    distance, which = trace(scene.shapes, center.expand_as(world), world)
+    distance, which = trace(scene.shapes, center[None], world)
     missed = torch.isinf(distance)
     return center + distance.masked_fill(missed, 0.0)[:, None] * world, which.masked_fill(missed, -1)
 

@@ -125,17 +125,17 @@ class Preset:
 # Exchange coefficients are those of a room with moving air, radiation included. Depths are chosen so that the time
 # constants ρc·depth/h span 4 minutes (plastic) to an hour (floor) and the Biot numbers h·depth/k 0.001 (aluminium, a
 # single exponential) to 2 (wood, far from one).
-WOOD = Material(conductivity=0.16, heat_capacity=0.9e6, depth_m=0.016, exchange=20.0)
-ALUMINIUM = Material(conductivity=200.0, heat_capacity=2.4e6, depth_m=0.006, exchange=20.0)
-STEEL = Material(conductivity=45.0, heat_capacity=3.7e6, depth_m=0.005, exchange=20.0)
-CERAMIC = Material(conductivity=1.5, heat_capacity=2.0e6, depth_m=0.010, exchange=20.0)
-RUBBER = Material(conductivity=0.25, heat_capacity=1.6e6, depth_m=0.008, exchange=20.0)
-PLASTIC = Material(conductivity=0.3, heat_capacity=1.6e6, depth_m=0.003, exchange=20.0)
-PLASTER = Material(conductivity=0.4, heat_capacity=1.0e6, depth_m=0.0125, exchange=15.0)
-STONE = Material(conductivity=1.4, heat_capacity=2.0e6, depth_m=0.030, exchange=15.0)
+WOOD = Material(conductivity=0.16, heat_capacity=0.9e6, depth_m=0.010, exchange=13.0)
+ALUMINIUM = Material(conductivity=200.0, heat_capacity=2.4e6, depth_m=0.004, exchange=13.0)
+STEEL = Material(conductivity=45.0, heat_capacity=3.7e6, depth_m=0.004, exchange=13.0)
+CERAMIC = Material(conductivity=1.5, heat_capacity=2.0e6, depth_m=0.012, exchange=13.0)
+RUBBER = Material(conductivity=0.25, heat_capacity=1.6e6, depth_m=0.008, exchange=13.0)
+PLASTIC = Material(conductivity=0.3, heat_capacity=1.6e6, depth_m=0.003, exchange=13.0)
+PLASTER = Material(conductivity=0.4, heat_capacity=1.0e6, depth_m=0.0095, exchange=10.0)
+LINOLEUM = Material(conductivity=0.2, heat_capacity=1.4e6, depth_m=0.006, exchange=10.0)
 
 TABLE_TOP = (
-    Surface("floor", Plane((0, 0, 0), (0, 0, 1)), STONE, Pattern(0.55, 0.1, 1.1, 0.15, 0.45), (0.75, 0.72, 0.68)),
+    Surface("floor", Plane((0, 0, 0), (0, 0, 1)), LINOLEUM, Pattern(0.55, 0.1, 1.1, 0.15, 0.45), (0.75, 0.72, 0.68)),
     Surface("wall", Plane((0, 1.0, 0), (0, -1, 0)), PLASTER, Pattern(0.5, 0.1, 1.2, 0.12, 0.5), (0.9, 0.88, 0.82)),
     Surface("left_wall", Plane((-1.7, 0, 0), (1, 0, 0)), PLASTER, Pattern(0.5, 0.15, 1.2), (0.82, 0.88, 0.9)),
     Surface("right_wall", Plane((1.7, 0, 0), (-1, 0, 0)), PLASTER, Pattern(0.5, 0.15, 1.2), (0.82, 0.88, 0.9)),
@@ -150,7 +150,7 @@ TABLE_TOP = (
         "tower",
         Box((0.5, 0.35, 0.35), (0.35, 0.35, 0.7), -25.0),
         ALUMINIUM,
-        Pattern(0.5, 0.1, 0.5, 0.2, 0.23),
+        Pattern(0.5, 0.1, 0.5, 0.2, 0.175),
         (0.8, 0.82, 0.85),
     ),
     Surface("carton", Box((-0.45, 0.25, 0.59), (0.24, 0.22, 0.18), 55.0), PLASTIC, Pattern(0.4, 0.1), (0.9, 0.3, 0.3)),
@@ -166,7 +166,7 @@ _WARM = {
     "left_wall": Pattern(9.0, 6.0, 1.3),
     "right_wall": Pattern(13.0, 6.0, 1.3),
     "crate": Pattern(27.0, 7.0, 0.6, 3.0, 0.25),
-    "tower": Pattern(33.0, 5.0, 0.5, 2.5, 0.23),
+    "tower": Pattern(33.0, 5.0, 0.5, 2.5, 0.175),
     "carton": Pattern(36.0, 4.0, 0.3),
     "vase": Pattern(30.0, 6.0, 0.4, 3.0, 0.17),
     "ball": Pattern(22.0, 8.0, 0.3),
@@ -188,10 +188,10 @@ _LUKEWARM = {
 }
 
 _LAMP = Lamp(
-    position=(-0.7, -1.6, 1.7),
+    position=(-0.6, -2.0, 2.0),
     aim=(0.0, 0.1, 0.25),
-    half_angle_deg=32.0,
-    flux_w_m2=900.0,
+    half_angle_deg=36.0,
+    flux_w_m2=1000.0,
     waveform=periodic(period_s=600.0, on_s=300.0, ramp_s=120.0, duration_s=1800.0),
 )
 

@@ -1,12 +1,13 @@
 """Solid shapes that rays hit exactly: planes, boxes, spheres and upright cylinders.
 
-Every shape has three methods, all float64 and vectorised:
+Every shape has these methods, all float64 and vectorised:
 
-* ``intersect(origins [n, 3], directions [n, 3]) -> [n]``: distance along the direction (in units of its length) to the
-  first hit in front of the origin, infinite where there is none. Shapes are seen from outside.
+* ``intersect(origins [n or 1, 3], directions [n, 3]) -> [n]``: distance along the direction (in units of its length) to
+  the first hit in front of the origin, infinite where there is none. Shapes are seen from outside.
 * ``normals(points [n, 3]) -> [n, 3]``: outward unit normals at points of the surface.
 * ``nearest(points [n, 3]) -> [n, 3]``: the point of the surface nearest to each point.
 * ``local(points [n, 3]) -> [n, 3]``: the points in the shape's own axes, about its own origin.
+* ``bounds() -> (centre, radius)`` of a sphere around the shape, or None for an infinite one.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class Shape(Protocol):
     def nearest(self, points: Tensor) -> Tensor: ...
 
     def local(self, points: Tensor) -> Tensor: ...
+
+    def bounds(self) -> tuple[Point, float] | None: ...
 
 
 def _row(point: Point) -> Tensor:
@@ -88,6 +91,9 @@ class Plane:
     def local(self, points: Tensor) -> Tensor:
         return points - _row(self.point)
 
+    def bounds(self) -> None:
+        return None
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -111,6 +117,9 @@ class Sphere:
 
     def local(self, points: Tensor) -> Tensor:
         return points - _row(self.center)
+
+    def bounds(self) -> tuple[Point, float]:
+        return self.center, self.radius
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,9 @@ class Box:
 
     def local(self, points: Tensor) -> Tensor:
         return (points - _row(self.center)) @ self._turn()
+
+    def bounds(self) -> tuple[Point, float]:
+        return self.center, 0.5 * math.hypot(*self.size)
 
 
 @dataclass(frozen=True)
@@ -209,16 +221,37 @@ class Cylinder:
     def local(self, points: Tensor) -> Tensor:
         return points - _row(self.base)
 
+    def bounds(self) -> tuple[Point, float]:
+        x, y, z = self.base
+        return (x, y, z + 0.5 * self.height), math.hypot(self.radius, 0.5 * self.height)
+
 
 def trace(shapes: Sequence[Shape], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """The first hit of every ray: distance [n], infinite for a miss, and which of ``shapes`` was hit [n]."""
-    nearest = torch.full(origins.shape[:1], math.inf, dtype=origins.dtype)
-    which = torch.zeros(origins.shape[:1], dtype=torch.int64)
+    """The first hit of every ray: distance [n], infinite for a miss, and which of ``shapes`` was hit [n].
+
+    Args:
+        origins: [n, 3], or [1, 3] when all rays start at one point.
+        directions: [n, 3].
+    """
+    nearest = torch.full_like(directions[:, 0], math.inf)
+    which = torch.zeros_like(nearest, dtype=torch.int64)
+    lengths = dot(directions, directions)
     for position, shape in enumerate(shapes):
-        distance = shape.intersect(origins, directions)
+        bounds = shape.bounds()
+        if bounds is None:
+            distance = shape.intersect(origins, directions)
+        else:
+            # Few rays come near a given object; the others need not ask it.
+            center, radius = bounds
+            offset = origins - _row(center)
+            outside = dot(offset, offset) - (1.0 + 1e-9) * radius**2
+            along = dot(directions, offset)
+            near = ((along * along >= lengths * outside) & ((along < 0) | (outside < 0))).nonzero()[:, 0]
+            distance = torch.full_like(nearest, math.inf)
+            distance[near] = shape.intersect(origins if len(origins) == 1 else origins[near], directions[near])
         closer = distance < nearest
         nearest = torch.where(closer, distance, nearest)
-        which = torch.where(closer, position, which)
+        which.masked_fill_(closer, position)
     return nearest, which
 
 
