@@ -2,7 +2,7 @@
 
 The plain-torch twin is heatsplat.geometry.spherical_harmonics.evaluate, which says what the conventions are. Lanes are
 sixteen Gaussians in the polynomials of the direction; sums over coefficients go row by row where they live (turning
-rows into lanes costs more than it saves). Every Gaussian is computed and written by one thread, so the number of threads
+rows into lanes costs more than it saves). Every Gaussian is computed and written by one thread: the number of threads
 changes no bit.
 """
 
