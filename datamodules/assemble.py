@@ -184,8 +184,8 @@ def build_scene(
     kinds = {p.thermal.dtype.kind for p in prepared.values()}
     if len(kinds) > 1:
         raise SceneError(f"scene {name} mixes float images (°C) with integer images; convert them to one kind")
-    if kinds == {"f"}:
-        counts = counts or CELSIUS
+    if kinds == {"f"} and counts is None:
+        counts = CELSIUS
         notes["encoding"] = "float pixels are temperatures in °C"
     if counts and thermal_range is None:
         thermal_range = _range_of([prepared[i] for i in train], counts)
@@ -360,8 +360,10 @@ def _origin_of(frames: Sequence[RawFrame], points: np.ndarray) -> np.ndarray:
 
 def _range_of(prepared: Sequence[_Prepared], counts: Counts) -> ThermalRange:
     """Bounds that hold 99.8 % of the unmasked pixels; the rest clips, so that a hot pixel does not flatten a scene."""
-    values = np.concatenate([(p.thermal if p.mask is None else p.thermal[p.mask]).ravel()[::7] for p in prepared])
-    low, high = np.percentile(values.astype(np.float64), [0.1, 99.9]) if values.size else (0.0, 0.0)
+    # A percentile needs no more than a few million pixels.
+    stride = 1 + sum(p.thermal.size for p in prepared) // 4_000_000
+    values = np.concatenate([(p.thermal if p.mask is None else p.thermal[p.mask]).ravel()[::stride] for p in prepared])
+    low, high = map(float, np.percentile(values, [0.1, 99.9])) if values.size else (0.0, 0.0)
     if not low < high:
         raise SceneError(f"the training images are constant ({low}), so no temperature range can be taken from them")
     return ThermalRange(counts.scale * low + counts.offset_c, counts.scale * high + counts.offset_c)

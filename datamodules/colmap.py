@@ -134,7 +134,7 @@ class Colmap(SceneDataModule):
         """How an image file becomes stored numbers, what they mean, and a sentence about it."""
         if raw:
             c = self.counts
-            return read_image, c, f"16-bit counts in {self.raw}/: °C = {c.scale:g} * counts {c.offset_c:+g}"
+            return _read_counts, c, f"16-bit counts in {self.raw}/: °C = {c.scale:g} * counts {c.offset_c:+g}"
         if self.radiometric == "auto":
             having = [file for file in files if has_temperatures(index.folder / file)]
             if having and len(having) < len(files):
@@ -173,6 +173,18 @@ class Colmap(SceneDataModule):
         if all(t is not None for t in times.values()):
             return times, "DJI file names (whole seconds, the camera's clock)"  # type: ignore[return-value]
         return None, "none (set data.time_regex or data.time_csv)"
+
+
+def _read_counts(path: Path) -> np.ndarray:
+    """Raw sensor counts [H, W] uint16. Raises SceneError for 8-bit or colour images, which hold no counts."""
+    pixels = read_image(path)
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        raise SceneError(
+            f"data.raw: {path} has {channels} channels of {pixels.dtype}, counts are one channel of uint16; "
+            "leave data.raw out to use the images as greys"
+        )
+    return pixels
 
 
 def image_index(folder: Path, images: str, key: str) -> ImageIndex:

@@ -1,0 +1,120 @@
+import cv2
+import numpy as np
+import pytest
+from layouts import write_image
+from PIL import Image
+
+from datamodules.formats.images import (
+    ImageIndex,
+    colour_levels,
+    read_image,
+    resized,
+    resized_mask,
+    split_alpha,
+    to_grey,
+)
+from heatsplat.contracts import SceneError
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [None, 3, 4])
+def test_png_files_come_back_as_they_are_stored(tmp_path, dtype, channels):
+    shape = (5, 7) if channels is None else (5, 7, channels)
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, endpoint=True).astype(dtype)
+    write_image(tmp_path / "a.png", pixels)
+    back = read_image(tmp_path / "a.png")
+    assert back.dtype == dtype
+    assert (back == pixels).all()
+
+
+def test_float_files_keep_their_values_and_their_gaps(tmp_path):
+    pixels = np.array([[1.25, np.nan], [-40.5, 1e4]], np.float32)
+    write_image(tmp_path / "a.tiff", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tiff"), pixels)
+
+
+def test_grey_with_alpha_has_alpha(tmp_path):
+    pixels = np.stack([np.full((4, 4), 90), np.eye(4) * 255], axis=2).astype(np.uint8)
+    Image.fromarray(pixels, "LA").save(tmp_path / "a.png")
+    grey, alpha = split_alpha(read_image(tmp_path / "a.png"))
+    assert (to_grey(grey) == 90).all()
+    assert (alpha == np.eye(4, dtype=bool)).all()
+
+
+def test_the_content_decides_not_the_extension(tmp_path):
+    write_image(tmp_path / "a.png", np.full((4, 4), 7, np.uint8))
+    (tmp_path / "a.png").rename(tmp_path / "a.jpg")
+    assert (read_image(tmp_path / "a.jpg") == 7).all()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_damaged_images_are_named(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_image(path, np.random.default_rng(0).integers(0, 255, (60, 60)).astype(np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(SceneError, match=rf"a\{suffix} is corrupt.*copy it again"):
+        read_image(path)
+    path.write_bytes(b"")
+    with pytest.raises(SceneError, match=rf"a\{suffix} is empty \(0 bytes\)"):
+        read_image(path)
+    path.write_bytes(b"no image at all")
+    with pytest.raises(SceneError, match="is corrupt or no image"):
+        read_image(path)
+    path.unlink()
+    with pytest.raises(SceneError, match="cannot be read: No such file"):
+        read_image(path)
+
+
+def test_a_whole_jpeg_is_not_called_truncated(tmp_path):
+    path = tmp_path / "a.jpg"
+    write_image(path, np.full((40, 40), 99, np.uint8))
+    path.write_bytes(path.read_bytes() + b"\0trailing bytes of a second picture")
+    assert abs(read_image(path).astype(int) - 99).max() <= 2
+
+
+def test_other_pixel_types_are_refused(tmp_path):
+    assert cv2.imwrite(str(tmp_path / "a.tiff"), np.zeros((4, 4), np.int32))
+    with pytest.raises(SceneError, match="pixels of type int32; supported are uint8, uint16 and float32"):
+        read_image(tmp_path / "a.tiff")
+
+
+def test_names_are_found_up_to_case_and_extension(tmp_path):
+    for name in ("a.PNG", "sub/b.jpg"):
+        write_image(tmp_path / name.lower(), np.zeros((2, 2), np.uint8))
+        (tmp_path / name.lower()).rename(tmp_path / name)
+    index = ImageIndex(tmp_path)
+    assert index.find("a.png") == "a.PNG"
+    assert index.find("A.JPG") == "a.PNG"
+    assert index.find("sub/b") == "sub/b.jpg"
+    assert index.find("b.jpg") is None
+    assert index.unused(["a.PNG"]) == ["sub/b.jpg"]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_stored_as_colour_is_exactly_that_grey(dtype):
+    grey = np.arange(np.iinfo(np.uint8).max + 1, dtype=dtype).reshape(16, 16) * (np.iinfo(dtype).max // 255)
+    stored = np.repeat(grey[..., None], 3, axis=2)
+    assert (to_grey(stored) == grey).all()
+    assert colour_levels(stored) == 0
+
+
+def test_colour_maps_are_far_from_grey():
+    ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    colours = cv2.applyColorMap(ramp, cv2.COLORMAP_INFERNO)
+    assert colour_levels(colours) > 40
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_shrinking_averages_areas_in_the_stored_type(dtype):
+    pixels = (np.array([[0, 10, 4, 4], [20, 30, 4, 5]]) * (np.iinfo(dtype).max // 255)).astype(dtype)
+    small = resized(pixels, 2, 1)
+    assert small.dtype == dtype
+    blocks = pixels.reshape(2, 2, 2).astype(float).mean(axis=(0, 2))
+    assert np.abs(small[0] - blocks).max() <= 0.5
+
+
+def test_a_small_pixel_counts_only_where_all_of_it_does():
+    mask = np.ones((4, 6), bool)
+    mask[1, 1] = False
+    assert resized_mask(mask, 3, 2).tolist() == [[False, True, True], [True, True, True]]

@@ -1,0 +1,84 @@
+import json
+
+import pytest
+
+from datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
+from heatsplat.contracts import SceneError
+
+
+def test_every_8th_follows_plain_string_order():
+    names = [f"{i}.png" for i in range(20)]
+    train, test = every_nth(names)
+    assert {names[i] for i in test} == set(sorted(names)[::8])
+    assert sorted(train + test) == list(range(20))
+
+
+def test_307_registered_views_give_the_39_test_views_that_ti_nsd_reports():
+    assert len(every_nth([f"{i}.png" for i in range(307)])[1]) == 39
+
+
+def test_quarter_centre_takes_the_middle_eighth_of_each_quarter():
+    _, test = quarter_centre(range(221))
+    # quarters of 55, 55, 55 and 56 frames: 6, 6, 6 and 7 test frames from (55 - 6) // 2 = 24 and (56 - 7) // 2 = 24 on
+    expected = [q * 55 + 24 + k for q, count in enumerate((6, 6, 6, 7)) for k in range(count)]
+    assert test == expected
+
+
+def test_quarter_centre_follows_the_given_order():
+    order = list(range(32))[::-1]
+    assert quarter_centre(order)[1] == sorted(31 - i for i in quarter_centre(range(32))[1])
+
+
+@pytest.mark.parametrize("count", [4, 5, 9, 40])
+def test_quarter_centre_always_tests_something_in_each_quarter(count):
+    train, test = quarter_centre(range(count))
+    assert len(test) >= 4
+    assert sorted(train + test) == list(range(count))
+
+
+@pytest.mark.parametrize(("position", "first"), [(0.0, 0), (0.5, 15), (1.0, 30)])
+def test_block_holds_out_one_stretch(position, first):
+    _, test = block(range(40), fraction=0.25, position=position)
+    assert test == list(range(first, first + 10))
+
+
+def test_block_refuses_impossible_fractions():
+    with pytest.raises(SceneError, match="data.split_fraction in"):
+        block(range(10), fraction=1.5)
+
+
+def test_names_and_folders():
+    assert by_name(["frame_train_1.png", "a/frame_eval_2.png"]) == ([0], [1])
+    assert by_folder(["train/1.png", "test/2.png", "x/val/3.png"]) == ([0], [1, 2])
+
+
+def test_names_say_which_file_speaks_of_neither():
+    with pytest.raises(SceneError, match="frame_003.png says neither.*data.split=every_8th"):
+        by_name(["frame_train_001.png", "frame_003.png"])
+
+
+def test_lists_in_text_and_json(tmp_path):
+    names = ["a/1.png", "a/2.png", "a/3.png"]
+    (tmp_path / "test.txt").write_text("2.png\n\n3\n")
+    assert by_list(names, tmp_path / "test.txt") == ([0], [1, 2])
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["1"], "test": ["a/3.png"]}))
+    assert by_list(names, tmp_path / "split.json") == ([0], [2])
+
+
+def test_lists_name_the_frame_that_does_not_exist(tmp_path):
+    (tmp_path / "test.txt").write_text("9.png\n")
+    with pytest.raises(SceneError, match=r"test.txt lists '9.png', which is no frame.*'1.png'"):
+        by_list(["1.png"], tmp_path / "test.txt")
+    with pytest.raises(SceneError, match="there is no file"):
+        by_list(["1.png"], tmp_path / "none.txt")
+
+
+def test_rules_that_leave_nothing_to_train_or_test_are_refused():
+    with pytest.raises(SceneError, match="data.split=every_8th leaves 0 training and 1 test"):
+        SplitRule("every_8th")(["a"], [0], [None])
+    with pytest.raises(SceneError, match="data.split=json leaves 0 training and 0 test"):
+        SplitRule("json")(["a"], [0], [None])
+    with pytest.raises(SceneError, match="data.split=thirds is no split; choose one of every_8th, quarter_centre"):
+        SplitRule("thirds")(["a"], [0], [None])
+    with pytest.raises(SceneError, match="data.split=list needs data.split_file"):
+        SplitRule("list")(["a", "b"], [0, 1], [None, None])

@@ -1,0 +1,78 @@
+import pytest
+
+from datamodules.timestamps import (
+    dji_time,
+    seconds_of_day,
+    stem_of,
+    time_by_pattern,
+    times_from_csv,
+    unrolled_midnight,
+)
+from heatsplat.contracts import SceneError
+
+
+def test_nine_digits_are_hours_minutes_seconds_and_thousandths():
+    assert seconds_of_day("153824825") == 15 * 3600 + 38 * 60 + 24 + 0.825
+    assert seconds_of_day("000000001") == 0.001
+
+
+@pytest.mark.parametrize("digits", ["240000000", "126000000", "12345678", "1234567890", "12345678x"])
+def test_digits_that_are_no_time_of_day_are_refused(digits):
+    with pytest.raises(ValueError, match="is no"):
+        seconds_of_day(digits)
+
+
+def test_a_recording_over_midnight_continues():
+    times, passed = unrolled_midnight([60.0, 86340.0, 0.5, 86370.0])
+    assert passed
+    assert times == [86460.0, 86340.0, 86400.5, 86370.0]
+
+
+@pytest.mark.parametrize("times", [[3600.0, 3700.0, 90.0], [50000.0], [], [9 * 3600.0, 23 * 3600.0]])
+def test_a_recording_within_a_day_is_left_alone(times):
+    assert unrolled_midnight(times) == (times, False)
+
+
+def test_dji_names_hold_the_time_to_the_second():
+    first = dji_time("images/DJI_20240806173449_0008_T.png")
+    assert dji_time("DJI_20240807000003_0009_T.JPG") - first == 6 * 3600 + 25 * 60 + 14
+    assert dji_time("frame_001.png") is None
+
+
+def test_a_pattern_picks_seconds_and_formats():
+    assert time_by_pattern("s/t_12.5_x.png", r"t_([\d.]+)_", None) == 12.5
+    assert time_by_pattern("000001500.png", r"\d{9}", "HHMMSSmmm") == 1.5
+    a = time_by_pattern("2024-01-01T00-00-01.png", r"(.*)\.png", "%Y-%m-%dT%H-%M-%S")
+    b = time_by_pattern("2024-01-01T00-01-00.png", r"(.*)\.png", "%Y-%m-%dT%H-%M-%S")
+    assert b - a == 59
+
+
+def test_a_pattern_that_fails_names_the_image():
+    with pytest.raises(SceneError, match=r"data.time_regex 'x\(\\\\d\+\)' does not match the image name a.png"):
+        time_by_pattern("a.png", r"x(\d+)", None)
+    with pytest.raises(SceneError, match="a.png: 'a' is no time of the form seconds"):
+        time_by_pattern("a.png", r"(a)", None)
+
+
+def test_a_table_gives_seconds_or_dates(tmp_path):
+    table = tmp_path / "t.csv"
+    table.write_text("file,utc,s\nA_1,2024-08-06T15:35:05.376048,1.5\nA_2.png,2024-08-06T15:35:06.376048,2\n")
+    assert times_from_csv(table, "file", "s") == {"A_1": 1.5, "A_2": 2.0}
+    dates = times_from_csv(table, "file", "utc")
+    assert dates["A_2"] - dates["A_1"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_table_names_missing_columns_and_bad_cells(tmp_path):
+    table = tmp_path / "t.csv"
+    table.write_text("file,s\na,soon\n")
+    with pytest.raises(SceneError, match="data.time_csv_time=when: .*t.csv has no such column; it has file, s"):
+        times_from_csv(table, "file", "when")
+    with pytest.raises(SceneError, match="line 2: 'soon' in column s is neither seconds nor a date-time"):
+        times_from_csv(table, "file", "s")
+    with pytest.raises(SceneError, match="data.time_csv: there is no file"):
+        times_from_csv(tmp_path / "no.csv", "file", "s")
+
+
+def test_stems_lose_folder_and_extension_only():
+    assert stem_of("a/b/DJI_1_T.JPG") == stem_of("DJI_1_T") == "DJI_1_T"
+    assert stem_of("12.500") == "12.500"
