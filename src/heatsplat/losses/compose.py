@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from torch import Tensor
@@ -24,6 +24,7 @@ class LossInputs:
         splats: the Gaussians.
         step: training step, from 0.
         max_steps: length of the run in steps.
+        companions: prediction and target of the further images that the model explains, by modality.
         target_key: names the content of target and mask, so that terms may keep what they computed from them: equal
             keys promise equal pixels. None, the default, promises nothing.
     """
@@ -35,7 +36,23 @@ class LossInputs:
     splats: Splats
     step: int
     max_steps: int
+    companions: Mapping[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     target_key: Hashable | None = None
+
+    def pair(self, modality: str | None) -> tuple[Tensor, Tensor]:
+        """Prediction and target of a companion, or of the image itself for None.
+
+        Raises:
+            ValueError: the model does not explain that modality.
+        """
+        if modality is None:
+            return self.prediction, self.target
+        if modality not in self.companions:
+            there = ", ".join(self.companions) or "none"
+            raise ValueError(
+                f"a loss term asks for {modality} images, which the model does not explain (it has: {there})"
+            )
+        return self.companions[modality]
 
     @property
     def progress(self) -> float:

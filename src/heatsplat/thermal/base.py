@@ -57,7 +57,7 @@ class Seeds:
 
     Args:
         means: [N, 3] positions.
-        values: [N, C] mean image value at the projections of each point, in [0, 1].
+        values: [N, C] median image value at the projections of each point, in [0, 1]; the channels of all modalities.
         generator: for models that start from random numbers.
     """
 
@@ -89,12 +89,15 @@ class ThermalModel(nn.Module, ABC):
 
     Class attributes:
         needs: metadata the model cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
-        modality: the image that it explains, "thermal" or "rgb".
-        modality_channels: channels of each opacity set, such as (1,); their sum is the number of features.
+        modality: the image that it explains, "thermal" or "rgb"; this is what metrics score.
+        companions: further images that it explains with the same Gaussians, such as ("rgb",).
+        modality_channels: channels of the image and of its companions, each with an opacity of its own, such as (1, 3);
+            their sum is the number of features.
     """
 
     needs: frozenset[str] = frozenset()
     modality: str = "thermal"
+    companions: tuple[str, ...] = ()
     modality_channels: tuple[int, ...] = (1,)
 
     def check(self, scene: SceneData) -> None:

@@ -42,7 +42,8 @@ class Initialisation:
     def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
         means = self._means(scene, generator_for(seed, 0, "init"))
-        values = image_values_at(scene, means, thermal.modality, thermal.modality_channels[0])
+        modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
+        values = torch.cat([image_values_at(scene, means, name, channels) for name, channels in modalities], dim=1)
         declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
         squared = neighbour_distances(means).square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
         count = len(means)

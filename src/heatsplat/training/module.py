@@ -86,8 +86,9 @@ class SplatTraining(pl.LightningModule):
         self.sensor.prepare(scene)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
-        background = self.renderer.background_of(scene, self.modality)
-        self.register_buffer("background", torch.full((sum(self.thermal.modality_channels),), background))
+        modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
+        behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
+        self.register_buffer("background", torch.cat(behind))
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -149,7 +150,8 @@ class SplatTraining(pl.LightningModule):
         view = view.to(self.device)
         self.thermal.on_step(step)
         output = self.render(view.frame, absgrad=self.density.absgrad)
-        prediction = self.sensor(output.features, view.frame)
+        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        prediction = self.sensor(image, view.frame)
         inputs = LossInputs(
             prediction,
             view.image(self.modality),
@@ -158,6 +160,7 @@ class SplatTraining(pl.LightningModule):
             self.splats,
             step,
             self.trainer.max_steps,
+            {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
             target_key=view.frame.frame_id,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
@@ -188,14 +191,24 @@ class SplatTraining(pl.LightningModule):
     @torch.no_grad()
     def predict(self, frame: Frame) -> Tensor:
         """The image that the camera would record of ``frame``, [H, W, C] in [0, 1]; this is what metrics score."""
-        return self.sensor(self.render(frame).features, frame).clamp(0, 1)
+        return self.predict_all(frame)[self.modality]
+
+    @torch.no_grad()
+    def predict_all(self, frame: Frame) -> dict[str, Tensor]:
+        """The image that the camera would record and the images of the model's companions, by modality."""
+        image, *companions = self.render(frame).features.split(self.thermal.modality_channels, dim=-1)
+        images = (self.sensor(image, frame), *companions)
+        return {
+            name: seen.clamp(0, 1) for name, seen in zip((self.modality, *self.thermal.companions), images, strict=True)
+        }
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         start = time.perf_counter()
-        prediction = self.predict(view.frame)
-        if prediction.is_cuda:
+        images = self.predict_all(view.frame)
+        if images[self.modality].is_cuda:
             torch.cuda.synchronize()
-        return {"view": view, "prediction": prediction, "seconds": time.perf_counter() - start}
+        seconds = time.perf_counter() - start
+        return {"view": view, "prediction": images.pop(self.modality), "companions": images, "seconds": seconds}
 
     test_step = validation_step
 
