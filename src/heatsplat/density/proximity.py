@@ -1,0 +1,176 @@
+"""TI-3DGS's density control: Gaussians with distant neighbours get company along the edges to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.ops import Cloud
+
+EVEN = 1e-4  # scores that differ by less than this share are equal: an even cloud has no gaps but those of rounding
+
+
+class Proximity(DensityControl):
+    """Thermal attenuation-aware density control (TADC; TI-3DGS, section III-C 2, Eq. 13-14) on top of another recipe.
+
+    The recipe works as ever. In addition, every so often, the proximity graph of all centres is built anew: each
+    Gaussian points to its K nearest others, and its score is the mean length of these edges. Where the score is above
+    the threshold, a Gaussian is put on every edge: a copy of its source whose radiance is weaker by e^{-μ Δd}, Δd being
+    its distance to the source. An edge that two sources share is used once, by the one with the higher score.
+
+    Radiance is whatever the raw tensors named in ``radiance`` hold, up to an offset: the tensor plus its offset is
+    multiplied. With the offset of a constant part (1/2 of 3DGS's emission is √π on "sh0") radiance itself is weakened;
+    offsets of 0 scale the coefficients, as the paper prints.
+
+    Args:
+        recipe: density control that this one extends; its statistics and refinements are left as they are.
+        radiance: name of a raw tensor -> offset. Names that the Gaussians do not have are skipped (harmonics of higher
+            degree are optional), but not all of them.
+        neighbours: K.
+        quantile: share of the Gaussians whose score is not above the threshold; used without ``threshold``.
+        threshold: t_prox in extents of the scene (paper: a number it does not give), or None.
+        edge_share: Δd as a share of the edge; used without ``distance``.
+        distance: Δd in extents (paper: a number it does not give), never beyond the end of the edge; or None.
+        attenuation: μ per extent.
+        min_opacity: sources must be at least this opaque, in some modality.
+        start, stop: first and last step at which Gaussians are inserted.
+        every: steps between insertions.
+        growth: one insertion adds at most this share of the Gaussians there are.
+        cap_max: never more Gaussians than this; the highest scores come first.
+
+    Raises:
+        ValueError: an option is out of its range.
+    """
+
+    def __init__(
+        self,
+        recipe: DensityControl,
+        radiance: Mapping[str, float],
+        neighbours: int = 3,
+        quantile: float = 0.9,
+        threshold: float | None = None,
+        edge_share: float = 0.5,
+        distance: float | None = None,
+        attenuation: float = 0.1,
+        min_opacity: float = 0.05,
+        start: int = 500,
+        stop: int = 7500,
+        every: int = 500,
+        growth: float = 0.05,
+        cap_max: int = 100_000,
+    ) -> None:
+        if neighbours < 1 or every < 1 or cap_max < 1:
+            raise ValueError(
+                f"density.neighbours, every and cap_max must be at least 1, got {neighbours}, {every}, {cap_max}"
+            )
+        if not 0 <= quantile <= 1 or not 0 < edge_share < 1:
+            raise ValueError(f"density.quantile lies in [0, 1] and edge_share in (0, 1), got {quantile}, {edge_share}")
+        if not radiance:
+            raise ValueError(
+                "density.radiance names no tensor; give those that hold radiance, such as {sh0: 1.7724539}"
+            )
+        self.recipe, self.radiance = recipe, dict(radiance)
+        self.neighbours, self.quantile, self.threshold = neighbours, quantile, threshold
+        self.edge_share, self.distance, self.attenuation = edge_share, distance, attenuation
+        self.min_opacity, self.growth, self.cap_max = min_opacity, growth, cap_max
+        self.start, self.stop, self.every = start, stop, every
+        self.absgrad = recipe.absgrad
+
+    def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
+        """The recipe's statistics; proximity keeps none."""
+        return self.recipe.initial_state(count, device)
+
+    def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
+        self.recipe.observe(state, output, camera, step)
+
+    @torch.no_grad()
+    def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
+        change = self.recipe.refine(cloud, step, extent, generator)
+        if not self.start <= step < self.stop or (step + 1) % self.every != 0:
+            return change
+        added = self._insert(cloud, extent)
+        if added == 0:
+            return change
+        change = change or DensityChange()
+        return DensityChange(change.added + added, change.removed, change.opacity_reset)
+
+    def _insert(self, cloud: Cloud, extent: float) -> int:
+        radiance = {name: offset for name, offset in self.radiance.items() if name in cloud.splats}
+        if not radiance:
+            raise ValueError(
+                f"density.radiance names {', '.join(self.radiance)}, but the Gaussians have "
+                f"{', '.join(cloud.splats.names)}; name the tensors that hold the radiance of this thermal model"
+            )
+        room = min(int(self.growth * len(cloud)), self.cap_max - len(cloud))
+        if room < 1:
+            return 0
+        sources, lengths, ends = self._edges(cloud, extent, room)
+        if self.distance is None:
+            steps = self.edge_share * lengths
+        else:
+            steps = (self.distance * extent * torch.ones_like(lengths)).minimum(lengths)
+        means = cloud.splats.means.detach()
+        rows = cloud.rows(sources)
+        rows["means"] = torch.lerp(means[sources], means[ends], (steps / lengths)[:, None])
+        weaker = torch.exp(-self.attenuation * steps / extent)
+        for name, offset in radiance.items():
+            factor = weaker.reshape(-1, *[1] * (rows[name].ndim - 1))
+            rows[name] = (rows[name] + offset) * factor - offset
+        cloud.append(rows)
+        return len(sources)
+
+    def _edges(self, cloud: Cloud, extent: float, most: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Sources, lengths and ends of the edges to be populated, [n] each, n <= most; the highest scores first."""
+        lengths, ends = proximity_graph(cloud.splats.means.detach(), self.neighbours)
+        scores = lengths.mean(1) if lengths.shape[1] else lengths.new_zeros(len(lengths))
+        limit = torch.quantile(scores, self.quantile) if self.threshold is None else self.threshold * extent
+        able = (cloud.splats.opacities >= self.min_opacity).any(dim=0) & (scores > (1.0 + EVEN) * limit)
+        order = scores.argsort(descending=True, stable=True)
+        order = order[able[order]]
+        sources = order.repeat_interleave(ends.shape[1])
+        lengths, ends = lengths[order].flatten(), ends[order].flatten()
+        fresh = _first_of_each(torch.minimum(sources, ends) * len(cloud) + torch.maximum(sources, ends))
+        fresh = fresh[lengths[fresh] > 0][:most]  # coinciding Gaussians have no room between them
+        return sources[fresh], lengths[fresh], ends[fresh]
+
+
+def proximity_graph(means: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
+    """Lengths [N, K] and ends [N, K] int64 of the edges from each centre to its K nearest others, nearest first.
+
+    With fewer than K + 1 centres K is what there is. A centre that is not finite has edges of length zero to itself,
+    and no other centre points to it. Coinciding centres are neighbours at distance zero; none is its own neighbour.
+
+    Args:
+        means: [N, 3].
+        neighbours: K.
+    """
+    finite = torch.isfinite(means).all(dim=1).nonzero().squeeze(1)
+    k = max(0, min(neighbours, len(finite) - 1))
+    ends = torch.arange(len(means), device=means.device)[:, None].repeat(1, k)
+    lengths = means.new_zeros(len(means), k)
+    if k == 0:
+        return lengths, ends
+    centres = means[finite].cpu().double().numpy()
+    distances, ids = cKDTree(centres).query(centres, k=k + 1, workers=torch.get_num_threads())
+    distances, ids = torch.from_numpy(distances), torch.from_numpy(ids)
+    # The centre itself is among the nearest, but not always the first where centres coincide; with more coinciding ones
+    # than neighbours it may be missing, and then the last is left out.
+    own = ids == torch.arange(len(ids))[:, None]
+    own[:, -1] |= ~own.any(dim=1)
+    others = ~own
+    lengths[finite] = distances[others].reshape(-1, k).to(means)
+    ends[finite] = finite[ids[others].reshape(-1, k).to(finite.device)]
+    return lengths, ends
+
+
+def _first_of_each(keys: Tensor) -> Tensor:
+    """Positions of the first occurrence of every value, ascending."""
+    _, inverse = keys.unique(return_inverse=True)
+    positions = torch.arange(len(keys), device=keys.device)
+    first = torch.full_like(keys, len(keys)).scatter_reduce(0, inverse, positions, "amin")
+    return first[first < len(keys)].sort().values
