@@ -254,7 +254,7 @@ class _Prepared:
 
 def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool) -> _Prepared:
     """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them."""
-    pixels, alpha = split_alpha(frame.read())
+    pixels, alpha = split_alpha(_supported(frame.read(), frame.name))
     height, width = pixels.shape[:2]
     colour = colour_levels(pixels)
     found = {
@@ -304,6 +304,18 @@ def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool)
     if mask is not None and mask.all():
         mask = None
     return _Prepared(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _supported(pixels: np.ndarray, name: str) -> np.ndarray:
+    """The pixels as uint8, uint16 or float32. Raises SceneError for other types and shapes."""
+    pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels
+    grey_or_colour = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32) or not grey_or_colour or pixels.size == 0:
+        raise SceneError(
+            f"image {name} is {pixels.dtype} {list(pixels.shape)}; images are [H, W], [H, W, 3] or [H, W, 4] of uint8, "
+            "uint16 or float32 (°C)"
+        )
+    return pixels
 
 
 def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] | None, dict[str, Any]]:

@@ -1,6 +1,6 @@
 """The Lightning side of a scene: the options that all loaders share, and the data loaders.
 
-``RawFrame``, ``Counts`` and ``build_scene`` (``datamodules.assemble``) are what a loader works with.
+``RawFrame``, ``Lens``, ``Counts`` and ``build_scene`` (``datamodules.assemble``) are what a loader works with.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from torch.utils.data import DataLoader
 
 from datamodules.assemble import CELSIUS, Counts, RawFrame, build_scene
 from datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
+from datamodules.formats.lens import Lens
 from datamodules.splits import SplitRule
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
 
-__all__ = ["CELSIUS", "Counts", "RawFrame", "SceneDataModule", "build_scene"]
+__all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "SceneDataModule", "build_scene"]
 
 log = logging.getLogger(__name__)
 

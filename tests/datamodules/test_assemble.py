@@ -319,6 +319,21 @@ def test_pixels_stay_in_their_stored_type():
     assert torch.equal(first.thermal, again.thermal)
 
 
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 5), np.int32), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5), np.uint8)]
+)
+def test_other_pixels_name_their_image(image):
+    with pytest.raises(SceneError, match=r"image 0\d\d.png is .*; images are \[H, W\]"):
+        scene_of([image] * 9)
+
+
+def test_doubles_are_celsius_too():
+    scene = scene_of([20.0 + grey(i) / 20 for i in range(9)], thermal_range=ThermalRange(20, 40))
+    assert scene.notes["pixel_type"] == "float32"
+    celsius = scene.thermal_range.to_celsius(scene.train[0].thermal[..., 0])
+    np.testing.assert_allclose(celsius, 20 + grey(1) / 20, atol=1e-5)
+
+
 def test_an_empty_scene_and_unknown_channels_are_refused():
     with pytest.raises(SceneError, match="scene s has no frames"):
         build_scene("s", [], points(), split=EVERY_8TH)
