@@ -1,10 +1,24 @@
-"""Temperatures of the Gaussians in view: the closed form of relaxation.py for rows of per-Gaussian tensors."""
+"""Temperatures of the Gaussians in view: the closed form of relaxation.py for rows of per-Gaussian tensors.
+
+On a CPU in float32 it runs in a fused kernel (heatsplat.kernels.relaxation), elsewhere in plain torch.
+"""
 
 from __future__ import annotations
 
-from torch import Tensor
+import math
 
-from heatsplat.physics.relaxation import temperature
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from heatsplat.kernels import relaxation as kernels
+from heatsplat.kernels.compilation import announced
+from heatsplat.kernels.simd import LANES
+from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, temperature
+
+SMALLEST_OMEGA = 1e-15  # below it the kernel's a² + ω² could vanish in float32
+COMPILING = "compiling the kernels of heat: some seconds, once"
 
 
 def visible_temperature(
@@ -29,8 +43,23 @@ def visible_temperature(
         gains: [N, 2, K] strengths of the sources sin ωt and cos ωt, one row of memory per Gaussian; None is no source.
         inverse_capacity: [N] multiplies the sources of a Gaussian; None is 1.
         ids: [n] int64 rows, each at most once; None is all of them.
+
+    Raises:
+        ValueError: the shape of the gains does not fit.
     """
-    return _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids)
+    if gains is not None and gains.shape != (rate.shape[0], 2, omega.shape[0]):
+        raise ValueError(f"gains must have shape {[rate.shape[0], 2, omega.shape[0]]}, got {list(gains.shape)}")
+    arguments = (time, ambient, initial, rate, omega, gains, inverse_capacity, ids)
+    if _fits_kernel(rate, omega):
+        return _VisibleTemperature.apply(*arguments)
+    return _reference(*arguments)
+
+
+def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
+    """Whether the kernel can be used: float32 on a CPU, and no ω of (almost) zero."""
+    if rate.device.type != "cpu" or rate.dtype != torch.float32:
+        return False
+    return omega.numel() == 0 or omega.abs().min().item() >= SMALLEST_OMEGA
 
 
 def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids) -> Tensor:
@@ -43,3 +72,50 @@ def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids
         scale = inverse_capacity if ids is None else inverse_capacity.index_select(0, ids)
         gains = gains * scale[:, None, None]
     return temperature(time, ambient, initial, rate, omega, gains[:, 0], gains[:, 1])
+
+
+class _VisibleTemperature(torch.autograd.Function):
+    """The kernel. Gradients are dense [N, ...], zero in rows out of view: that is what the optimiser reads."""
+
+    @staticmethod
+    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids) -> Tensor:
+        count = rate.shape[0]
+        ids = torch.arange(count) if ids is None else ids
+        gains = rate.new_empty(count, 2, 0) if gains is None else gains
+        scale = rate.new_empty(0) if inverse_capacity is None else inverse_capacity
+        tensors = rate.contiguous(), initial.contiguous(), gains.contiguous(), scale.contiguous(), ids.contiguous()
+        ctx.save_for_backward(*tensors)
+        seconds, frequencies = time.item(), gains.shape[2]
+        limit = BACKWARD_TIME_CONSTANTS / -seconds if seconds < 0 else math.inf
+        ctx.table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), np.float32)
+        ctx.numbers = np.float32(ambient.item()), np.float32(seconds), np.float32(limit)
+        values = rate.new_empty(ids.shape[0])
+        with announced(COMPILING), kernels.threads_for(ids.shape[0]):
+            kernels.fill_table(omega.numpy()[:frequencies], seconds, ctx.table)
+            kernels.forward(*_kernel_arguments(ctx, tensors), values.numpy())
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_values: Tensor):
+        tensors = ctx.saved_tensors
+        rate, initial, gains, scale, ids = tensors
+        # Rows that are all in view are all written; only then may they start as whatever memory held.
+        allocate = torch.empty if ids.shape[0] == rate.shape[0] else torch.zeros
+        v_rate, v_initial, v_gains, v_scale = (allocate(x.shape) for x in (rate, initial, gains, scale))
+        v_ambient = torch.empty(-(-ids.shape[0] // kernels.BLOCK))
+        outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
+        with announced(COMPILING), kernels.threads_for(ids.shape[0]):
+            gradient = v_values.contiguous().numpy()
+            kernels.backward(*_kernel_arguments(ctx, tensors), gradient, *(x.numpy() for x in outputs))
+        v_ambient = v_ambient.sum() if ctx.needs_input_grad[1] else None
+        v_gains = v_gains if ctx.needs_input_grad[5] else None
+        v_scale = v_scale if ctx.needs_input_grad[6] else None
+        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None
+
+
+def _kernel_arguments(ctx, tensors: tuple[Tensor, ...]) -> tuple:
+    """What both kernels take first, in their order."""
+    rate, initial, gains, scale, ids = (x.detach().numpy() for x in tensors)
+    ambient, time, limit = ctx.numbers
+    return rate, initial, ambient, gains, scale, ids, time, limit, ctx.table
