@@ -9,7 +9,9 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -180,7 +182,9 @@ def build_scene(
         notes["recentred"] = "coordinates too large for float32: 'origin' (world units) was subtracted from the scene"
 
     used = sorted(set(train) | set(test))
-    prepared = {i: _prepare(frames[i], downscale, thermal_channels, alpha_mask) for i in used}
+    with ThreadPoolExecutor() as pool:  # decoding takes most of the time and leaves Python alone
+        prepare = partial(_prepare, downscale=downscale, channels=thermal_channels, alpha_mask=alpha_mask)
+        prepared = dict(zip(used, pool.map(prepare, [frames[i] for i in used]), strict=True))
     kinds = {p.thermal.dtype.kind for p in prepared.values()}
     if len(kinds) > 1:
         raise SceneError(f"scene {name} mixes float images (°C) with integer images; convert them to one kind")

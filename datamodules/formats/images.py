@@ -11,6 +11,9 @@ import numpy as np
 from datamodules.formats.lens import Lens, undistortion_maps
 from heatsplat.contracts import SceneError
 
+# What is wrong with a file is said by the exceptions below; OpenCV would add a line for every unknown TIFF tag.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 # Mean difference between the largest and smallest channel of a pixel, in 8-bit grey levels. Greys stored as RGB have 0,
@@ -34,14 +37,10 @@ def read_image(path: Path) -> np.ndarray:
         raise SceneError(f"image {path} is empty (0 bytes); copy it again or remove it from the scene")
     if data[:2] == b"\xff\xd8" and _is_truncated_jpeg(data):
         raise SceneError(f"image {path} is corrupt: the JPEG ends early; copy it again or remove it from the scene")
-    # A corrupt file is reported by the exception below, not by lines on stderr.
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if pixels is None or pixels.size == 0:
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it from the scene")
     if pixels.dtype == np.float64:
@@ -49,12 +48,7 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.dtype not in (np.uint8, np.uint16, np.float32):
         raise SceneError(f"image {path} has pixels of type {pixels.dtype}; supported are uint8, uint16 and float32")
     if pixels.ndim == 3:
-        if pixels.shape[2] == 1:
-            pixels = pixels[..., 0]
-        elif pixels.shape[2] == 2:  # grey with alpha, kept as RGBA so that there is one rule for alpha
-            pixels = pixels[..., [0, 0, 0, 1]]
-        else:
-            pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
+        pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
     return np.ascontiguousarray(pixels)
 
 
