@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import pytorch_lightning as pl
@@ -43,7 +44,7 @@ class FiniteGuard(pl.Callback):
         step = trainer.global_step
         if module.device.type == "cpu" or step % self.every == 0:
             total = outputs["loss"]
-            if not torch.isfinite(total).item():
+            if not math.isfinite(total.item()):
                 demand_finite(((f"loss term '{name}'", term) for name, term in outputs.get("terms", {}).items()), step)
                 demand_finite([("loss", total)], step)
         if step % self.every == 0:
@@ -55,7 +56,7 @@ class FiniteGuard(pl.Callback):
             demand_finite(_moments(optimizer), trainer.global_step)
 
 
-def demand_finite(tensors: Any, step: int) -> None:
+def demand_finite(tensors: Iterable[tuple[str, Tensor]], step: int) -> None:
     """Raises NotFinite with the names of all ``tensors`` (pairs of name and tensor) that are not finite at ``step``.
 
     The sum of a tensor is finite if its values are and do not overflow together; only where it is not are the values

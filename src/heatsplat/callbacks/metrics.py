@@ -81,14 +81,10 @@ class QualityMetrics(pl.Callback):
         if trainer.sanity_checking or not self._rows:
             return
         means = {name: mean_of_images(self._rows, name) for name in DEFINITIONS}
-        known = {name: value for name, value in means.items() if value is not None}
-        module.log_dict({f"val/{name}": value for name, value in known.items()})
-        seconds = module.results.cost.get("train_seconds")
-        writer = board(module)
-        if writer is not None and seconds is not None:
-            for name, value in known.items():
-                writer.add_scalar(f"val_by_seconds/{name}", value, round(seconds))
-        step = trainer.global_step
+        step, seconds = trainer.global_step, module.results.cost.get("train_seconds")
+        self._log(module, "val", means, step)
+        if seconds is not None:
+            self._log(module, "val_by_seconds", means, round(seconds))
         self.curve = [row for row in self.curve if row["step"] < step]
         self.curve.append({"step": step, "train_seconds": seconds, "gaussians": len(module.splats), **means})
         write_table(module.output_dir / CURVE_FILE, CURVE_COLUMNS, self.curve)
@@ -123,7 +119,7 @@ class QualityMetrics(pl.Callback):
             return
         results.data["test_pixels_counted"] = mean_of_images(self._rows, "counted")
         results.data["test_pixels_saturated"] = mean_of_images(self._rows, "saturated")
-        module.log_dict({f"test/{name}": value for name, value in results.test.items() if value is not None})
+        self._log(module, "test", results.test, trainer.global_step)
         write_table(module.output_dir / TEST_FILE, tuple(self._rows[0]), self._rows)
 
     def _why_not(self, name: str, module: pl.LightningModule) -> str:
@@ -144,6 +140,18 @@ class QualityMetrics(pl.Callback):
         if self._rows[0]["mae_c"] is None and "roi" not in name:
             return "the images have no channel of temperature (pseudo-colour), or every error exceeds the outlier rule"
         return "no test image has a region of interest with such pixels"
+
+    def _log(self, module: pl.LightningModule, tag: str, scores: Mapping[str, float | None], step: int) -> None:
+        """Scores to TensorBoard and to the trainer, where checkpoints may monitor them.
+
+        Lightning's own way to the logger counts steps from zero, one less than every other curve.
+        """
+        known = {f"{tag}/{name}": value for name, value in scores.items() if value is not None}
+        module.log_dict(known, logger=False)
+        writer = board(module)
+        if writer is not None:
+            for name, value in known.items():
+                writer.add_scalar(name, value, step)
 
     # Resume ----------------------------------------------------------------------------------------------------------
 

@@ -66,7 +66,7 @@ class Progress(pl.Callback):
                 words.append(text.format(found[name]))
         seconds = module.results.cost.get("train_seconds")
         if seconds is not None:
-            words.append(f"after {seconds:.0f} s")
+            words.append(f"after {seconds:.{0 if seconds >= 10 else 1}f} s")
         self._bar.write("  ".join(words), file=sys.stderr)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

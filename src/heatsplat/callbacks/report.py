@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from heatsplat.callbacks.images import spread
 from heatsplat.callbacks.metrics import CURVE_FILE, TEST_FILE, read_table
 from heatsplat.contracts import SceneData
 from heatsplat.io.pictures import figure_picture, write_png
@@ -62,8 +63,7 @@ class Report(pl.Callback):
         results.write(folder / METRICS_FILE)
         curves = draw_curves(folder)
         pictures = sorted((folder / "renders" / "test").glob("*.png"))
-        shown = [pictures[i * len(pictures) // self.pictures] for i in range(self.pictures)]
-        shown = list(dict.fromkeys(shown)) if pictures else []
+        shown = [pictures[i] for i in spread(len(pictures), self.pictures)]
         probes = folder / "renders" / "probes.png"
         write_atomically(
             folder / REPORT_FILE, report(results, folder, shown, curves, probes if probes.exists() else None)

@@ -1,0 +1,92 @@
+"""CostMeter: what is timed and what is not, memory, and going on after a resume."""
+
+import time
+
+import numpy as np
+import pytest
+from fake_run import FakeModule, evaluate, fit, trainer, wall
+from pytorch_lightning.callbacks import ModelCheckpoint
+
+from heatsplat.callbacks.timing import CLEAR, CostMeter
+
+
+class Slow(FakeModule):
+    """Steps take 10 ms, the first one 300 (a compiler at work); a validation view takes 100, a test view 20."""
+
+    def training_step(self, view, batch_idx):
+        time.sleep(0.3 if self.global_step == 0 else 0.01)
+        return super().training_step(view, batch_idx)
+
+    def validation_step(self, view, batch_idx):
+        time.sleep(0.1)
+        return super().validation_step(view, batch_idx)
+
+    def predict(self, frame):
+        if self.trainer.testing:
+            time.sleep(0.02)
+        return super().predict(frame)
+
+
+def test_compiling_and_evaluation_are_not_training(tmp_path):
+    module = Slow(wall(), tmp_path)
+    job = trainer(tmp_path, [CostMeter(fps_views=2, fps_repeats=3)], steps=20, every=10)
+    start = time.perf_counter()
+    fit(module, job)
+    elapsed = time.perf_counter() - start
+    cost = dict(module.results.cost)
+    assert cost["warmup_seconds"] >= 0.3
+    assert cost["evaluation_seconds"] >= 6 * 0.1
+    assert 17 * 0.01 <= cost["train_seconds"] <= elapsed - 0.9
+    assert cost["steps_per_second"] == pytest.approx(17 / cost["train_seconds"])
+    assert cost["wall_seconds"] <= elapsed
+    assert "render_fps" not in cost
+    evaluate(module, job)
+    assert 10 < module.results.cost["render_fps"] <= 50
+    assert module.results.cost["train_seconds"] == cost["train_seconds"]
+
+
+def test_a_resumed_run_goes_on_counting(tmp_path):
+    save = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=8, save_top_k=-1)
+    module = Slow(wall(), tmp_path)
+    fit(module, trainer(tmp_path, [CostMeter(), save], steps=8, every=4))
+    first = dict(module.results.cost)
+    again = Slow(wall(), tmp_path)
+    fit(again, trainer(tmp_path, [CostMeter()], steps=16, every=4), ckpt=tmp_path / "step=8.ckpt")
+    cost = again.results.cost
+    assert cost["train_seconds"] >= first["train_seconds"] * 0.99 + 5 * 0.01
+    assert cost["steps_per_second"] == pytest.approx((8 - 3 + 8 - 3) / cost["train_seconds"])
+    assert cost["warmup_seconds"] > first["warmup_seconds"] * 0.99 + 3 * 0.01
+    assert (
+        cost["evaluation_seconds"] >= 0.9
+    )  # 3 views at steps 4, 12 and 16; the one at step 8 came after the checkpoint
+
+
+def test_runs_without_timed_steps_say_so(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    job = trainer(tmp_path, [CostMeter()], steps=3, every=3)
+    fit(module, job)
+    assert module.results.cost["train_seconds"] is None
+    assert "not longer than its 3 steps of warm-up" in module.results.reasons["cost.train_seconds"]
+
+    module = FakeModule(wall(), tmp_path)
+    evaluate(module, trainer(tmp_path, [CostMeter()]))
+    assert module.results.cost["train_seconds"] is None
+    assert "trained nothing" in module.results.reasons["cost.steps_per_second"]
+    assert module.results.cost["gaussians"] == 300
+
+
+def test_peak_memory_is_that_of_this_run(tmp_path):
+    class Hungry(FakeModule):
+        def training_step(self, view, batch_idx):
+            np.ones(60_000_000).sum()  # 480 MB, given back at once
+            return super().training_step(view, batch_idx)
+
+    def peak(kind):
+        module = kind(wall(), tmp_path)
+        fit(module, trainer(tmp_path, [CostMeter()], steps=5, every=5))
+        return module.results.cost["peak_memory_mb"]
+
+    before, hungry, after = peak(FakeModule), peak(Hungry), peak(FakeModule)
+    assert hungry > before + 400
+    if CLEAR.exists():
+        assert after < hungry - 300  # a sweep's next run does not inherit the peak

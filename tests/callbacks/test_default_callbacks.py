@@ -1,0 +1,60 @@
+"""conf/callbacks/default.yaml: every entry can be built, says what its settings are, and stands in its place."""
+
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from fake_run import FakeModule, fit, trainer, wall
+
+FILE = Path(__file__).resolve().parents[2] / "conf" / "callbacks" / "default.yaml"
+ENTRIES = yaml.safe_load(FILE.read_text())
+
+
+def build(name, **changes):
+    settings = dict(ENTRIES[name])
+    module, _, cls = settings.pop("_target_").rpartition(".")
+    return getattr(import_module(module), cls)(**settings | changes)
+
+
+@pytest.mark.parametrize("name", list(ENTRIES))
+def test_every_setting_is_one_that_exists(name):
+    settings = dict(ENTRIES[name])
+    module, _, cls = settings.pop("_target_").rpartition(".")
+    accepted = inspect.signature(getattr(import_module(module), cls)).parameters
+    assert set(settings) <= set(accepted)
+    if module.startswith("heatsplat.callbacks"):
+        assert set(settings) == set(accepted), "every setting is shown in the file"
+        assert all(settings[key] == accepted[key].default for key in settings), "file and code have the same defaults"
+
+
+def test_every_key_has_a_comment():
+    for line in FILE.read_text().splitlines():
+        if re.match(r"\s*\w+:", line) and "_target_" not in line:
+            assert "  # " in line, line
+
+
+def test_order():
+    names = list(ENTRIES)
+    assert names[0] == "costs" and names[-1] == "report"
+    assert names.index("metrics") < names.index("report")
+
+
+@pytest.mark.parametrize("steps", [8, 9])
+def test_checkpoints_at_fixed_steps_and_at_the_end(tmp_path, steps):
+    where = {"dirpath": str(tmp_path / "checkpoints")}
+    saves = [build("checkpoint", every_n_train_steps=4, **where), build("checkpoint_end", **where)]
+    module = FakeModule(wall(), tmp_path)
+    fit(module, trainer(tmp_path, saves, steps=steps, every=4))
+    names = sorted(p.name for p in (tmp_path / "checkpoints").iterdir())
+    assert names == ["last.ckpt", "step_000004.ckpt", "step_000008.ckpt"]
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == steps
+    again = FakeModule(wall(), tmp_path)
+    saves = [build("checkpoint", every_n_train_steps=4, **where), build("checkpoint_end", **where)]
+    fit(again, trainer(tmp_path, saves, steps=12, every=4), ckpt=tmp_path / "checkpoints" / "step_000004.ckpt")
+    names = sorted(p.name for p in (tmp_path / "checkpoints").iterdir())
+    assert names == ["last.ckpt", "step_000004.ckpt", "step_000008.ckpt", "step_000012.ckpt"]
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 12

@@ -1,0 +1,172 @@
+"""Scores that cannot be had say why; curves survive a resume; probes are seen by the cameras that look at them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from fake_run import FakeModule, camera, evaluate, events, fit, trainer, wall
+from pytorch_lightning.callbacks import ModelCheckpoint
+
+from heatsplat.callbacks.images import ImagePanels, file_stem, spread
+from heatsplat.callbacks.metrics import QualityMetrics, read_table
+from heatsplat.callbacks.probes import TemperatureCurves, find_probes, project, recorded, seen_by
+from heatsplat.callbacks.progress import Progress
+from heatsplat.callbacks.report import Report
+from heatsplat.contracts import ViewSet
+
+
+def scored(scene, folder, *callbacks):
+    module = FakeModule(scene, folder)
+    evaluate(module, trainer(folder, [QualityMetrics(lpips_net=None), *callbacks], logger=False))
+    return module.results
+
+
+@pytest.mark.parametrize(
+    ("scene", "reason"),
+    [
+        (wall(thermal_range=None), "the scene has no temperature bounds"),
+        (wall(channels=3, modality="rgb"), "rgb images are no temperatures"),
+        (wall(channels=3), "pseudo-colour"),
+    ],
+)
+def test_temperature_errors_that_cannot_be_had_say_why(tmp_path, scene, reason):
+    results = scored(scene, tmp_path)
+    assert results.test["psnr"] > 20 and results.test["ssim"] > 0.5
+    for name in ("mae_c", "mae_inlier_c", "mae_roi_c", "mae_roi_scene_c"):
+        assert results.test[name] is None
+    assert reason in results.reasons["test.mae_c"]
+    assert results.test["lpips"] is None and results.reasons["test.lpips"] == "not asked for"
+
+
+def test_images_without_region_of_interest_are_not_averaged_in(tmp_path):
+    scene = wall()
+
+    def decode(i):
+        view = scene.test[i]
+        return replace(view, thermal=torch.full_like(view.thermal, 0.3)) if i == 1 else view
+
+    mixed = replace(scene, test=ViewSet(scene.test.frames, decode))
+    results = scored(mixed, tmp_path)
+    rows = read_table(tmp_path / "test_per_image.csv")
+    having = [row["mae_roi_c"] for row in rows if row["mae_roi_c"] is not None]
+    assert rows[1]["mae_roi_c"] is None and len(having) == 3
+    assert results.test["mae_roi_c"] == pytest.approx(sum(having) / 3)
+    assert "mean of the 3 of 4 test images" in results.definitions["mae_roi_c"]
+
+
+def test_identical_images_give_infinite_psnr_and_null_in_the_file(tmp_path):
+    scene = wall()
+    module = FakeModule(scene, tmp_path)
+
+    def decode(i):
+        frame = scene.test.frames[i]
+        return replace(scene.test[i], thermal=module.predict(frame))
+
+    module.scene = replace(scene, test=ViewSet(scene.test.frames, decode))
+    evaluate(module, trainer(tmp_path, [QualityMetrics(lpips_net=None), Report(show=False)], logger=False))
+    assert module.results.test["psnr"] == float("inf")
+    assert read_table(tmp_path / "test_per_image.csv")[0]["psnr"] == float("inf")
+    content = module.results.as_json()
+    assert content["test"]["psnr"] is None and content["reasons"]["test.psnr"] == "infinite"
+    assert "`test.psnr`: infinite" in (tmp_path / "report.md").read_text()
+
+
+def test_the_course_of_scores_survives_a_resume(tmp_path):
+    save = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=6, save_top_k=-1)
+    module = FakeModule(wall(), tmp_path)
+    fit(module, trainer(tmp_path, [QualityMetrics(), save], steps=12, every=4))
+    whole = read_table(tmp_path / "curve.csv")
+    again = FakeModule(wall(), tmp_path / "b")
+    fit(again, trainer(tmp_path, [QualityMetrics()], steps=12, every=4), ckpt=tmp_path / "step=6.ckpt")
+    resumed = read_table(tmp_path / "b" / "curve.csv")
+    assert [row["step"] for row in resumed] == [row["step"] for row in whole] == [4, 8, 12]
+    assert [row["psnr"] for row in resumed] == pytest.approx([row["psnr"] for row in whole], rel=1e-6)
+
+
+def test_scores_can_be_monitored(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    job = trainer(tmp_path, [QualityMetrics()], steps=4, every=4)
+    fit(module, job)
+    assert float(job.callback_metrics["val/psnr"]) == pytest.approx(
+        read_table(tmp_path / "curve.csv")[0]["psnr"], rel=1e-5
+    )
+
+
+def test_panels_without_logger_and_bounds(tmp_path):
+    scored(wall(thermal_range=None), tmp_path, ImagePanels(test_views=-1), TemperatureCurves(times=4))
+    assert len(list((tmp_path / "renders" / "test").glob("*.png"))) == 4
+    assert (tmp_path / "renders" / "probes.png").exists()
+    none = tmp_path / "none"
+    scored(wall(), none, ImagePanels(test_views=0))
+    assert not (none / "renders").exists()
+
+
+def test_positions_are_spread_and_names_unique():
+    assert spread(10, 3) == [0, 3, 6]
+    assert spread(2, 5) == [0, 1]
+    assert spread(5, 0) == []
+    scene = wall()
+    frames = [*scene.train.frames, *scene.test.frames]
+    assert len({file_stem(frame) for frame in frames}) == len(frames)
+
+
+def test_models_and_scenes_without_time_have_no_curves(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    module.thermal.needs = frozenset()
+    evaluate(module, trainer(tmp_path, [TemperatureCurves()], logger=False))
+    assert not (tmp_path / "renders").exists()
+    timeless = FakeModule(wall(), tmp_path)
+    frames = [replace(frame, time_s=None) for frame in timeless.scene.train.frames]
+    timeless.scene = replace(timeless.scene, train=ViewSet(frames, lambda i: None))
+    evaluate(timeless, trainer(tmp_path, [TemperatureCurves()], logger=False))
+    assert not (tmp_path / "renders").exists()
+
+
+def test_projection_by_hand():
+    pixels, depths = project(torch.tensor([[0.5, -1.0, 4.0], [0.0, 0.0, -1.0]]), camera(0.1))
+    assert pixels[0].tolist() == pytest.approx([28 + 60 * 0.4 / 4, 20 - 60 / 4])
+    assert depths.tolist() == [4.0, -1.0]
+
+
+def test_hidden_points_are_not_seen():
+    cloud = torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) * torch.tensor([0.4, 0.4, 0.0])
+    screen = cloud + torch.tensor([0.0, 0.0, 2.0])  # a screen before the points at x, y > 0
+    points = torch.tensor([[0.3, 0.3, 4.0], [-0.3, -0.3, 4.0], [0.0, 0.0, -4.0], [9.0, 0.0, 4.0], [0.2, 0.2, 2.0]])
+    assert seen_by(camera(0.0), points, screen).tolist() == [False, True, False, False, True]
+    assert seen_by(camera(0.0), points, screen[:0]).tolist() == [True, True, False, False, True]
+
+
+def test_probes_are_found_without_the_scenes_help():
+    scene = wall(truth=False)
+    probes = find_probes(scene, 5)
+    assert len(probes) == 5
+    for probe in probes:
+        (column, row), _ = (x[0].tolist() if x.ndim > 1 else x for x in project(probe.point[None], probe.frame.camera))
+        assert (int(row), int(column)) == (probe.row, probe.column)
+    places = torch.stack([probe.point for probe in probes])
+    assert torch.pdist(places).min() > 0.3
+    times, values = recorded(probes[0], scene, "thermal")
+    assert times == scene.train.times_s
+    column, row = (int(x) for x in project(probes[0].point[None], scene.train.frames[2].camera)[0][0])
+    assert values[2] == scene.train[2].thermal[row, column].item()
+
+
+def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
+    module = FakeModule(wall(truth=False), tmp_path)
+    evaluate(module, trainer(tmp_path, [TemperatureCurves(times=4)]))
+    assert (tmp_path / "renders" / "probes.png").exists()
+    assert "truth_1" not in read_table(tmp_path / "renders" / "probes.csv")[0]
+    assert "test/probes" in events(tmp_path).Tags()["images"]
+
+
+def test_progress_says_how_far_it_is(tmp_path, capsys):
+    module = FakeModule(wall(), tmp_path)
+    fit(module, trainer(tmp_path, [QualityMetrics(lpips_net=None), Progress()], steps=8, every=4))
+    said = capsys.readouterr().err
+    assert "8/8" in said
+    curve = read_table(tmp_path / "curve.csv")
+    for row in curve:
+        assert f"step {row['step']:.0f}:  PSNR {row['psnr']:.2f} dB" in said
+    quiet = FakeModule(wall(), tmp_path)
+    fit(quiet, trainer(tmp_path, [Progress(enabled=False)], steps=4, every=4))
+    assert "/4" not in capsys.readouterr().err
