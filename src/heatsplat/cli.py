@@ -102,7 +102,8 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     if plain["data"].get("root") is not None:
         plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
     trainer = build(plain["trainer"], callbacks=list(build(plain["callbacks"]).values()), logger=build(plain["logger"]))
-    module = build(plain["module"], recipe=plain, output_dir=str(output_dir))
+    module = build(plain["module"], output_dir=str(output_dir))
+    module.recipe = plain  # set, not passed: Hydra would build every part in it once more
     results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
 
@@ -164,5 +165,6 @@ def _restored(config: DictConfig, output_dir: Path) -> tuple[Any, Any, dict[str,
     changed = {key: value for key, value in OmegaConf.to_container(config.data).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
-    module = build(stored["module"], recipe=stored, output_dir=str(output_dir))
+    module = build(stored["module"], output_dir=str(output_dir))
+    module.recipe = stored
     return module, build(stored["data"] | changed), {**stored, "checkpoint": checkpoint}

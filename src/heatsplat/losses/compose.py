@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -25,8 +25,6 @@ class LossInputs:
         step: training step, from 0.
         max_steps: length of the run in steps.
         companions: prediction and target of the further images that the model explains, by modality.
-        target_key: names the content of target and mask, so that terms may keep what they computed from them: equal
-            keys promise equal pixels. None, the default, promises nothing.
     """
 
     prediction: Tensor
@@ -37,7 +35,6 @@ class LossInputs:
     step: int
     max_steps: int
     companions: Mapping[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    target_key: Hashable | None = None
 
     def pair(self, modality: str | None) -> tuple[Tensor, Tensor]:
         """Prediction and target of a companion, or of the image itself for None.

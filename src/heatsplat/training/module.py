@@ -30,7 +30,8 @@ class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir`` and ``predict(frame)``.
+    ``output_dir``, ``predict(frame)``, and ``recipe``, the resolved configuration as plain containers: it travels in the
+    checkpoint, so that a checkpoint and its data are enough to evaluate or render.
 
     Args:
         thermal: what splats emit.
@@ -41,8 +42,6 @@ class SplatTraining(pl.LightningModule):
         init: how splats start.
         optim: learning rates and schedule.
         seed: seed of every random draw.
-        recipe: the resolved configuration as plain containers; travels in the checkpoint, so that a checkpoint and its
-            data are enough to evaluate or render.
         output_dir: folder of the run.
     """
 
@@ -56,13 +55,13 @@ class SplatTraining(pl.LightningModule):
         init: Initialisation,
         optim: Optimisation,
         seed: int = 0,
-        recipe: dict[str, Any] | None = None,
         output_dir: Path | str = ".",
     ) -> None:
         super().__init__()
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
-        self.seed, self.recipe, self.output_dir = seed, recipe or {}, Path(output_dir)
+        self.seed, self.output_dir = seed, Path(output_dir)
+        self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
         self.results = RunResults()
         self.scene: SceneData | None = None
@@ -161,7 +160,6 @@ class SplatTraining(pl.LightningModule):
             step,
             self.trainer.max_steps,
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
-            target_key=view.frame.frame_id,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         self._rendered = (output, view)

@@ -21,7 +21,14 @@ from heatsplat.training.module import SplatTraining
 log = logging.getLogger("heatsplat")
 
 # Lightning speaks of data loader workers, of its products and of a torch deprecation; none is the user's to act on.
-NOISE = (r".*does not have many workers.*", r".*LeafSpec.*", r".*`isinstance\(treespec.*", r".*Checkpoint directory.*")
+NOISE = (
+    r".*smaller than the logging interval.*",
+    r".*does not have many workers.*",
+    r".*LeafSpec.*",
+    r".*`isinstance\(treespec.*",
+    r".*Checkpoint directory.*",
+    r".*transfer_batch_to.*",
+)
 
 
 def prepare_machine(threads: int | None) -> None:

@@ -1,0 +1,109 @@
+"""Whole runs on the tiny synthetic scene: they resume bit for bit, stop gracefully and refuse what does not fit."""
+
+import json
+import signal
+
+import pytest
+import torch
+from running import TINY, run
+
+from heatsplat.contracts import SceneError
+from heatsplat.training.session import load_checkpoint
+
+SHORT = (
+    *TINY,
+    "max_steps=40",
+    "density.start=5",
+    "density.every=10",
+    "density.stop=30",
+    "trainer.val_check_interval=20",
+)
+
+
+def state_of(module, trainer) -> dict[str, torch.Tensor]:
+    optimizer = trainer.optimizers[0]
+    found = {name: value.clone() for name, value in module.state_dict().items()}
+    for group in optimizer.param_groups:
+        for key, value in optimizer.state[group["params"][0]].items():
+            found[f"{group['name']}.{key}"] = torch.as_tensor(value).clone()
+    return found
+
+
+@pytest.mark.parametrize("method", ["3dgs", "etgs"])
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(method, tmp_path):
+    overrides = (*SHORT, f"method={method}", "test=false", "callbacks.checkpoint.every_n_train_steps=20")
+    whole = state_of(*run(tmp_path / "whole", *overrides))
+    half = tmp_path / "whole" / "checkpoints" / "step_000020.ckpt"
+    resumed = state_of(*run(tmp_path / "resumed", *overrides, f"ckpt={half}"))
+    assert whole.keys() == resumed.keys()
+    different = [name for name in whole if not torch.equal(whole[name], resumed[name])]
+    assert different == []
+    assert len(whole["splats.raw.means"]) > 600  # density control was at work
+
+
+def test_a_run_leaves_metrics_beside_their_cost(tmp_path):
+    module, _ = run(tmp_path, *SHORT, "method=etgs")
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["test"]["psnr"] > 5 and found["test"]["mae_c"] > 0
+    assert found["cost"]["gaussians"] == len(module.splats)
+    assert found["cost"]["train_seconds"] > 0 and found["cost"]["render_fps"] > 0
+    assert found["effects"]["harmonic_source"]["frequencies"] > 0
+    assert found["test"]["lpips"] is not None or "LPIPS" in found["reasons"]["test.lpips"]
+    assert (tmp_path / "report.md").exists()
+
+
+def test_interruption_leaves_a_checkpoint_that_resumes(tmp_path, monkeypatch):
+    import heatsplat.training.session as session
+
+    steps = []
+
+    def interrupt_at_seven(self, trainer, *_):
+        steps.append(trainer.global_step)
+        if trainer.global_step == 7:
+            signal.raise_signal(signal.SIGINT)
+        if self.interrupted:
+            trainer.should_stop = True
+
+    monkeypatch.setattr(session.StopOnInterrupt, "on_train_batch_end", interrupt_at_seven)
+    with pytest.raises(SystemExit) as stopped:
+        run(tmp_path, *SHORT, "method=3dgs")
+    assert stopped.value.code == 130
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    assert load_checkpoint(last)["global_step"] == 7 == steps[-1]
+    _, trainer = run(tmp_path / "on", *SHORT, "method=3dgs", "test=false", f"ckpt={last}")
+    assert trainer.global_step == 40
+
+
+def test_a_checkpoint_of_another_method_is_refused(tmp_path):
+    run(tmp_path / "etgs", *SHORT, "method=etgs", "test=false")
+    last = tmp_path / "etgs" / "checkpoints" / "last.ckpt"
+    with pytest.raises(SceneError, match="method 'etgs', this run is method '3dgs'"):
+        run(tmp_path / "3dgs", *SHORT, "method=3dgs", f"ckpt={last}")
+
+
+def test_a_missing_checkpoint_is_named_with_those_that_exist(tmp_path):
+    (tmp_path / "other.ckpt").touch()
+    with pytest.raises(SceneError, match="other.ckpt"):
+        load_checkpoint(tmp_path / "none.ckpt")
+    with pytest.raises(SceneError, match="not a checkpoint that can be read"):
+        load_checkpoint(tmp_path / "other.ckpt")
+
+
+def test_a_method_that_needs_time_refuses_a_scene_without(tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    from datamodules.synthetic import Synthetic
+    from heatsplat.contracts import ViewSet
+
+    def timeless(views: ViewSet) -> ViewSet:
+        return ViewSet([replace(frame, time_s=None) for frame in views.frames], lambda i: views[i])
+
+    loaded = Synthetic.load
+
+    def without_time(self):
+        scene = loaded(self)
+        return replace(scene, train=timeless(scene.train), val=timeless(scene.val), test=timeless(scene.test))
+
+    monkeypatch.setattr(Synthetic, "load", without_time)
+    with pytest.raises(SceneError, match="NewtonHarmonic needs time, which scene 'cooling' does not have"):
+        run(tmp_path, *SHORT, "method=etgs")
