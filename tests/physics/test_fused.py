@@ -147,3 +147,39 @@ def test_changing_an_input_before_the_backward_pass_is_noticed():
         leaves["rate"].mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         values.sum().backward()
+
+
+def test_gradients_of_two_moments_add_up():
+    """Memory of gradients is reused, never while somebody still holds it: within a graph, between two, and after."""
+    leaves, omega = case(50, 24)
+    del leaves["inverse_capacity"]
+    gains = leaves["gains"]
+
+    def at(time):
+        return visible_temperature(torch.tensor(time, dtype=DOUBLE), omega=omega, **leaves).sum()
+
+    single = []
+    for time in (0.3, 2.0):
+        at(time).backward()
+        single.append(gains.grad.clone())
+        gains.grad = None
+    (at(0.3) + at(2.0)).backward()
+    torch.testing.assert_close(gains.grad, single[0] + single[1])
+    at(0.3).backward()
+    torch.testing.assert_close(gains.grad, 2 * single[0] + single[1])
+    kept = gains.grad
+    gains.grad = None
+    at(2.0).backward()
+    assert torch.equal(gains.grad, single[1])
+    torch.testing.assert_close(kept, 2 * single[0] + single[1])
+
+
+def test_memory_of_gradients_is_used_again():
+    leaves, omega = case(50, 24)
+    where = set()
+    for _ in range(3):
+        leaves["gains"].grad = None
+        visible_temperature(torch.tensor(1.0, dtype=DOUBLE), omega=omega, **leaves).sum().backward()
+        where.add(leaves["gains"].grad.data_ptr())
+    assert len(where) == 1
+    assert where.pop() % 64 == 0

@@ -6,6 +6,7 @@ On a CPU in float32 it runs in a fused kernel (heatsplat.kernels.relaxation), el
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from heatsplat.kernels.simd import LANES
 from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, temperature
 
 SMALLEST_OMEGA = 1e-15  # below it the kernel's a² + ω² could vanish in float32
+CACHE_LINE = 16  # float32 numbers; rows of gains are read by whole lines
 COMPILING = "compiling the kernels of heat: some seconds, once"
 
 
@@ -74,6 +76,33 @@ def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids
     return temperature(time, ambient, initial, rate, omega, gains[:, 0], gains[:, 1])
 
 
+class _SpareMemory:
+    """Memory of one tensor, lent again once nothing uses it any more.
+
+    A new tensor of this size (20 MB for 100,000 Gaussians) comes as untouched pages, whose first touch costs more than
+    the kernel that fills them.
+    """
+
+    def __init__(self) -> None:
+        self._array = np.empty(0, np.float32)
+        self._references_unused = self._references()
+
+    def _references(self) -> int:
+        # A tensor made of an array keeps one reference to it for as long as anything shares its storage.
+        return sys.getrefcount(self._array)
+
+    def take(self, shape: torch.Size) -> Tensor:
+        """A float32 tensor of that shape with undefined values."""
+        if self._array.shape != tuple(shape) or self._references() > self._references_unused:
+            memory = np.empty(shape.numel() + CACHE_LINE, np.float32)
+            start = -(memory.ctypes.data // memory.itemsize) % CACHE_LINE
+            self._array = memory[start : start + shape.numel()].reshape(tuple(shape))
+        return torch.from_numpy(self._array)
+
+
+_gain_gradients = _SpareMemory()
+
+
 class _VisibleTemperature(torch.autograd.Function):
     """The kernel. Gradients are dense [N, ...], zero in rows out of view: that is what the optimiser reads."""
 
@@ -100,9 +129,10 @@ class _VisibleTemperature(torch.autograd.Function):
     def backward(ctx, v_values: Tensor):
         tensors = ctx.saved_tensors
         rate, initial, gains, scale, ids = tensors
-        # Rows that are all in view are all written; only then may they start as whatever memory held.
-        allocate = torch.empty if ids.shape[0] == rate.shape[0] else torch.zeros
-        v_rate, v_initial, v_gains, v_scale = (allocate(x.shape) for x in (rate, initial, gains, scale))
+        v_rate, v_initial, v_scale = (torch.zeros(x.shape) for x in (rate, initial, scale))
+        v_gains = _gain_gradients.take(gains.shape)
+        if ids.shape[0] < rate.shape[0]:  # otherwise every row is written
+            v_gains.zero_()
         v_ambient = torch.empty(-(-ids.shape[0] // kernels.BLOCK))
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
