@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ViewSet
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import Emission, Query, Seeds
 from heatsplat.thermal.imaging_field import ImagingField, octaves
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.static import Static
@@ -218,6 +218,29 @@ def test_it_wraps_any_emission_and_speaks_for_it():
     harmonics, _ = make(emission=Static(degree=2, degree_every=10))
     harmonics.on_step(10)
     assert harmonics.emission.active_degree == 1
+
+
+def test_companions_pass_untouched():
+    class Joint(Static):
+        """Two images on one geometry, as a joint method has them."""
+
+        companions = ("rgb",)
+
+        def __init__(self):
+            super().__init__()
+            self.modality_channels = (1, 3)
+
+        def features(self, splats, query):
+            emitted = super().features(splats, query).features
+            return Emission(torch.cat((emitted, emitted.expand(-1, 3)), 1))
+
+    _, splats = make()
+    model = ImagingField(Joint())
+    with torch.no_grad():
+        model.head.bias[3] = 1.0
+    features = model.features(splats, query()).features
+    assert torch.allclose(features[:, 0], 2 / (1 + math.exp(-1.0)) * features[:, 1], rtol=1e-5)
+    assert (model.companions, model.modality_channels) == (("rgb",), (1, 3))
 
 
 def test_the_network_starts_from_the_generator_it_is_given():

@@ -93,7 +93,8 @@ class ImagingField(ThermalModel):
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         self.time, self.gauge, self.lr, self.lr_end = time, gauge, lr, lr_end
         self.needs = emission.needs | (frozenset({"time"}) if time == "seconds" else frozenset())
-        self.modality, self.modality_channels = emission.modality, emission.modality_channels
+        self.modality, self.companions = emission.modality, emission.companions
+        self.modality_channels = emission.modality_channels
         codes = 6 * position_frequencies
         inputs = [codes if i == 0 else width + codes if i == skip else width for i in range(depth)]
         self.layers = nn.ModuleList(nn.Linear(count, width) for count in inputs)
@@ -142,9 +143,10 @@ class ImagingField(ThermalModel):
     def features(self, splats: Splats, query: Query) -> Emission:
         emitted = self.emission.features(splats, query).features
         factor = self.factor(query.rows(splats.means), query)[:, None].to(emitted)
-        if self.on_radiance:
-            return Emission(factor * emitted)
-        return Emission((factor * (emitted - OFFSET) + OFFSET).clamp(min=0.0))
+        channels = self.modality_channels[0]  # companions take another way to another sensor
+        emitted, others = emitted[:, :channels], emitted[:, channels:]
+        emitted = factor * emitted if self.on_radiance else (factor * (emitted - OFFSET) + OFFSET).clamp(min=0.0)
+        return Emission(torch.cat((emitted, others), 1) if others.shape[1] else emitted)
 
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
         return self.emission.geometry(splats, query)
