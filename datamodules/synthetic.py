@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 import torch
 
-from datamodules.base import RawFrame, SceneDataModule
+from datamodules.assemble import RawFrame
+from datamodules.base import SceneDataModule
 from datamodules.synthetic_scene.film import SIZES, Recording, film
 from datamodules.synthetic_scene.presets import PRESETS
 from datamodules.synthetic_scene.scene import Scene

@@ -142,9 +142,10 @@ class Box:
         last = torch.full_like(offset[:, 0], math.inf)
         for axis, size in enumerate(self.size):
             inverse = 1.0 / rays[:, axis]
-            middle, reach = -offset[:, axis] * inverse, 0.5 * size * inverse.abs()
-            # A ray in the very plane of a face divides 0 by 0; fmax and fmin then leave that pair of faces out.
-            first, last = torch.fmax(first, middle - reach), torch.fmin(last, middle + reach)
+            one, other = (-0.5 * size - offset[:, axis]) * inverse, (0.5 * size - offset[:, axis]) * inverse
+            # A ray in the very plane of a face multiplies 0 by infinity; fmax and fmin leave that face out.
+            first = torch.fmax(first, torch.fmin(one, other))
+            last = torch.fmin(last, torch.fmax(one, other))
         return torch.where((first <= last) & (first > 0), first, torch.full_like(first, math.inf))
 
     def normals(self, points: Tensor) -> Tensor:
