@@ -30,8 +30,8 @@ class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir``, ``predict(frame)``, and ``recipe``, the resolved configuration as plain containers: it travels in the
-    checkpoint, so that a checkpoint and its data are enough to evaluate or render.
+    ``output_dir``, ``predict(frame)``, and ``recipe``, the resolved configuration as plain containers: it travels in
+    the checkpoint, so that a checkpoint and its data are enough to evaluate or render.
 
     Args:
         thermal: what splats emit.

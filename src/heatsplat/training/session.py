@@ -20,14 +20,17 @@ from heatsplat.training.module import SplatTraining
 
 log = logging.getLogger("heatsplat")
 
-# Lightning speaks of data loader workers, of its products and of a torch deprecation; none is the user's to act on.
+# Lightning's remarks that no user can act on: on workers, its products, a torch deprecation, checkpoints of another folder,
+# and on loaders that cannot resume (ours takes the step from the trainer, so a resumed run sees the views it would have).
 NOISE = (
-    r".*smaller than the logging interval.*",
     r".*does not have many workers.*",
     r".*LeafSpec.*",
     r".*`isinstance\(treespec.*",
     r".*Checkpoint directory.*",
     r".*transfer_batch_to.*",
+    r".*smaller than the logging interval.*",
+    r".*dirpath has changed.*",
+    r".*dataloader is not resumable.*",
 )
 
 
