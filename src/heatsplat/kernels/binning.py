@@ -12,7 +12,6 @@ import numpy as np
 from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel, serial_kernel
-from heatsplat.kernels.layout import modalities
 from heatsplat.kernels.projection import CHUNK, GEOMETRY, LOG2_ALPHA_MIN, TILE
 from heatsplat.kernels.simd import (
     bits,
@@ -53,8 +52,8 @@ def _touched_blocks(block_x, block_y, first, mixed, second, slope_x, slope_y, li
 
 @kernel
 def find_instances(
-    layout, geometry, rectangles, width, height, visible, visible_counts, first_slots,
-    features, rows_are_ranks, first_ranks, opacities, depths, depth_channel, records, tiles, masks, ranges,
+    geometry, rectangles, width, height, visible, visible_counts, first_slots, features, rows_are_ranks, first_ranks,
+    opacities, depths, has_depth, records, tiles, masks, ranges,
 ):  # fmt: skip
     """Packs the records of the visible Gaussians and tests these against the tiles of their bounding boxes.
 
@@ -63,11 +62,11 @@ def find_instances(
         first_slots: [chunks], where the instances of a chunk begin.
         features: [N, C], or [n, C] of the visible ones where ``rows_are_ranks``.
         first_ranks: [chunks], how many visible Gaussians there are before a chunk.
-        records: out [N, record_size]: geometry, the opacities relative to the largest where there are several, features,
-            depth where ``depth_channel``. One row is what compositing reads of a Gaussian.
+        records: out [N, numbers], what compositing reads of a Gaussian (layout.Layout.record).
         tiles, masks: out, in order of Gaussian index; a chunk leaves a gap before the next one.
         ranges: out [N, 2], first instance of each visible Gaussian and the one after its last.
     """
+    modalities, colours = opacities.shape[0], features.shape[1]
     tiles_x = (width + TILE - 1) // TILE
     column = to_float(lane_indices() & 3) * np.float32(4.0)
     line = to_float(lane_indices() >> 2) * np.float32(4.0)
@@ -78,18 +77,18 @@ def find_instances(
             for field in range(GEOMETRY):
                 records[gaussian, field] = geometry[gaussian, field]
             field = GEOMETRY
-            if modalities(layout) > 1:
+            if modalities > 1:
                 largest = _ZERO
-                for modality in range(modalities(layout)):
+                for modality in range(modalities):
                     largest = max(largest, opacities[modality, gaussian])
-                for modality in range(modalities(layout)):
+                for modality in range(modalities):
                     records[gaussian, field] = opacities[modality, gaussian] / largest
                     field += 1
             row = first_ranks[chunk] + position if rows_are_ranks else gaussian
-            for channel in range(features.shape[1]):
+            for channel in range(colours):
                 records[gaussian, field + channel] = features[row, channel]
-            if depth_channel:
-                records[gaussian, field + features.shape[1]] = depths[gaussian]
+            if has_depth:
+                records[gaussian, field + colours] = depths[gaussian]
 
             mean_x, mean_y = records[gaussian, 0], records[gaussian, 1]
             first, mixed, second = records[gaussian, 2], records[gaussian, 3], records[gaussian, 4]

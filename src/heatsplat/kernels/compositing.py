@@ -36,46 +36,69 @@ from heatsplat.kernels.simd import (
     absolute,
     bits,
     exp2,
-    lane_indices,
     load,
     lowest_bit,
     minimum,
+    prefetch,
     registers,
     select,
     splat,
     store,
-    to_float,
+    store_first,
+    store_scalar,
     total,
+    totals,
 )
 
 ALPHA_MIN = np.float32(1.0 / 255.0)
 ALPHA_MAX = np.float32(0.999)
 TRANSMITTANCE_MIN = np.float32(1e-4)
 BLOCKS = 16
+BATCH = 32  # instances between two looks at which blocks are finished
+AHEAD = 8  # instances ahead of use that records are fetched
 
-_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inline
-def _whitened_corner(records, record, tile_x, tile_y):
-    """u1 and u2 of the sixteen pixels of a tile's first block."""
-    x = to_float(lane_indices() & 3) + (tile_x + _HALF - records[record, 0])
-    y = to_float(lane_indices() >> 2) + (tile_y + _HALF - records[record, 1])
+def _offset(records, record, tile_x, tile_y):
+    """u1 and u2 of the corner of a tile: what is left of the whitening once it is linear in the pixels of the tile."""
+    x, y = tile_x - records[record, 0], tile_y - records[record, 1]
     return records[record, 2] * x + records[record, 3] * y, records[record, 4] * y
 
 
 @inline
-def _whitened_block(records, record, corner_1, corner_2, block):
+def _whitened(records, record, offset, pixels, block):
     """u1 and u2 of the pixels of a block."""
-    right, down = np.float32((block & 3) * 4), np.float32((block >> 2) * 4)
+    x, y = load(pixels, block * LANES), load(pixels, (BLOCKS + block) * LANES)
     return (
-        corner_1 + (records[record, 2] * right + records[record, 3] * down),
-        corner_2 + records[record, 4] * down,
+        records[record, 2] * x + (records[record, 3] * y + offset[0]),
+        records[record, 4] * y + offset[1],
     )
 
 
 @inline
-def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, transmittances, image):
+def _alpha(layout, modality, density, reached, records, record):
+    """Alpha of a modality before it is clamped, and where it is not skipped."""
+    if modalities(layout) == 1:
+        return density, reached
+    alpha = density * records[record, GEOMETRY + modality]
+    return alpha, reached & (alpha >= ALPHA_MIN)
+
+
+@inline
+def _unfinished_blocks(layout, tile, transmittances):
+    """A bit mask of the blocks of a tile with a pixel that still takes light."""
+    blocks = 0
+    for block in range(BLOCKS):
+        for modality in range(modalities(layout)):
+            place = ((tile * BLOCKS + block) * modalities(layout) + modality) * LANES
+            blocks |= (bits(load(transmittances, place) > _ZERO) != 0) << block
+    return blocks
+
+
+@inline
+def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, pixels, transmittances, image):
     """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
 
     Block masks are reduced to the blocks where a pixel took something, which is what the backward pass has to visit.
@@ -86,60 +109,46 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, trans
             store(transmittances, (block * modalities(layout) + modality) * LANES, splat(_ONE))
         for channel in range(channels(layout)):
             store(image, (block * channels(layout) + channel) * LANES, splat(_ZERO))
-    unfinished = 0xFFFF
-    last = begin
     weights = registers(modalities(layout))
     features = GEOMETRY + (modalities(layout) if modalities(layout) > 1 else 0)
-    for instance in range(begin, end):
-        blocks = np.int64(instances[instance, 2]) & unfinished
-        used = 0
-        if blocks != 0:
+    last = begin
+    for batch in range(begin, end, BATCH):
+        unfinished = _unfinished_blocks(layout, tile, transmittances)
+        if unfinished == 0:
+            break
+        for instance in range(batch, min(batch + BATCH, end)):
+            prefetch(records, np.int64(instances[min(instance + AHEAD, end - 1), 0]) * records.shape[1])
             record = np.int64(instances[instance, 0])
-            corner_1, corner_2 = _whitened_corner(records, record, tile_x, tile_y)
+            blocks = np.int64(instances[instance, 2]) & unfinished
+            offset = _offset(records, record, tile_x, tile_y)
+            used = 0
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1
                 state = tile * BLOCKS + block
-                u1, u2 = _whitened_block(records, record, corner_1, corner_2, block)
+                u1, u2 = _whitened(records, record, offset, pixels, block)
                 exponent = records[record, 5] - u1 * u1 - u2 * u2
                 reached = exponent >= LOG2_ALPHA_MIN
                 density = exp2(exponent)
-                any_taken, any_finished = 0, 0
+                anything = 0
                 for modality in range(modalities(layout)):
-                    alpha = density
-                    passed = reached
-                    if modalities(layout) > 1:
-                        alpha = density * records[record, GEOMETRY + modality]
-                        passed = reached & (alpha >= ALPHA_MIN)
-                    alpha = minimum(alpha, ALPHA_MAX)
+                    alpha, passed = _alpha(layout, modality, density, reached, records, record)
+                    alpha = select(passed, minimum(alpha, ALPHA_MAX), _ZERO)
                     place = (state * modalities(layout) + modality) * LANES
                     before = load(transmittances, place)
-                    weight = alpha * before
-                    after = before - weight
-                    taken = passed & (after > TRANSMITTANCE_MIN)
-                    finished = passed & (after <= TRANSMITTANCE_MIN)
-                    weights[modality] = select(taken, weight, _ZERO)
-                    after = select(taken, after, before)
-                    any_taken |= bits(taken)
-                    any_finished |= bits(finished)
-                    store(transmittances, place, select(finished, -absolute(after), after))
+                    after = before - alpha * before
+                    taken = after > TRANSMITTANCE_MIN
+                    weights[modality] = select(taken, alpha * before, _ZERO)
+                    anything |= bits(taken & passed)
+                    store(transmittances, place, select(taken, after, -absolute(before)))
                 for channel in range(channels(layout)):
                     place = (state * channels(layout) + channel) * LANES
                     colour = weights[modality_of(layout, channel)] * records[record, features + channel]
                     store(image, place, load(image, place) + colour)
-                if any_taken != 0:
-                    used |= 1 << block
-                if any_finished != 0:
-                    alive = 0
-                    for modality in range(modalities(layout)):
-                        alive |= bits(load(transmittances, (state * modalities(layout) + modality) * LANES) > _ZERO)
-                    if alive == 0:
-                        unfinished &= ~(1 << block)
+                used |= (anything != 0) << block
+            instances[instance, 2] = used
             if used != 0:
                 last = instance + 1
-        instances[instance, 2] = used
-        if unfinished == 0:
-            break
     return last
 
 
@@ -166,7 +175,7 @@ def _write_tile(layout, tile, tiles_x, width, height, transmittances, image, bac
 
 @kernel
 def composite(
-    layout, workers, width, height, records, instances, tile_starts, background, ticket,
+    layout, workers, width, height, records, instances, tile_starts, background, pixels, ticket,
     tile_ends, transmittances, image, features, alpha, depth,
 ):  # fmt: skip
     """Composites all tiles.
@@ -191,6 +200,7 @@ def composite(
                 instances,
                 tile_starts[tile],
                 tile_starts[tile + 1],
+                pixels,
                 transmittances,
                 image,
             )
@@ -246,9 +256,19 @@ def _start_remainders(layout, tile, colours, transmittances, image, v_pixels, wo
 
 
 @inline
+def _store_moments(layout, moments, slots, place):
+    """Writes the sums over lanes of the moments from ``place`` on, up to the end of the slot."""
+    if moment_count(layout) <= LANES:
+        store_first(slots, place, totals(moments), slots.shape[1])
+    else:
+        for k in range(moment_count(layout)):
+            store_scalar(slots, place + k, total(moments[k]))
+
+
+@inline
 def _composite_tile_backward(
-    layout, tile, tiles_x, records, instances, begin, end, v_pixels, worker, state, slots
-):  # fmt: skip
+    layout, tile, tiles_x, records, instances, begin, end, pixels, v_pixels, worker, state, slots
+):
     """Leaves the moments of instances ``begin`` to ``end`` of a tile in their gradient slots."""
     tile_x, tile_y = np.float32(tile % tiles_x * TILE), np.float32(tile // tiles_x * TILE)
     size = channels(layout) + modalities(layout)
@@ -257,17 +277,17 @@ def _composite_tile_backward(
     weights = registers(modalities(layout))
     along = registers(modalities(layout))
     for instance in range(begin, end):
+        prefetch(records, np.int64(instances[min(instance + AHEAD, end - 1), 0]) * records.shape[1])
         blocks = np.int64(instances[instance, 2])
         record = np.int64(instances[instance, 0])
-        slot = np.int64(instances[instance, 1])
-        corner_1, corner_2 = _whitened_corner(records, record, tile_x, tile_y)
+        offset = _offset(records, record, tile_x, tile_y)
         for k in range(moment_count(layout)):
             moments[k] = splat(_ZERO)
         while blocks != 0:
             block = lowest_bit(blocks)
             blocks &= blocks - 1
-            pixels = (worker * BLOCKS + block) * size
-            u1, u2 = _whitened_block(records, record, corner_1, corner_2, block)
+            v_block = (worker * BLOCKS + block) * size
+            u1, u2 = _whitened(records, record, offset, pixels, block)
             exponent = records[record, 5] - u1 * u1 - u2 * u2
             reached = exponent >= LOG2_ALPHA_MIN
             density = exp2(exponent)
@@ -275,32 +295,24 @@ def _composite_tile_backward(
                 along[modality] = splat(_ZERO)
             for channel in range(channels(layout)):
                 modality = modality_of(layout, channel)
-                v_pixel = load(v_pixels, (pixels + channel) * LANES)
+                v_pixel = load(v_pixels, (v_block + channel) * LANES)
                 along[modality] = along[modality] + v_pixel * records[record, features + channel]
             gradient = splat(_ZERO)
             for modality in range(modalities(layout)):
-                alpha = density
-                passed = reached
-                if modalities(layout) > 1:
-                    alpha = density * records[record, GEOMETRY + modality]
-                    passed = reached & (alpha >= ALPHA_MIN)
-                unclamped = alpha < ALPHA_MAX
-                alpha = minimum(alpha, ALPHA_MAX)
+                alpha, passed = _alpha(layout, modality, density, reached, records, record)
+                free = passed & (alpha < ALPHA_MAX)
+                alpha = select(passed, minimum(alpha, ALPHA_MAX), _ZERO)
                 place = ((worker * BLOCKS + block) * modalities(layout) + modality) * 2 * LANES
-                before = load(state, place)
-                rest = load(state, place + LANES)
-                weight = alpha * before
-                after = before - weight
-                taken = passed & (after > TRANSMITTANCE_MIN)
-                finished = passed & (after <= TRANSMITTANCE_MIN)
+                before, rest = load(state, place), load(state, place + LANES)
+                after = before - alpha * before
+                taken = after > TRANSMITTANCE_MIN
+                weight = select(taken, alpha * before, _ZERO)
+                weights[modality] = weight
+                store(state, place, select(taken, after, -absolute(before)))
                 gain = weight * along[modality]
-                rest_after = rest - gain
-                v_log_alpha = gain - rest_after * (alpha / (_ONE - alpha))
-                v_log_alpha = select(taken & unclamped, v_log_alpha, _ZERO)
-                weights[modality] = select(taken, weight, _ZERO)
-                after = select(taken, after, before)
-                store(state, place, select(finished, -absolute(after), after))
-                store(state, place + LANES, select(taken, rest_after, rest))
+                rest = rest - gain
+                store(state, place + LANES, rest)
+                v_log_alpha = select(free & taken, gain - rest * (alpha / (_ONE - alpha)), _ZERO)
                 moments[5 + modality] = moments[5 + modality] + v_log_alpha
                 gradient = gradient + v_log_alpha
                 if has_absgrad(layout):
@@ -316,16 +328,14 @@ def _composite_tile_backward(
             moments[4] = moments[4] + g2 * u2
             for channel in range(channels(layout)):
                 k = 5 + modalities(layout) + channel
-                moments[k] = moments[k] + weights[modality_of(layout, channel)] * load(
-                    v_pixels, (pixels + channel) * LANES
-                )
-        for k in range(moment_count(layout)):
-            slots[slot, k] = total(moments[k])
+                v_pixel = load(v_pixels, (v_block + channel) * LANES)
+                moments[k] = moments[k] + weights[modality_of(layout, channel)] * v_pixel
+        _store_moments(layout, moments, slots, np.int64(instances[instance, 1]) * slots.shape[1])
 
 
 @kernel
 def composite_backward(
-    layout, workers, width, height, records, instances, tile_starts, tile_ends, transmittances, image, ticket,
+    layout, workers, width, height, records, instances, tile_starts, tile_ends, transmittances, image, pixels, ticket,
     v_features, v_alpha, v_depth, v_pixels, state, slots, v_backgrounds,
 ):  # fmt: skip
     """Leaves the moments of every instance in its gradient slot, and the background's gradient tile by tile.
@@ -356,6 +366,7 @@ def composite_backward(
                 instances,
                 tile_starts[tile],
                 tile_ends[tile],
+                pixels,
                 v_pixels,
                 worker,
                 state,

@@ -24,7 +24,6 @@ import numpy as np
 from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel
-from heatsplat.kernels.layout import channels, has_absgrad, modalities, moment_count
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -388,9 +387,9 @@ def _project_block_backward(
 
 @kernel
 def project_backward(
-    layout, means, quats, scales, opacities, camera, antialiased, depth_channel,
-    visible, visible_counts, ranges, slots, rows_are_ranks, first_ranks,
-    v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, absgrad, v_cameras, sums, lanes,
+    means, quats, scales, opacities, camera, antialiased, has_depth, visible, visible_counts, ranges, slots,
+    rows_are_ranks, first_ranks, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, absgrad, v_cameras,
+    sums, lanes,
 ):  # fmt: skip
     """Gradients of the Gaussians from the moments that ``compositing.composite_backward`` left in their slots.
 
@@ -399,16 +398,17 @@ def project_backward(
 
     Args:
         ranges: [N, 2], first slot of each visible Gaussian and the one after its last.
-        slots: [slots, slot_size].
+        slots: [slots, moments], see ``compositing.composite_backward``.
         rows_are_ranks, first_ranks: see ``binning.find_instances``.
-        v_means ... absgrad: out, all rows are written.
+        v_means ... v_means2d: out, all rows are written.
+        absgrad: out [N, 2], or [0, 0] where it is not wanted.
         v_cameras: out, added to: [chunks, 12], or [chunks, 0] where it is not wanted.
-        sums, lanes: scratch [chunks, slot_size] and [chunks, 7, LANES].
+        sums, lanes: scratch [chunks, moments in whole vectors] and [chunks, 7, LANES].
     """
     count = means.shape[0]
-    colours = v_features.shape[1]
-    opacity_sums, feature_sums = 5, 5 + modalities(layout)
-    absolute_sums = feature_sums + channels(layout)
+    moments, modalities, colours = slots.shape[1], opacities.shape[0], v_features.shape[1]
+    opacity_sums, feature_sums = 5, 5 + modalities
+    absolute_sums = feature_sums + colours + has_depth
     for chunk in prange(visible_counts.shape[0]):
         begin = chunk * CHUNK
         position, end = begin, begin + visible_counts[chunk]
@@ -416,26 +416,25 @@ def project_backward(
             for field in range(7):
                 store(lanes, (chunk * 7 + field) * LANES, splat(_ZERO))
             for gaussian in range(block, min(block + LANES, count)):
-                for modality in range(modalities(layout)):
+                for modality in range(modalities):
                     v_opacities[modality, gaussian] = _ZERO
                 for channel in range(0 if rows_are_ranks else colours):
                     v_features[gaussian, channel] = _ZERO
-                if has_absgrad(layout):
-                    absgrad[gaussian, 0] = _ZERO
-                    absgrad[gaussian, 1] = _ZERO
+                for axis in range(absgrad.shape[1]):
+                    absgrad[gaussian, axis] = _ZERO
             seen = 0
             while position < end and visible[position] < block + LANES:
                 gaussian = np.int64(visible[position])
                 lane = gaussian - block
                 seen |= 1 << lane
-                for field in range(moment_count(layout)):
-                    sums[chunk, field] = _ZERO
-                for slot in range(ranges[gaussian, 0], ranges[gaussian, 1]):
-                    for field in range(moment_count(layout)):
-                        sums[chunk, field] += slots[slot, field]
+                for field in range(0, moments, LANES):
+                    summed = splat(_ZERO)
+                    for slot in range(ranges[gaussian, 0], ranges[gaussian, 1]):
+                        summed = summed + load(slots, slot * moments + field)
+                    store(sums, chunk * sums.shape[1] + field, summed)
                 for field in range(5):
                     lanes[chunk, field, lane] = sums[chunk, field]
-                for modality in range(modalities(layout)):
+                for modality in range(modalities):
                     v_log_opacity = sums[chunk, opacity_sums + modality]
                     opacity = opacities[modality, gaussian]
                     lanes[chunk, 5, lane] += v_log_opacity
@@ -443,11 +442,10 @@ def project_backward(
                 row = first_ranks[chunk] + position - begin if rows_are_ranks else gaussian
                 for channel in range(colours):
                     v_features[row, channel] = sums[chunk, feature_sums + channel]
-                if depth_channel:
+                if has_depth:
                     lanes[chunk, 6, lane] = sums[chunk, feature_sums + colours]
-                if has_absgrad(layout):
-                    absgrad[gaussian, 0] = sums[chunk, absolute_sums] * TWO_LN_2
-                    absgrad[gaussian, 1] = sums[chunk, absolute_sums + 1] * TWO_LN_2
+                for axis in range(absgrad.shape[1]):
+                    absgrad[gaussian, axis] = sums[chunk, absolute_sums + axis] * TWO_LN_2
                 position += 1
             _project_block_backward(
                 block, mask_of(seen), lanes, chunk * 7, means, quats, scales, camera, antialiased,

@@ -367,6 +367,32 @@ def store(typing_context, array, offset, value):
 
 
 @intrinsic
+def store_scalar(typing_context, array, offset, value):
+    """Writes one element of a contiguous float32 array, by its place in flat order."""
+
+    def generate(context, builder, signature, values):
+        data = context.make_array(array)(context, builder, values[0]).data
+        offset = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
+        builder.store(values[2], builder.gep(data, [offset]))
+        return context.get_dummy_value()
+
+    return types.void(array, offset, value), generate
+
+
+@intrinsic
+def store_first(typing_context, array, offset, value, count):
+    """Writes the first ``count`` lanes of a vector, from ``offset`` of the array's flat order."""
+
+    def generate(context, builder, signature, values):
+        pointer = _pointer(context, builder, array, values[0], values[1], signature.args[1], LANES)
+        mask = _rows_mask(builder, context, values[3], signature.args[3], 1)
+        _llvm(builder, "llvm.masked.store.v16f32.p0", ir.VoidType(), values[2], pointer, _ALIGN_4, mask)
+        return context.get_dummy_value()
+
+    return types.void(array, offset, value, count), generate
+
+
+@intrinsic
 def load_scalar(typing_context, array, offset):
     """Element ``offset`` of a contiguous array in its flat order, without wrap-around of negative indices."""
     if not isinstance(array, types.Array) or array.layout != "C":
@@ -539,6 +565,39 @@ def _set_register(context, builder, signature, values):
     return context.get_dummy_value()
 
 
+@intrinsic
+def totals(typing_context, vectors):
+    """The sums over lanes of up to sixteen ``registers``: sum k in lane k of one vector, undefined in other lanes.
+
+    Vectors are folded two into one, each to half the lanes, so a sum costs little more than one addition.
+    """
+    if not isinstance(vectors, RegistersType) or vectors.count > LANES:
+        return None
+
+    def generate(context, builder, signature, values):
+        loaded = builder.load(values[0])
+        folded = [builder.extract_value(loaded, k) for k in range(vectors.count)]
+        width = LANES  # lanes that hold the parts of one sum
+        while width > 1:
+            starts = range(0, folded[0].type.count * min(len(folded), 2), width)
+            width //= 2
+            low = [start + k for start in starts for k in range(width)]
+            low, high = (_constant([k + shift for k in low], _i32) for shift in (0, width))
+            pairs = zip(folded[::2], [*folded[1::2], folded[-1]], strict=False)
+            folded = [
+                builder.fadd(builder.shuffle_vector(a, b, low), builder.shuffle_vector(a, b, high)) for a, b in pairs
+            ]
+        return _padded(builder, folded[0])
+
+    return float32x16(vectors), generate
+
+
+def _padded(builder, vector):
+    """A shorter vector with undefined lanes up to sixteen."""
+    count = vector.type.count
+    return builder.shuffle_vector(vector, vector, _constant([k % count for k in range(LANES)], _i32))
+
+
 # ---- scalar bit tricks ----
 
 
@@ -561,15 +620,15 @@ _SQRT_HALF_BITS = np.int32(0x3F3504F3)
 
 @inline
 def exp2(x):
-    """2 to the power of x, relative error below 2e-7 for -126 <= x < 128; below -126 it gives 2^-126."""
-    x = maximum(x, np.float32(-126.0))
+    """2 to the power of x, relative error below 2e-7, for -126 <= x < 128; anything at all for other x."""
     shifted = x + _ROUND
     x = x - (shifted - _ROUND)
-    power = x * np.float32(1.32647e-3) + np.float32(9.67151e-3)  # minimax on [-1/2, 1/2] with 2^0 = 1: 9.2e-8
-    power = power * x + np.float32(5.550734e-2)
-    power = power * x + np.float32(2.4022242e-1)
-    power = power * x + np.float32(6.9314698e-1)
-    power = power * x + np.float32(1.0)
+    # Minimax on [-1/2, 1/2] with 2^0 = 1: 9.2e-8. Pairs instead of Horner's rule: a third of the latency.
+    square = x * x
+    low = x * np.float32(6.9314698e-1) + np.float32(1.0)
+    middle = x * np.float32(5.550734e-2) + np.float32(2.4022242e-1)
+    high = x * np.float32(1.32647e-3) + np.float32(9.67151e-3)
+    power = (high * square + middle) * square + low
     return floats_of_bits(bits_of_floats(power) + (bits_of_floats(shifted) << 23))
 
 

@@ -161,7 +161,7 @@ class _Frame:
         self.slots = int(self.bounds.sum())
         tiles, masks = array("instance_tiles", np.int32, self.slots), array("instance_masks", np.int32, self.slots)
         binning.find_instances(
-            self.layout, self.geometry, self.rectangles, self.width, self.height, self.visible, self.visible_counts,
+            self.geometry, self.rectangles, self.width, self.height, self.visible, self.visible_counts,
             first_slots, _numpy(features), callable(inputs.features), self.first_ranks, _numpy(inputs.opacities),
             self.depths, inputs.depth, self.records, tiles, masks, self.ranges,
         )  # fmt: skip
@@ -190,10 +190,17 @@ class _Frame:
         self.composited = array("composited", np.float32, blocks, layout.channels, LANES)
         compositing.composite(
             layout, self.workers, self.width, self.height, self.records, self.instances, self.tile_starts,
-            _numpy(background), np.zeros(1, np.int64), self.tile_ends, self.transmittances, self.composited,
+            _numpy(background), self._pixels(), np.zeros(1, np.int64), self.tile_ends, self.transmittances, self.composited,
             image.numpy(), alpha.numpy(), _NO_DEPTH if depth is None else depth.numpy(),
         )  # fmt: skip
         return image, alpha, depth
+
+    def _pixels(self):
+        pixels = self.buffers.array("pixels", np.float32, 2, 16, LANES)
+        k, b = np.arange(16), np.arange(16)[:, None]
+        pixels[0] = b % 4 * 4 + k % 4 + 0.5
+        pixels[1] = b // 4 * 4 + k // 4 + 0.5
+        return pixels
 
     def composite_backward(self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None) -> Tensor:
         """The gradient of the background [C]. Leaves what the Gaussians need in their gradient slots."""
@@ -203,7 +210,7 @@ class _Frame:
         self.moments = array("moments", np.float32, self.slots, layout.slot)
         compositing.composite_backward(
             layout, self.workers, self.width, self.height, self.records, self.instances, self.tile_starts,
-            self.tile_ends, self.transmittances, self.composited, np.zeros(1, np.int64),
+            self.tile_ends, self.transmittances, self.composited, self._pixels(), np.zeros(1, np.int64),
             _numpy(v_image), _numpy(v_alpha), _NO_DEPTH if v_depth is None else _numpy(v_depth),
             array("v_pixels", np.float32, rows, layout.channels + layout.modalities, LANES),
             array("state", np.float32, rows, layout.modalities, 2, LANES), self.moments, v_background,
@@ -225,12 +232,12 @@ class _Frame:
         v_camera = np.zeros((self.chunks, 12 if camera else 0))
         array = self.buffers.array
         projection.project_backward(
-            layout, _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera,
+            _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera,
             inputs.antialiased, inputs.depth, self.visible, self.visible_counts, self.ranges, self.moments,
             callable(inputs.features), self.first_ranks, v["means"].numpy(), v["quats"].numpy(), v["scales"].numpy(),
             v["opacities"].numpy(), v["features"].numpy(), v["means2d"].numpy(),
             v["absgrad"].numpy() if inputs.absgrad else _NO_DEPTH, v_camera,
-            array("sums", np.float32, self.chunks, layout.slot), array("lanes", np.float32, self.chunks, 7, LANES),
+            array("sums", np.float32, self.chunks, -(-layout.slot // LANES) * LANES), array("lanes", np.float32, self.chunks, 7, LANES),
         )  # fmt: skip
         v["viewmat"] = _viewmat_gradient(v_camera) if camera else None
         return v
