@@ -11,9 +11,15 @@ from heatsplat.contracts import Frame, SceneData
 
 
 class SensorPart(nn.Module, ABC):
-    """One effect of a camera. One part is one file with one subclass and one entry in a list in conf/sensor/."""
+    """One effect of a camera. One part is one file with one subclass and one entry in a list in conf/sensor/.
+
+    Attributes:
+        lr: learning rate of its parameters.
+        lr_end: factor on it at the last step of the run, log-linear in between.
+    """
 
     lr: float = 1e-3
+    lr_end: float = 1.0
 
     def prepare(self, scene: SceneData) -> None:
         """Takes sizes (number of frames, image shape) from the scene. Called once, before training."""
@@ -32,12 +38,12 @@ class SensorChain(nn.Module):
     """Parts in the order in which light meets them. An empty chain is absent: it returns the very tensor it was given.
 
     Args:
-        parts: name -> part.
+        parts: name -> part, or None for a part that is absent.
     """
 
-    def __init__(self, parts: Mapping[str, SensorPart] | None = None) -> None:
+    def __init__(self, parts: Mapping[str, SensorPart | None] | None = None) -> None:
         super().__init__()
-        self.parts = nn.ModuleDict(parts or {})
+        self.parts = nn.ModuleDict({name: part for name, part in (parts or {}).items() if part is not None})
 
     def prepare(self, scene: SceneData) -> None:
         for part in self.parts.values():

@@ -1,0 +1,71 @@
+"""Automatic gain control: a camera that stretches the contrast of every image as it likes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import Frame, SceneData
+from heatsplat.sensors.base import SensorPart
+
+EPSILON = 1e-4  # images are kept this far from 0 and 1 under the logit, which bounds its slope by 1e4
+
+
+class GainControl(SensorPart):
+    """sigmoid(s logit(I) + t) with one s and t per training image: a monotone stretch of contrast (SupIR-GS, Eq. 5).
+
+    A stretch common to all images belongs to the scene: log s and t have mean zero over the training images. An image
+    that was not trained on has no s and t of its own and is left as it is.
+
+    It is computed as I + [sigmoid(s logit(Ĩ) + t) - sigmoid(logit(Ĩ))], Ĩ being I clipped to [ε, 1 - ε]. That is the
+    same where nothing is clipped, exactly I for s = 1 and t = 0, and keeps a gradient where something is.
+
+    Args:
+        stretch_max: bound of s and 1/s before the mean is taken away; larger than 1.
+        shift_max: bound of |t| before the mean is taken away.
+        weight: of the penalty mean of (s - 1)² + t².
+        lr, lr_end: learning rate and the factor on it at the end of the run.
+    """
+
+    def __init__(
+        self,
+        stretch_max: float = 2.0,
+        shift_max: float = 1.0,
+        weight: float = 5e-4,
+        lr: float = 1e-3,
+        lr_end: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if stretch_max <= 1 or shift_max < 0:
+            raise ValueError(
+                f"stretch_max must be above 1 and shift_max not negative, got {stretch_max} and {shift_max}"
+            )
+        self.weight, self.lr, self.lr_end = weight, lr, lr_end
+        self.register_buffer("bounds", torch.tensor([math.log(stretch_max), shift_max]))
+        self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))
+        self.raw = nn.Parameter(torch.zeros(0, 2))
+
+    def prepare(self, scene: SceneData) -> None:
+        self.frame_ids = torch.tensor(sorted({frame.frame_id for frame in scene.train.frames}))
+        self.raw = nn.Parameter(torch.zeros(len(self.frame_ids), 2))
+
+    def forward(self, image: Tensor, frame: Frame) -> Tensor:
+        row = (self.frame_ids == frame.frame_id).nonzero().flatten()
+        if len(row) == 0:
+            return image
+        log_stretch, shift = self.settings()[row[0]]
+        logits = torch.logit(image.clamp(EPSILON, 1 - EPSILON))
+        return image + (torch.sigmoid(log_stretch.exp() * logits + shift) - torch.sigmoid(logits))
+
+    def settings(self) -> Tensor:
+        """log s and t of the training images in order of their ids, [F, 2], each with mean zero."""
+        values = self.bounds * self.raw.tanh()
+        return values - values.mean(0)
+
+    def regulariser(self) -> Tensor | None:
+        if self.weight == 0:
+            return None
+        log_stretch, shift = self.settings().unbind(1)
+        return self.weight * (log_stretch.expm1().square() + shift.square()).mean()

@@ -1,0 +1,110 @@
+"""What a microbolometer adds to every image alike: uneven gain and offset of its pixels, and the lens's falloff."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import Frame, SceneData
+from heatsplat.geometry.resampling import resampled
+from heatsplat.sensors.base import SensorPart
+
+
+class Calibration(SensorPart):
+    """[I (1 + G) + B] V of an image I, with fields that belong to the sensor and not to the scene (SupIR-GS, Eq. 4, 6).
+
+    Gain G and bias B are grids of a few nodes, bounded by tanh and interpolated bilinearly over the image, so the same
+    field serves every resolution. V = exp(a2 r² + a4 r⁴) with r = 1 in the corners is vignetting.
+
+    A level that gain and emission share, or bias and emission, is nobody's: the mean of both grids is taken away, and
+    from the gain also what r² and r⁴ can say, which is left to V. V is 1 in the middle of the image.
+
+    Args:
+        grid: nodes along each side.
+        gain_max, bias_max: bounds of the nodes of G (a factor) and B (image units) before their means are taken away.
+        vignetting_max: bound of |a2| and |a4| each; 0 leaves vignetting out.
+        weight: of the penalty mean G² + mean B² + total variation of both + a2² + a4².
+        lr, lr_end: learning rate and the factor on it at the end of the run.
+    """
+
+    def __init__(
+        self,
+        grid: int = 16,
+        gain_max: float = 0.1,
+        bias_max: float = 0.05,
+        vignetting_max: float = 0.5,
+        weight: float = 5e-4,
+        lr: float = 1e-3,
+        lr_end: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if grid < 2:
+            raise ValueError(f"a calibration grid needs 2 nodes along each side or more, got {grid}")
+        if min(gain_max, bias_max, vignetting_max) < 0:
+            raise ValueError(f"bounds must not be negative, got {gain_max}, {bias_max}, {vignetting_max}")
+        self.gain_max, self.bias_max, self.vignetting_max = gain_max, bias_max, vignetting_max
+        self.weight, self.lr, self.lr_end = weight, lr, lr_end
+        self.raw_gain = nn.Parameter(torch.zeros(grid, grid))
+        self.raw_bias = nn.Parameter(torch.zeros(grid, grid))
+        self.raw_falloff = nn.Parameter(torch.zeros(2)) if vignetting_max > 0 else None
+        self.register_buffer("shared", torch.full((grid * grid, 1), 1.0 / grid))  # orthonormal columns
+
+    def prepare(self, scene: SceneData) -> None:
+        camera = scene.train.frames[0].camera
+        r2 = radius_squared(len(self.raw_gain), len(self.raw_gain), camera.width / camera.height).flatten()
+        powers = (0, 1, 2) if self.raw_falloff is not None else (0,)
+        self.shared = torch.linalg.qr(torch.stack([r2**power for power in powers], 1))[0].float()
+
+    def forward(self, image: Tensor, frame: Frame) -> Tensor:
+        height, width = image.shape[:2]
+        gain, bias = resampled(torch.stack(self.nodes(), 2), height, width, "bilinear").split(1, dim=2)
+        calibrated = image * (1.0 + gain) + bias
+        return calibrated if self.raw_falloff is None else calibrated * self.vignetting(height, width)
+
+    def nodes(self) -> tuple[Tensor, Tensor]:
+        """Gain and bias at the nodes of the grid, [grid, grid] each, with what they share with others taken away."""
+        gain = self.gain_max * self.raw_gain.tanh()
+        bias = self.bias_max * self.raw_bias.tanh()
+        level = self.shared @ (self.shared.T @ gain.flatten())
+        return gain - level.reshape_as(gain), bias - bias.mean()
+
+    def vignetting(self, height: int, width: int) -> Tensor:
+        """V on a grid of pixels, [height, width, 1]; 1 in the middle, all 1 without vignetting."""
+        r2 = radius_squared(height, width).to(self.raw_gain)[..., None]
+        if self.raw_falloff is None:
+            return torch.ones_like(r2)
+        a2, a4 = self.coefficients()
+        return torch.exp((a2 + a4 * r2) * r2)
+
+    def coefficients(self) -> Tensor:
+        """a2 and a4 of the vignetting, [2]; empty without."""
+        if self.raw_falloff is None:
+            return self.raw_gain.new_zeros(0)
+        return self.vignetting_max * self.raw_falloff.tanh()
+
+    def regulariser(self) -> Tensor | None:
+        if self.weight == 0:
+            return None
+        penalty = self.coefficients().square().sum()
+        for field in self.nodes():
+            variation = field.diff(dim=0).abs().mean() + field.diff(dim=1).abs().mean()
+            penalty = penalty + field.square().mean() + variation
+        return self.weight * penalty
+
+
+@lru_cache(maxsize=16)
+def radius_squared(height: int, width: int, aspect: float | None = None) -> Tensor:
+    """r² of the pixels of an image, [height, width] float64: 0 in its middle, 1 in its corners.
+
+    Args:
+        height, width: of the grid.
+        aspect: width over height of the area that the grid covers; by default that of the grid (square pixels).
+    """
+    aspect = width / height if aspect is None else aspect
+    diagonal = math.hypot(aspect, 1.0)
+    y = ((torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1) / diagonal
+    x = ((torch.arange(width, dtype=torch.float64) + 0.5) / width * 2 - 1) * aspect / diagonal
+    return y[:, None] ** 2 + x**2

@@ -1,0 +1,85 @@
+"""A tone curve that the data choose: small, smooth corrections of brightness that depend on brightness alone."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from heatsplat.contracts import Frame
+from heatsplat.sensors.base import SensorPart
+
+LEVELS = 256  # the curve between 0 and 1 is kept at this many brightnesses
+
+
+class Tone(SensorPart):
+    """I (1 + m tanh δ_m) + o tanh δ_o with δ_m, δ_o a network's answer to the mean of the channels (SupIR-GS, Eq. 7-8).
+
+    The network sees one number per pixel, so it is a curve. It is evaluated at 256 levels with straight lines between,
+    which stays within a quarter of an 8-bit step of asking it at every pixel and costs a thousandth. Brightness beyond
+    [0, 1] is corrected like its end.
+
+    The start is fixed, without a draw: bends evenly over [0, 1] in the first layer, an orthogonal mixture of them in
+    the second, zero in the last.
+
+    Args:
+        width: units of each of the two hidden layers.
+        gain_max, offset_max: m and o, the largest change as a factor and in image units.
+        weight: of the penalty mean of δ_m² + δ_o² over the levels.
+        exact: asks the network at every pixel (the paper); slow.
+        lr, lr_end: learning rate and the factor on it at the end of the run.
+    """
+
+    def __init__(
+        self,
+        width: int = 64,
+        gain_max: float = 0.08,
+        offset_max: float = 0.04,
+        weight: float = 1e-3,
+        exact: bool = False,
+        lr: float = 1e-3,
+        lr_end: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if width < 2 or min(gain_max, offset_max) < 0:
+            raise ValueError(f"tone needs width >= 2 and bounds >= 0, got {width}, {gain_max}, {offset_max}")
+        self.weight, self.exact, self.lr, self.lr_end = weight, exact, lr, lr_end
+        first, second, last = nn.Linear(1, width), nn.Linear(width, width), nn.Linear(width, 2)
+        self.network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
+        with torch.no_grad():
+            bends = (torch.arange(width) + 0.5) / width
+            side = 1.0 - 2.0 * (torch.arange(width) % 2)  # every other unit is active below its bend
+            first.weight.copy_(2.0 * side[:, None])
+            first.bias.copy_(-2.0 * side * bends)
+            row, column = torch.arange(width)[:, None], torch.arange(width)
+            mixture = torch.cos(math.pi / width * (column + 0.5) * row) * math.sqrt(2.0 / width)
+            mixture[0] /= math.sqrt(2.0)
+            second.weight.copy_(math.sqrt(2.0) * mixture)
+            for parameter in (second.bias, last.weight, last.bias):
+                parameter.zero_()
+        self.register_buffer("bounds", torch.tensor([gain_max, offset_max]))
+        self.register_buffer("levels", torch.linspace(0.0, 1.0, LEVELS)[:, None])
+
+    def forward(self, image: Tensor, frame: Frame) -> Tensor:
+        brightness = image.mean(2)
+        if self.exact:
+            change = self.bounds * self.network(brightness.clamp(0, 1)[..., None]).tanh()
+        else:
+            change = _interpolated(self.bounds * self.network(self.levels).tanh(), brightness)
+        return image * (1.0 + change[..., :1]) + change[..., 1:]
+
+    def regulariser(self) -> Tensor | None:
+        if self.weight == 0:
+            return None
+        return self.weight * self.network(self.levels).square().sum(1).mean()
+
+
+def _interpolated(curve: Tensor, brightness: Tensor) -> Tensor:
+    """The curve [L, 2] over [0, 1] at brightness [H, W], [H, W, 2], linear between levels."""
+    where = torch.stack((2.0 * brightness - 1.0, torch.zeros_like(brightness)), 2)
+    found = functional.grid_sample(
+        curve.T[None, :, None], where[None], mode="bilinear", padding_mode="border", align_corners=True
+    )
+    return found[0].permute(1, 2, 0)
