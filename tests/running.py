@@ -33,9 +33,8 @@ def run(output_dir: Path, *overrides: str):
     config = compose_run(output_dir, *overrides)
     plain = OmegaConf.to_container(config, resolve=True)
     prepare_machine(plain["threads"])
-    callbacks = {name: item for name, item in plain["callbacks"].items() if item is not None}
     trainer = cli.build(
-        plain["trainer"], callbacks=list(cli.build(callbacks).values()), logger=cli.build(plain["logger"])
+        plain["trainer"], callbacks=cli.build_callbacks(plain["callbacks"]), logger=cli.build(plain["logger"])
     )
     module = cli.build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain

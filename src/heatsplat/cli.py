@@ -51,6 +51,11 @@ OmegaConf.register_new_resolver("steps", _steps, replace=True)
 OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
 
 
+def build_callbacks(plain: dict[str, Any]) -> list[Any]:
+    """The callbacks that are on; ``callbacks.<name>=null`` leaves one out."""
+    return list(build({name: settings for name, settings in plain.items() if settings is not None}).values())
+
+
 def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
     """Runs ``work(config, output_dir)`` so that a failure leaves a FAILED file and a readable message.
 
@@ -101,7 +106,7 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     if plain["data"].get("root") is not None:
         plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
-    trainer = build(plain["trainer"], callbacks=list(build(plain["callbacks"]).values()), logger=build(plain["logger"]))
+    trainer = build(plain["trainer"], callbacks=build_callbacks(plain["callbacks"]), logger=build(plain["logger"]))
     module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain  # set, not passed: Hydra would build every part in it once more
     results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
@@ -116,11 +121,11 @@ def evaluate(config: DictConfig, output_dir: Path) -> float | None:
 
     prepare_machine(config.threads)
     module, data, stored = _restored(config, output_dir)
-    callbacks = build(OmegaConf.to_container(config.callbacks, resolve=True))
+    plain = OmegaConf.to_container(config, resolve=True)
     trainer = build(
-        stored["trainer"] | {"accelerator": config.accelerator},
-        callbacks=list(callbacks.values()),
-        logger=build(OmegaConf.to_container(config.logger, resolve=True)),
+        stored["trainer"] | {"accelerator": plain["accelerator"]},
+        callbacks=build_callbacks(plain["callbacks"]),
+        logger=build(plain["logger"]),
     )
     restore(module, data, stored["checkpoint"])
     trainer.test(module, datamodule=data, verbose=False)

@@ -1,4 +1,4 @@
-"""conf/callbacks/default.yaml: every entry can be built, says what its settings are, and stands in its place."""
+"""conf/callbacks: every entry can be built, says what its settings are, and stands in its place."""
 
 import inspect
 import re
@@ -10,8 +10,12 @@ import torch
 import yaml
 from fake_run import FakeModule, fit, trainer, wall
 
-FILE = Path(__file__).resolve().parents[2] / "conf" / "callbacks" / "default.yaml"
-ENTRIES = yaml.safe_load(FILE.read_text())
+FILES = [
+    Path(__file__).resolve().parents[2] / "conf" / "callbacks" / name for name in ("evaluate.yaml", "default.yaml")
+]
+ENTRIES = {
+    name: entry for file in FILES for name, entry in yaml.safe_load(file.read_text()).items() if name != "defaults"
+}
 
 
 def build(name, **changes):
@@ -31,16 +35,19 @@ def test_every_setting_is_one_that_exists(name):
         assert all(settings[key] == accepted[key].default for key in settings), "file and code have the same defaults"
 
 
-def test_every_key_has_a_comment():
-    for line in FILE.read_text().splitlines():
-        if re.match(r"\s*\w+:", line) and "_target_" not in line:
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_every_key_has_a_comment(file):
+    for line in file.read_text().splitlines():
+        if re.match(r"\s*\w+:", line) and "_target_" not in line and line != "defaults:":
             assert "  # " in line, line
 
 
-def test_order():
-    names = list(ENTRIES)
-    assert names[0] == "costs" and names[-1] == "report"
-    assert names.index("metrics") < names.index("report")
+def test_an_evaluation_has_the_measuring_part():
+    evaluate, default = (yaml.safe_load(file.read_text()) for file in FILES)
+    assert list(evaluate) == ["costs", "metrics", "images", "probes", "report"]  # costs first: its clock stops first
+    assert default["defaults"] == ["evaluate", "_self_"]
+    assert not set(evaluate) & set(default)
+    assert "${" not in FILES[0].read_text()  # needs nothing of a training's configuration
 
 
 @pytest.mark.parametrize("steps", [8, 9])

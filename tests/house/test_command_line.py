@@ -1,0 +1,115 @@
+"""The commands as a user types them, in processes of their own, from another working directory."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = ("data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1")
+
+
+def command(script: str, *overrides: str, cwd: Path, code: int = 0) -> str:
+    """What ``python src/<script>.py`` prints; checks its exit code."""
+    environment = {**os.environ, "COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "src" / f"{script}.py"), *overrides],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """Folder of a finished tiny run, trained from another working directory."""
+    folder = tmp_path_factory.mktemp("cli")
+    output = command("train", "method=etgs", *TINY, f"hydra.run.dir={folder}/run", cwd=folder)
+    assert "psnr" in output and "train_seconds" in output and ".png" in output
+    return folder / "run"
+
+
+def test_a_run_leaves_what_it_promises(finished):
+    for name in (
+        ".hydra/config.yaml",
+        "tb",
+        "checkpoints/last.ckpt",
+        "renders",
+        "metrics.json",
+        "report.md",
+        "run.log",
+    ):
+        assert (finished / name).exists(), name
+    assert sorted(path.name for path in (finished / "checkpoints").glob("step_*.ckpt"))
+    assert not (finished / "FAILED").exists()
+    found = json.loads((finished / "metrics.json").read_text())
+    assert set(found) >= {"test", "cost", "effects", "data", "versions"}
+    assert set(found["cost"]) >= {"train_seconds", "steps_per_second", "render_fps", "peak_memory_mb", "gaussians"}
+    report = (finished / "report.md").read_text()
+    for link in (part.split(")")[0] for part in report.split("](")[1:]):
+        assert (finished / link).exists(), f"report.md points to {link}"
+
+
+def test_a_finished_run_is_skipped(finished):
+    before = (finished / "metrics.json").read_text()
+    assert "has results already" in command("train", "method=etgs", *TINY, f"hydra.run.dir={finished}", cwd=finished)
+    assert (finished / "metrics.json").read_text() == before
+
+
+def test_evaluate_needs_the_checkpoint_only_and_agrees_with_training(finished):
+    command("evaluate", f"ckpt={finished}/checkpoints/last.ckpt", cwd=finished.parent)
+    (again,) = finished.glob("evaluations/*/metrics.json")
+    first, second = (json.loads(path.read_text())["test"] for path in (finished / "metrics.json", again))
+    assert first["psnr"] == second["psnr"] and first["mae_c"] == second["mae_c"]
+
+
+def test_render_writes_temperatures_pictures_and_a_video(finished):
+    output = command(
+        "render", f"ckpt={finished}/checkpoints/last.ckpt", "trajectory=orbit", "time=600", "frames=3",
+        cwd=finished.parent,
+    )  # fmt: skip
+    assert "3 frames" in output
+    (folder,) = finished.glob("views/orbit_*")
+    tiffs, pngs = sorted(folder.glob("tiff/*.tiff")), sorted(folder.glob("png/*.png"))
+    assert len(tiffs) == len(pngs) == 3
+    celsius = cv2.imread(str(tiffs[0]), cv2.IMREAD_UNCHANGED)
+    assert celsius.dtype == "float32" and 10 < celsius.mean() < 80
+    assert (folder / "video.mp4").stat().st_size > 1000
+
+
+def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path):
+    output = command(
+        "train", "-m", "method=3dgs", "seed=0,1", "init.opacity=0.1,2.0", *TINY, "test=false",
+        f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, code=1,
+    )  # fmt: skip
+    assert "init.opacity must lie in (0, 1)" in output
+    jobs = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    failed = [path for path in jobs if (path / "FAILED").exists()]
+    assert len(jobs) == 4 and len(failed) == 2
+    assert all("opacity" in (path / "FAILED").read_text() for path in failed)
+    assert all((path / "checkpoints" / "last.ckpt").exists() for path in jobs if path not in failed)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), "method"),
+        (("method=etgs", "max_stepz=10"), "max_stepz"),
+        (("method=etgs", "data=rhd"), "data.root"),
+        (("method=etgs", "data=rhd", "data.root=/nowhere/at/all"), "/nowhere/at/all"),
+        (("method=3dgs", "ckpt=/nowhere/last.ckpt"), "no checkpoint at /nowhere/last.ckpt"),
+        (("method=3dgs", "data.split=every_9th"), "every_9th"),
+    ],
+)
+def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path):
+    output = command("train", *overrides, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
+    assert message in output
+
+
+def test_help_lists_the_choices(tmp_path):
+    output = command("train", "--help", cwd=tmp_path)
+    assert "etgs" in output and "colmap" in output

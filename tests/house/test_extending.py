@@ -1,0 +1,73 @@
+"""docs/extending.md, followed literally in a copy of the repository."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "docs" / "extending.md").read_text()
+FILES = re.findall(r"^`([\w./]+)`\n\n```\w+\n(.*?)^```", TEXT, re.M | re.S)
+COMMANDS = [line for block in re.findall(r"^```sh\n(.*?)^```", TEXT, re.M | re.S) for line in block.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A copy of the sources with the files of the page written into it."""
+    folder = tmp_path_factory.mktemp("extended")
+    for name in ("src", "conf", "datamodules"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("*.egg-info"))
+    for path, content in FILES:
+        (folder / path).write_text(content)
+    return folder
+
+
+def run(copy: Path, command: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *command.split()[1:], "data.size=tiny", f"hydra.run.dir={copy}/run"]
+        if "data=" not in command
+        else [sys.executable, *command.split()[1:], f"hydra.run.dir={copy}/run"],
+        cwd=copy, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    shutil.rmtree(copy / "run", ignore_errors=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_the_page_adds_a_model_a_sensor_part_and_a_data_set():
+    kinds = {path.rsplit("/", 1)[0] for path, _ in FILES}
+    assert kinds >= {"src/heatsplat/thermal", "src/heatsplat/sensors", "datamodules", "conf/thermal", "conf/data"}
+    assert not any((ROOT / path).exists() for path, _ in FILES), "the page must add files, not replace them"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_its_commands_run(command, copy):
+    assert "psnr" in run(copy, command)
+
+
+def test_its_data_set_loads(copy, tmp_path):
+    from datamodules.synthetic import Synthetic
+
+    scene = Synthetic(scene="cooling", size="tiny").scene
+    camera = scene.train.frames[0].camera
+    frames = sorted(
+        (frame.time_s, views[i]) for views in (scene.train, scene.test) for i, frame in enumerate(views.frames)
+    )
+    start = frames[0][0]
+    for time_s, view in frames:
+        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0]).numpy()
+        np.save(tmp_path / f"{time_s - start:09.3f}.npy", celsius)
+    np.savez(
+        tmp_path / "cameras.npz",
+        viewmats=np.stack([view.camera.viewmat.numpy() for _, view in frames]),
+        K=camera.K.numpy(),
+        points=scene.points.numpy(),
+    )
+    command = (
+        f"python src/train.py method=linear_drift data=npy_folder data.root={tmp_path} debug=fast data.downscale=1"
+    )
+    assert "mae_c" in run(copy, command)
