@@ -76,12 +76,14 @@ class PerGaussian:
         l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled
             weight decay of 2 * l2 is exactly its gradient).
         l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them.
+        lr_end: factor on lr at the last step of the run, log-linear in between.
     """
 
     initial: Tensor
     lr: float
     l2: float = 0.0
     l2_mean: bool = False
+    lr_end: float = 1.0
 
 
 class ThermalModel(nn.Module, ABC):
@@ -91,14 +93,25 @@ class ThermalModel(nn.Module, ABC):
         needs: metadata the model cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
         modality: the image that it explains, "thermal" or "rgb"; this is what metrics score.
         companions: further images that it explains with the same Gaussians, such as ("rgb",).
-        modality_channels: channels of the image and of its companions, each with an opacity of its own, such as (1, 3);
-            their sum is the number of features.
+        modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
+            features.
+        shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
+        lr: learning rate of the model's own parameters (those that are not per Gaussian).
+        lr_end: factor on it at the last step of the run, log-linear in between.
     """
 
     needs: frozenset[str] = frozenset()
     modality: str = "thermal"
     companions: tuple[str, ...] = ()
     modality_channels: tuple[int, ...] = (1,)
+    shared_opacity: bool = False
+    lr: float = 1e-3
+    lr_end: float = 1.0
+
+    @property
+    def opacity_channels(self) -> tuple[int, ...]:
+        """Channels that each set of opacities composites: those of the renderer's modalities."""
+        return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels
 
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``."""
@@ -136,6 +149,10 @@ class ThermalModel(nn.Module, ABC):
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """Temperature of every Gaussian in kelvin at a time, [N]; None where the model has no temperature."""
         return None
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
+        return {}
 
     def effects(self) -> dict[str, dict]:
         """The physical effects that the model simulates: catalogue name -> settings (for metrics.json)."""

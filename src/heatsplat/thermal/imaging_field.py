@@ -94,7 +94,7 @@ class ImagingField(ThermalModel):
         self.time, self.gauge, self.lr, self.lr_end = time, gauge, lr, lr_end
         self.needs = emission.needs | (frozenset({"time"}) if time == "seconds" else frozenset())
         self.modality, self.companions = emission.modality, emission.companions
-        self.modality_channels = emission.modality_channels
+        self.modality_channels, self.shared_opacity = emission.modality_channels, emission.shared_opacity
         codes = 6 * position_frequencies
         inputs = [codes if i == 0 else width + codes if i == skip else width for i in range(depth)]
         self.layers = nn.ModuleList(nn.Linear(count, width) for count in inputs)
@@ -161,6 +161,9 @@ class ImagingField(ThermalModel):
             terms = terms | {"sensitivity_gauge": self.gauge * (self._sensitivity.mean() - 1.0).square()}
         self._sensitivity = None
         return terms
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        return self.emission.attributes(splats, query)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """That of the emission: what a sensor would see without anything in between."""

@@ -52,7 +52,7 @@ class Initialisation:
             "means": means,
             "log_scales": (0.5 * squared.log() + np.log(self.scale))[:, None].repeat(1, 3),
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-            "opacity_logits": logit.repeat(count, len(thermal.modality_channels)),
+            "opacity_logits": logit.repeat(count, len(thermal.opacity_channels)),
         }
         return Splats(tensors | {name: item.initial for name, item in declared.items()}), declared
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from heatsplat.thermal.base import PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.rng import generator_for
+from heatsplat.training.stages import Stages
 
 CHECKPOINT_KEY = "heatsplat"
 
@@ -30,8 +32,8 @@ class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir``, ``predict(frame)``, and ``recipe``, the resolved configuration as plain containers: it travels in
-    the checkpoint, so that a checkpoint and its data are enough to evaluate or render.
+    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, and ``recipe``, the resolved configuration as plain
+    containers: it travels in the checkpoint, so that a checkpoint and its data are enough to evaluate or render.
 
     Args:
         thermal: what splats emit.
@@ -41,6 +43,7 @@ class SplatTraining(pl.LightningModule):
         loss: what is minimised.
         init: how splats start.
         optim: learning rates and schedule.
+        stages: which parameters stand still at which steps, or None where all train throughout.
         seed: seed of every random draw.
         output_dir: folder of the run.
     """
@@ -54,13 +57,14 @@ class SplatTraining(pl.LightningModule):
         loss: Loss,
         init: Initialisation,
         optim: Optimisation,
+        stages: Stages | None = None,
         seed: int = 0,
         output_dir: Path | str = ".",
     ) -> None:
         super().__init__()
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
-        self.seed, self.output_dir = seed, Path(output_dir)
+        self.stages, self.seed, self.output_dir = stages, seed, Path(output_dir)
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
         self.results = RunResults()
@@ -100,49 +104,53 @@ class SplatTraining(pl.LightningModule):
     def configure_optimizers(self):
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
         groups += [
-            {"params": [self.splats[name]], "name": name, "lr": item.lr, "weight_decay": self._penalty(item)}
+            {
+                "params": [self.splats[name]],
+                "name": name,
+                "lr": item.lr,
+                "lr_end": item.lr_end,
+                "weight_decay": self._penalty(item),
+            }
             for name, item in self._declared.items()
         ]
         groups += [
-            {"params": [parameter], "name": f"thermal.{name}", "lr": self.thermal.lr}
+            {"params": [parameter], "name": f"thermal.{name}", "lr": self.thermal.lr, "lr_end": self.thermal.lr_end}
             for name, parameter in self.thermal.named_parameters()
         ]
         groups += [
-            {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr}
+            {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
             for name, part in self.sensor.parts.items()
             for inner, parameter in part.named_parameters()
         ]
         optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps)
+        if self.stages is not None:
+            self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     # One step ----------------------------------------------------------------------------------------
 
     def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
-        query = Query(None, frame.camera, frame.time_s, frame.environment, frame.frame_id)
-        moved = self.thermal.geometry(self.splats, query)
-        means, quats, scales = (
-            (self.splats.means, self.splats.quats, self.splats.scales)
-            if moved is None
-            else (moved.means, moved.quats, moved.scales)
-        )
 
         def emitted(ids: Tensor) -> Tensor:
-            visible = Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id)
-            return self.thermal.features(self.splats, visible).features
+            return self.thermal.features(self.splats, _query(frame, ids)).features
 
         return self.renderer(
-            means,
-            quats,
-            scales,
+            *self._geometry(frame),
             self.splats.opacities,
             emitted,
             frame.camera,
             self.background,
-            self.thermal.modality_channels,
+            self.thermal.opacity_channels,
             absgrad=absgrad,
             depth=depth,
         )
+
+    def _geometry(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, rotations and scales of all Gaussians at the time of ``frame``."""
+        moved = self.thermal.geometry(self.splats, _query(frame))
+        shown = self.splats if moved is None else moved
+        return shown.means, shown.quats, shown.scales
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
@@ -173,8 +181,10 @@ class SplatTraining(pl.LightningModule):
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
-        optimizer.step(closure=optimizer_closure)
-        cloud = Cloud(self.splats, getattr(optimizer, "optimizer", optimizer), self._density_state)
+        inner = getattr(optimizer, "optimizer", optimizer)
+        with nullcontext() if self.stages is None else self.stages.on_step(step, inner):
+            optimizer.step(closure=optimizer_closure)
+        cloud = Cloud(self.splats, inner, self._density_state)
         if self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density")) is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
@@ -199,6 +209,22 @@ class SplatTraining(pl.LightningModule):
         return {
             name: seen.clamp(0, 1) for name, seen in zip((self.modality, *self.thermal.companions), images, strict=True)
         }
+
+    @torch.no_grad()
+    def attribute_maps(self, frame: Frame) -> dict[str, Tensor]:
+        """Images [H, W] of what the thermal model tells of its Gaussians (``ThermalModel.attributes``), by name.
+
+        Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality; NaN where none
+        is seen. Empty for models that tell nothing.
+        """
+        told = self.thermal.attributes(self.splats, _query(frame))
+        if not told:
+            return {}
+        values, opacities = torch.stack(list(told.values()), dim=1), self.splats.opacities[:1]
+        output = self.renderer(*self._geometry(frame), opacities, values, frame.camera, None, (len(told),))
+        alpha = output.alpha[0, ..., None]
+        maps = torch.where(alpha > 0, output.features / alpha, torch.nan)
+        return dict(zip(told, maps.unbind(-1), strict=True))
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         start = time.perf_counter()
@@ -233,6 +259,11 @@ class SplatTraining(pl.LightningModule):
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
+
+
+def _query(frame: Frame, ids: Tensor | None = None) -> Query:
+    """What is asked of the thermal model for a frame: the Gaussians ``ids``, or all."""
+    return Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id)
 
 
 def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None:

@@ -33,22 +33,28 @@ class Optimisation:
         self.betas, self.eps = tuple(betas), eps
 
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
-        """Parameter groups of the four geometry tensors."""
+        """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""
         rates = {
             "means": self.means * extent,
             "log_scales": self.log_scales,
             "quats": self.quats,
             "opacity_logits": self.opacity_logits,
         }
-        return [{"params": [splats[name]], "name": name, "lr": lr} for name, lr in rates.items()]
+        ends = {"means": self.means_end}
+        return [
+            {"params": [splats[name]], "name": name, "lr": lr, "lr_end": ends.get(name, 1.0)}
+            for name, lr in rates.items()
+        ]
 
     def build(self, groups: list[dict[str, Any]], max_steps: int):
-        """The optimiser over all groups, and the scheduler to call after every step."""
+        """The optimiser over all groups, and the scheduler to call after every step.
+
+        Args:
+            groups: each with "name", "params", "lr" and, where the rate changes, "lr_end": the factor on it at the last
+                step, log-linear in between.
+            max_steps: length of the run.
+        """
         optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
-        factors = [
-            (lambda step: self.means_end ** min(step / max(max_steps, 1), 1.0))
-            if group["name"] == "means"
-            else (lambda step: 1.0)
-            for group in optimizer.param_groups
-        ]
+        ends = [group.get("lr_end", 1.0) for group in optimizer.param_groups]
+        factors = [lambda step, end=end: end ** min(step / max(max_steps, 1), 1.0) for end in ends]
         return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)

@@ -1,0 +1,137 @@
+"""Stages of a run: which parameters stand still at which steps. A pure function of the step, so resuming is free."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+
+import torch
+from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+COLUMN = re.compile(r"(.+)\[(\d+)\]")
+
+
+class Rest:
+    """Steps at which some parameters stand still: one stretch of the run, or the end of every cycle in it.
+
+    Args:
+        groups: names of the optimiser's groups, wildcards allowed ("thermal.*"). "opacity_logits[1]" is the second
+            column of a tensor that has several; a tensor of one column is shared, and such a name leaves it alone.
+        start: first step.
+        stop: the step before which it ends; None is the end of the run.
+        cycle: steps of a cycle, counted from ``start``; None rests from ``start`` to ``stop``.
+        share: part of a cycle, at its end, in which they rest.
+        turn, turns: they rest in every ``turns``-th cycle, the first of which is number ``turn``.
+
+    Raises:
+        ValueError: an option is out of its range.
+    """
+
+    def __init__(
+        self,
+        groups: Sequence[str],
+        start: int = 0,
+        stop: int | None = None,
+        cycle: int | None = None,
+        share: float = 1.0,
+        turn: int = 0,
+        turns: int = 1,
+    ) -> None:
+        if not groups or isinstance(groups, str):
+            raise ValueError(f"groups must be a list of names of parameter groups, got {groups!r}")
+        if cycle is not None and cycle < 1:
+            raise ValueError(f"cycle must be at least 1 step, or null, got {cycle}")
+        if not 0 <= share <= 1 or not 0 <= turn < turns:
+            raise ValueError(f"share lies in [0, 1] and turn in 0 to turns - 1, got {share}, {turn} of {turns}")
+        self.groups, self.start, self.stop = tuple(groups), start, stop
+        self.cycle, self.share, self.turn, self.turns = cycle, share, turn, turns
+
+    def at(self, step: int) -> bool:
+        """Whether the parameters stand still at ``step``."""
+        if step < self.start or (self.stop is not None and step >= self.stop):
+            return False
+        if self.cycle is None:
+            return True
+        number, place = divmod(step - self.start, self.cycle)
+        return number % self.turns == self.turn and place >= self.cycle - round(self.share * self.cycle)
+
+
+class Stages:
+    """Holds parameters still while a step runs. They, their moments and their penalties are left as they were.
+
+    Args:
+        rests: name -> when which parameters stand still, or None for a stage that is absent.
+    """
+
+    def __init__(self, rests: Mapping[str, Rest | None]) -> None:
+        self.rests = {name: rest for name, rest in rests.items() if rest is not None}
+
+    def check(self, optimizer: torch.optim.Optimizer) -> None:
+        """Warns of stages that hold nothing still, as none of their names is a group of this run."""
+        for name, rest in self.rests.items():
+            if not any(_found(rest.groups, optimizer)):
+                there = ", ".join(group["name"] for group in optimizer.param_groups)
+                log.warning(
+                    "stage '%s' holds nothing still: none of %s is a parameter group of this run (%s)",
+                    name,
+                    ", ".join(rest.groups),
+                    there,
+                )
+
+    @contextmanager
+    def on_step(self, step: int, optimizer: torch.optim.Optimizer) -> Iterator[None]:
+        """Runs a training step, from the render to the optimiser's update, with the resting parameters held still.
+
+        Whole tensors get no gradient, so that nothing is computed for them and the optimiser passes them by. Columns of
+        a tensor are put back, with their moments, after the update.
+        """
+        names = [name for rest in self.rests.values() if rest.at(step) for name in rest.groups]
+        still = list(_found(names, optimizer))
+        whole = [parameter for parameter, column in still if column is None]
+        held = [
+            (parameter, column, _columns(parameter, column, optimizer))
+            for parameter, column in still
+            if column is not None
+        ]
+        for parameter in whole:
+            parameter.requires_grad_(False)
+        try:
+            yield
+        finally:
+            for parameter in whole:
+                parameter.requires_grad_(True)
+        for parameter, column, before in held:
+            _put_back(parameter, column, before, optimizer)
+
+
+def _found(names: Sequence[str], optimizer: torch.optim.Optimizer) -> Iterator[tuple[Tensor, int | None]]:
+    """Parameters of the groups with one of ``names``, each with the column that is meant, or None for all of it."""
+    for name in names:
+        match = COLUMN.fullmatch(name)
+        pattern, column = (match[1], int(match[2])) if match else (name, None)
+        for group in optimizer.param_groups:
+            if fnmatchcase(group["name"], pattern):
+                for parameter in group["params"]:
+                    if column is None or (parameter.ndim == 2 and column < parameter.shape[1] > 1):
+                        yield parameter, column
+
+
+def _columns(parameter: Tensor, column: int, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Copies of a column of a parameter, under "", and of its moments, which are missing before the first step."""
+    moments = optimizer.state.get(parameter, {})
+    found = {key: value for key, value in moments.items() if value.shape == parameter.shape} | {"": parameter.detach()}
+    return {key: value[:, column].clone() for key, value in found.items()}
+
+
+def _put_back(parameter: Tensor, column: int, before: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> None:
+    """Writes a column of a parameter and of its moments; moments that were missing become zero."""
+    with torch.no_grad():
+        parameter[:, column] = before[""]
+        for key, value in optimizer.state.get(parameter, {}).items():
+            if value.shape == parameter.shape:
+                value[:, column] = before.get(key, 0.0)
