@@ -8,7 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from heatsplat.contracts import View
+from heatsplat.contracts import SceneData, View
 from heatsplat.splats import Splats
 
 
@@ -58,7 +58,11 @@ class LossInputs:
 
 
 class LossTerm(Protocol):
-    """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term."""
+    """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term.
+
+    A term may also have ``prepare(scene, modality) -> dict[str, str]``, called once before training, to check and to
+    compute what it needs of the scene; it returns what the report should say of it, by name.
+    """
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]: ...
 
@@ -77,6 +81,10 @@ class Weighted:
         self.weight = weight
         self.schedule = schedule
 
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Prepares the term, unless its weight is zero."""
+        return prepare(self.term, scene, modality) if self.weight != 0.0 else {}
+
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         factor = self.weight if self.schedule is None else self.weight * self.schedule(inputs.progress)
         if factor == 0.0:
@@ -94,6 +102,13 @@ class Loss:
     def __init__(self, terms: Mapping[str, LossTerm | None]) -> None:
         self.terms = {name: term for name, term in terms.items() if term is not None}
 
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Lets terms check and compute what they need of a scene; what the report should say of them, by name."""
+        notes: dict[str, str] = {}
+        for term in self.terms.values():
+            notes |= prepare(term, scene, modality)
+        return notes
+
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         """Scalars by name: ``name`` of a term that returns a tensor, ``name/part`` of one that returns several."""
         scalars: dict[str, Tensor] = {}
@@ -101,6 +116,11 @@ class Loss:
             for part, value in _named(term(inputs)).items():
                 scalars[f"{name}/{part}" if part else name] = value
         return scalars
+
+
+def prepare(term: LossTerm, scene: SceneData, modality: str) -> dict[str, str]:
+    """Prepares a term that asks for it; most do not."""
+    return term.prepare(scene, modality) if hasattr(term, "prepare") else {}
 
 
 def _named(values: Tensor | dict[str, Tensor]) -> dict[str, Tensor]:

@@ -5,6 +5,8 @@ In config: ``{_target_: heatsplat.losses.schedules.linear, _partial_: true, star
 
 from __future__ import annotations
 
+import math
+
 
 def constant(progress: float, value: float = 1.0) -> float:
     """The same weight at every step."""
@@ -26,3 +28,15 @@ def linear(progress: float, start: float, end: float, before: float = 0.0, after
     if progress >= end:
         return after
     return before + (after - before) * (progress - start) / (end - start)
+
+
+def cosine(progress: float, start: float, end: float, before: float = 0.0, after: float = 1.0) -> float:
+    """The weight of a smooth ramp: ``before`` until ``start``, ``after`` from ``end``, half a cosine between them.
+
+    **Convention:** fractions of the run, as for ``linear``; no kink at either end (SupIR-GS, Eq. 11).
+
+    Raises:
+        ValueError: the ramp ends before it starts.
+    """
+    share = linear(progress, start, end)
+    return before + (after - before) * 0.5 * (1.0 - math.cos(math.pi * share))

@@ -1,0 +1,110 @@
+"""SupIR-GS's high-frequency loss: fine detail of a teacher, where the teacher can be trusted."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.contracts import SceneData, View
+from heatsplat.geometry.resampling import resampled
+from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.edge import GAIN, sobel, whole_windows
+from heatsplat.losses.low_resolution import fineness
+from heatsplat.losses.teacher import Teacher
+
+log = logging.getLogger(__name__)
+
+
+class HighFrequency:
+    """The mean of W |H(prediction) - H(teacher)| on the fine grid of the prediction (SupIR-GS, Eq. 9-10).
+
+    H is what lies between two averages and W, the confidence, falls where the teacher departs from the record. Both are
+    made once per training image and kept in half precision (4 bytes per pixel and channel). Where a masked pixel of the
+    record is near, nothing counts.
+
+    Args:
+        teacher: where the fine image comes from.
+        factor: how much finer than the training images the prediction is.
+        gamma_pixel, gamma_gradient: how fast confidence falls with |teacher - enlarged record| and with the sum of the
+            differences of their slopes per pixel.
+        inner, outer: sides of the averaging windows of H, odd; 1 is the image itself.
+
+    Raises:
+        ValueError: a window is not odd or they are not in order; or, when called, the prediction has another factor.
+    """
+
+    def __init__(
+        self,
+        teacher: Teacher,
+        factor: int = 4,
+        gamma_pixel: float = 10.0,
+        gamma_gradient: float = 5.0,
+        inner: int = 1,
+        outer: int = 7,
+    ) -> None:
+        if not 1 <= inner < outer or inner % 2 == 0 or outer % 2 == 0:
+            raise ValueError(f"inner and outer are odd sides of windows, the first smaller, got {inner} and {outer}")
+        if min(gamma_pixel, gamma_gradient) < 0 or factor < 1:
+            raise ValueError(
+                f"gammas must not be negative and factor at least 1, got {gamma_pixel}, {gamma_gradient}, {factor}"
+            )
+        self.teacher, self.factor = teacher, factor
+        self.gamma_pixel, self.gamma_gradient = gamma_pixel, gamma_gradient
+        self.inner, self.outer = inner, outer
+        self._made: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Checks that the teacher can serve every training image, asks it for all of them and forgets it."""
+        log.info("super-resolution teacher: %s", self.teacher.description)
+        for frame in scene.train.frames:
+            self.teacher.check(frame, self.factor)
+        for view in scene.train:
+            self._lesson(view, view.image(modality))
+        return {"teacher": self.teacher.description}
+
+    def __call__(self, inputs: LossInputs) -> Tensor:
+        if fineness(inputs) != self.factor:
+            raise ValueError(
+                f"the prediction is {fineness(inputs)} times as fine as the training image, the loss expects "
+                f"{self.factor}; set both by super_resolution"
+            )
+        detail, confidence = (made.to(inputs.prediction) for made in self._lesson(inputs.view, inputs.target))
+        error = confidence * (self.detail(inputs.prediction) - detail).abs()
+        if inputs.mask is None:
+            return error.mean()
+        counted = whole_windows(inputs.mask).repeat_interleave(self.factor, 0).repeat_interleave(self.factor, 1)
+        return torch.where(counted[..., None], error, 0.0).sum() / (counted.sum() * error.shape[2]).clamp(min=1)
+
+    def detail(self, image: Tensor) -> Tensor:
+        """H: the average over the inner window minus that over the outer one, [H, W, C]; 0 for a flat image."""
+        return averaged(image, self.inner) - averaged(image, self.outer)
+
+    def confidence(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """W of a teacher's image [fH, fW, C] of a record [H, W, C], [fH, fW, 1] in (0, 1]."""
+        enlarged = resampled(coarse, *fine.shape[:2], "bilinear")
+        slopes = zip(sobel(fine), sobel(enlarged), strict=True)
+        gradient = sum((a - b).abs() for a, b in slopes) / GAIN
+        departure = self.gamma_pixel * (fine - enlarged).abs() + self.gamma_gradient * gradient
+        return torch.exp(-departure.mean(2, keepdim=True))
+
+    @torch.no_grad()
+    def _lesson(self, view: View, target: Tensor) -> tuple[Tensor, Tensor]:
+        """H(teacher) and W for a training image, made when it is first seen."""
+        key = view.frame.frame_id
+        if key not in self._made:
+            record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
+            fine = self.teacher(record, view.frame, self.factor)
+            self._made[key] = (self.detail(fine).half(), self.confidence(fine, record).half())
+        return self._made[key]
+
+
+def averaged(image: Tensor, side: int) -> Tensor:
+    """Means over windows of ``side`` x ``side`` pixels, [H, W, C]; at the border over what lies inside."""
+    if side == 1:
+        return image
+    planes = image.permute(2, 0, 1)[None]
+    means = functional.avg_pool2d(planes, side, stride=1, padding=side // 2, count_include_pad=False)
+    return means[0].permute(1, 2, 0)

@@ -1,0 +1,95 @@
+"""Comparing a finely rendered image with a coarsely recorded one, on the grid of the record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from torch import Tensor
+
+from heatsplat.contracts import SceneData
+from heatsplat.geometry.resampling import KERNELS, resampled, scale_between
+from heatsplat.losses.compose import LossInputs, LossTerm, prepare
+from heatsplat.losses.photometric import Photometric
+
+
+class OnTargetGrid:
+    """A term of the prediction reduced to the grid of the target: consistency with what was recorded.
+
+    A prediction that has the target's size already is passed on as it is.
+
+    Args:
+        term: what compares.
+        kernel: how the prediction shrinks, as the record lost its resolution: "bicubic" for images made by
+            ``data.degrade=lr4``, "area" for ``area4`` and as a fair guess for a real sensor.
+
+    Raises:
+        ValueError: the kernel is unknown; or, when called, the prediction is not finer by a whole factor.
+    """
+
+    def __init__(self, term: LossTerm, kernel: str = "bicubic") -> None:
+        if kernel not in KERNELS:
+            raise ValueError(f"unknown resampling kernel '{kernel}'; there are {', '.join(KERNELS)}")
+        self.term, self.kernel = term, kernel
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Prepares the term."""
+        return prepare(self.term, scene, modality)
+
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
+        fineness(inputs)
+        height, width = inputs.target.shape[:2]
+        return self.term(replace(inputs, prediction=resampled(inputs.prediction, height, width, self.kernel)))
+
+
+class Curriculum:
+    """The terms "l1" and "dssim": (1 + b(t)) mean|x - y| and s(t) (1 - mean SSIM) (SupIR-GS, Eq. 12, first two terms).
+
+    Unlike in ``Photometric``, SSIM comes on top of the L1 term and not out of it.
+
+    Args:
+        ssim_weight: s at the end of its ramp.
+        ssim_schedule: ramp of s as a function of progress (``losses.schedules``), or None for constant.
+        boost_weight: b at the end of its ramp; the paper names late-stage boosting terms without saying what they are.
+        boost_schedule: ramp of b, or None for constant.
+
+    Raises:
+        ValueError: a weight is negative.
+    """
+
+    def __init__(
+        self,
+        ssim_weight: float = 0.2,
+        ssim_schedule: Callable[[float], float] | None = None,
+        boost_weight: float = 0.0,
+        boost_schedule: Callable[[float], float] | None = None,
+    ) -> None:
+        if min(ssim_weight, boost_weight) < 0:
+            raise ValueError(f"ssim_weight and boost_weight must not be negative, got {ssim_weight}, {boost_weight}")
+        self.ssim_weight, self.ssim_schedule = ssim_weight, ssim_schedule
+        self.boost_weight, self.boost_schedule = boost_weight, boost_schedule
+        self._plain, self._halves = Photometric(0.0), Photometric(0.5)
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        structure = self.ssim_weight * (self.ssim_schedule(inputs.progress) if self.ssim_schedule else 1.0)
+        boost = self.boost_weight * (self.boost_schedule(inputs.progress) if self.boost_schedule else 1.0)
+        if structure == 0.0:
+            return {"l1": (1.0 + boost) * self._plain(inputs)["l1"]}
+        halves = self._halves(inputs)
+        return {"l1": 2.0 * (1.0 + boost) * halves["l1"], "dssim": 2.0 * structure * halves["dssim"]}
+
+
+def fineness(inputs: LossInputs) -> int:
+    """The whole number by which the prediction's grid is finer than the target's.
+
+    Raises:
+        ValueError: there is none, with both sizes.
+    """
+    fine, coarse = tuple(inputs.prediction.shape[:2]), tuple(inputs.target.shape[:2])
+    factor = scale_between(fine, coarse)
+    if factor is None:
+        raise ValueError(
+            f"the prediction has {fine[1]} x {fine[0]} pixels and the target {coarse[1]} x {coarse[0]}: the first must "
+            "be a whole multiple of the second (module.supersample: how much finer than training images is rendered)"
+        )
+    return factor

@@ -1,0 +1,207 @@
+"""Super-resolution teachers: where a guess of the fine image comes from. Used in training only."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import warnings
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from heatsplat.contracts import Frame, SceneError
+from heatsplat.geometry.resampling import resampled
+from heatsplat.losses import swinir
+
+log = logging.getLogger(__name__)
+
+INTERPOLATIONS = ("lanczos", "bicubic")
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+WHERE = (
+    "Give a file with a network (a state dict of SwinIR such as 002_lightweightSR_DIV2K_s64w8_SwinIR-S_x4.pth from "
+    "github.com/JingyunLiang/SwinIR/releases, TorchScript, or torch.export's .pt2) or a folder with one enlarged image "
+    "per training image, by teacher=PATH; or choose interpolation by teacher=lanczos or teacher=bicubic."
+)
+
+
+class Teacher(ABC):
+    """A guess of the fine image behind a coarse one.
+
+    Attributes:
+        description: what it is, for the log and the report.
+    """
+
+    description: str
+
+    def check(self, frame: Frame, factor: int) -> None:
+        """Raises SceneError, naming the file and the remedy, when it cannot serve this training image."""
+        return
+
+    @abstractmethod
+    def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
+        """The image ``factor`` times as fine, [factor H, factor W, C], of [H, W, C] in [0, 1]."""
+
+
+def load_teacher(source: str | None, cache: str | None = "~/.cache/heatsplat/teacher") -> Teacher:
+    """The teacher that a word or a path means.
+
+    Args:
+        source: "lanczos" or "bicubic"; a folder of enlarged images; or a file that holds a network.
+        cache: folder in which a network's answers are kept, so that later runs need not ask again; None keeps none.
+
+    Raises:
+        SceneError: nothing was chosen, there is no such path, or the file holds no network that is understood.
+    """
+    if source in INTERPOLATIONS:
+        return Interpolation(source)
+    if source is None or str(source) == "":
+        raise SceneError(f"this loss learns from a super-resolution teacher, and none is chosen. {WHERE}")
+    path = Path(source).expanduser()
+    if path.is_dir():
+        return Images(path)
+    if not path.is_file():
+        raise SceneError(f"teacher={source}: there is no file or folder {path.absolute()}. {WHERE}")
+    return Network(path, None if cache is None else Path(cache).expanduser())
+
+
+class Interpolation(Teacher):
+    """The coarse image enlarged by a kernel: adds sharpness, knows nothing."""
+
+    def __init__(self, kernel: str) -> None:
+        self.kernel = kernel
+        self.description = f"{kernel} interpolation (no network)"
+
+    def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
+        height, width = image.shape[:2]
+        return resampled(image, factor * height, factor * width, self.kernel).clamp(0.0, 1.0)
+
+
+class Images(Teacher):
+    """A folder of enlarged images, found by the name of the training image whatever its extension.
+
+    Grey or RGB, 8 or 16 bit, or float in [0, 1], encoded like the training images: 0 and full scale are 0 and 1.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.files = {
+            path.relative_to(folder).with_suffix("").as_posix().lower(): path
+            for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in SUFFIXES
+        }
+        if not self.files:
+            raise SceneError(f"teacher={folder}: the folder holds no image ({', '.join(SUFFIXES)}). {WHERE}")
+        self.description = f"images in {folder.name}/"
+
+    def check(self, frame: Frame, factor: int) -> None:
+        path = self._file_of(frame)
+        with Image.open(path) as image:
+            self._check_size(path, image.size, frame, factor)
+
+    def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
+        path = self._file_of(frame)
+        with Image.open(path) as stored:
+            self._check_size(path, stored.size, frame, factor)
+            pixels = np.asarray(stored)
+        full = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 65535 if pixels.dtype.kind == "i" else 1
+        values = torch.from_numpy(pixels.astype(np.float32) / full)
+        values = values[..., None] if values.ndim == 2 else values[..., :3]
+        channels = image.shape[2]
+        values = values if values.shape[2] == channels else values.mean(2, keepdim=True).expand(-1, -1, channels)
+        return values.clamp(0.0, 1.0).to(image.device)
+
+    def _file_of(self, frame: Frame) -> Path:
+        name = Path(frame.name).with_suffix("").as_posix().lower()
+        path = self.files.get(name) or self.files.get(Path(name).name)
+        if path is None:
+            raise SceneError(
+                f"teacher={self.folder}: there is no image for {frame.name}; it holds {len(self.files)} images such as "
+                f"{next(iter(self.files.values())).name}. Every training image needs one of its name."
+            )
+        return path
+
+    def _check_size(self, path: Path, size: tuple[int, int], frame: Frame, factor: int) -> None:
+        expected = (factor * frame.camera.width, factor * frame.camera.height)
+        if size != expected:
+            raise SceneError(
+                f"teacher image {path} has {size[0]} x {size[1]} pixels, but {factor} times the training image "
+                f"{frame.name} is {expected[0]} x {expected[1]}"
+            )
+
+
+class Network(Teacher):
+    """A super-resolution network from a file, asked once per image; answers are kept on disk.
+
+    It gets [1, 3, H, W] in [0, 1] (grey is repeated) and must return [1, 3, fH, fW].
+    """
+
+    def __init__(self, path: Path, cache: Path | None) -> None:
+        self.path, self.cache = path, cache
+        self.network, kind = load_network(path)
+        self._digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        self.description = f"{kind} in {path.name} (SHA-256 {self._digest[:8]})"
+
+    def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
+        kept = self._kept(image, factor)
+        if kept is not None and kept.is_file():
+            return torch.from_numpy(np.load(kept).astype(np.float32)).to(image.device)
+        height, width, channels = image.shape
+        planes = image.detach().cpu().float().permute(2, 0, 1)[None]
+        with torch.no_grad():
+            answer = self.network(planes.expand(-1, 3, -1, -1) if channels == 1 else planes)
+        if tuple(answer.shape) != (1, 3, factor * height, factor * width):
+            raise SceneError(
+                f"teacher={self.path}: of an image of {width} x {height} pixels it made {list(answer.shape)}, but "
+                f"[1, 3, {factor * height}, {factor * width}] is needed; is it a network for factor {factor}?"
+            )
+        fine = answer[0].permute(1, 2, 0).clamp(0.0, 1.0)
+        fine = fine.mean(2, keepdim=True) if channels == 1 else fine
+        if not fine.isfinite().all():
+            raise SceneError(f"teacher={self.path}: its answer to {frame.name} is not finite")
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            partial = kept.with_suffix(".part.npy")
+            np.save(partial, fine.numpy().astype(np.float16))
+            partial.replace(kept)
+        return fine.to(image.device)
+
+    def _kept(self, image: Tensor, factor: int) -> Path | None:
+        """Where the answer to an image is kept: named by network, image and factor."""
+        if self.cache is None:
+            return None
+        content = image.detach().cpu().contiguous().numpy().tobytes()
+        key = hashlib.sha256(f"{self._digest}/{list(image.shape)}/{factor}/".encode() + content).hexdigest()[:32]
+        return self.cache / f"{key}.npy"
+
+
+def load_network(path: Path) -> tuple[nn.Module, str]:
+    """The network in a file, ready to be asked, and what it is.
+
+    Raises:
+        SceneError: the file holds none that is understood, with what it holds instead.
+    """
+    if path.suffix == ".pt2":
+        try:
+            return torch.export.load(path).module(), "exported network"
+        except Exception as error:
+            raise SceneError(f"teacher={path} is no program of torch.export: {error}") from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that it is TorchScript, which is tried below
+            stored = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:
+        stored = None
+    if stored is not None:
+        return swinir.from_state_dict(stored, path), "SwinIR"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript is what many released networks come in
+            return torch.jit.load(path, map_location="cpu").eval(), "TorchScript network"
+    except Exception as error:
+        raise SceneError(
+            f"teacher={path} is neither weights that torch can load safely nor TorchScript. {WHERE}"
+        ) from error
