@@ -172,10 +172,10 @@ def test_curves_at_probes(run):
     times = np.array([row["time_s"] for row in rows])
     assert times == pytest.approx(np.linspace(0, SECONDS, 9))
     truth = RANGE.to_celsius(warmth(torch.from_numpy(times)).numpy())
-    assert [row["truth_1"] for row in rows] == pytest.approx(truth)
+    assert [row["truth of probe 1"] for row in rows] == pytest.approx(truth)
     model = 10 + 40 * module.value.item() * warmth(torch.from_numpy(times)).numpy()  # probe 1 lies on the warm half
-    assert [row["probe_1"] for row in rows] == pytest.approx(model, rel=1e-5)
-    assert [row["probe_2"] for row in rows] == pytest.approx([14.0] * 9, rel=1e-5)
+    assert [row["probe 1"] for row in rows] == pytest.approx(model, rel=1e-5)
+    assert [row["probe 2"] for row in rows] == pytest.approx([14.0] * 9, rel=1e-5)
 
 
 def test_hyperparameters_are_flat_and_say_what_was_learned():

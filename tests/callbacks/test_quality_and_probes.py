@@ -151,11 +151,19 @@ def test_probes_are_found_without_the_scenes_help():
     assert values[2] == scene.train[2].thermal[row, column].item()
 
 
+def test_probes_of_the_scene_carry_their_names():
+    scene = wall()
+    assert [probe.name for probe in find_probes(scene, 6)] == ["probe 1", "probe 2"]
+    named = replace(scene, notes={"probes": ["stove", "window"]})
+    assert [probe.name for probe in find_probes(named, 6)] == ["stove", "window"]
+    assert [probe.name for probe in find_probes(named, 1)] == ["stove"]
+
+
 def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
     module = FakeModule(wall(truth=False), tmp_path)
     evaluate(module, trainer(tmp_path, [TemperatureCurves(times=4)]))
     assert (tmp_path / "renders" / "probes.png").exists()
-    assert "truth_1" not in read_table(tmp_path / "renders" / "probes.csv")[0]
+    assert list(read_table(tmp_path / "renders" / "probes.csv")[0]) == ["time_s", *(f"probe {i}" for i in range(1, 7))]
     assert "test/probes" in events(tmp_path).Tags()["images"]
 
 

@@ -26,8 +26,9 @@ DOTS = 200  # training images that are sampled where the true curve is not known
 
 @dataclass(frozen=True)
 class Probe:
-    """A point whose temperature is drawn: its place, the frame whose camera looks at it, and the pixel it falls on."""
+    """A point whose temperature is drawn: name, place, the frame whose camera looks at it, the pixel it falls on."""
 
+    name: str
     point: Tensor
     frame: Frame
     row: int
@@ -81,7 +82,9 @@ class TemperatureCurves(pl.Callback):
         to_unit = scene.thermal_range.to_celsius if unit == "°C" else lambda value: value
         model = to_unit(model)
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
-        picture = figure_picture(_figure(times.numpy(), model, truth, dots, unit, f"{scene.name}, step {step}"))
+        names = [probe.name for probe in self._probes]
+        title = f"{scene.name}, step {step}"
+        picture = figure_picture(_figure(times.numpy(), names, model, truth, dots, unit, title))
         write_png(module.output_dir / "renders" / "probes.png", picture)
         self._write(module, times.tolist(), model, truth)
         writer = board(module)
@@ -105,8 +108,8 @@ class TemperatureCurves(pl.Callback):
     def _write(
         self, module: pl.LightningModule, times: list[float], model: np.ndarray, truth: np.ndarray | None
     ) -> None:
-        columns = ["time_s", *(f"probe_{i + 1}" for i in range(len(model)))]
-        columns += [] if truth is None else [f"truth_{i + 1}" for i in range(len(truth))]
+        names = [probe.name for probe in self._probes]
+        columns = ["time_s", *names, *([] if truth is None else [f"truth of {name}" for name in names])]
         stacked = np.concatenate([[times], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
         write_table(module.output_dir / "renders" / "probes.csv", columns, rows)
@@ -136,14 +139,22 @@ def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:
 def find_probes(scene: SceneData, count: int) -> list[Probe]:
     """The scene's probes, or points of its cloud, each with a validation camera that sees it; unseen ones are left out.
 
+    Where ``scene.notes["probes"]`` lists a name for each of the scene's probes, they carry it.
+
     Cameras are chosen greedily, the one that sees most first, so that few renders serve many probes.
     """
     views: ViewSet = scene.val if len(scene.val) else scene.train
     frames = [views.frames[i] for i in spread(len(views), CANDIDATES)]
     cloud = scene.points[:: max(1, len(scene.points) // 20_000)]
-    points = scene.probes[:count] if scene.probes is not None else _spread_points(frames, cloud, count)
+    if scene.probes is not None:
+        picked = spread(len(scene.probes), count)
+        points, told = scene.probes[picked], scene.notes.get("probes")
+        names = [told[i] for i in picked] if isinstance(told, list) and len(told) == len(scene.probes) else None
+    else:
+        points, names = _spread_points(frames, cloud, count), None
     if not len(points) or not frames:
         return []
+    names = names or [f"probe {i + 1}" for i in range(len(points))]
     seen = torch.stack([seen_by(frame.camera, points, cloud) for frame in frames])
     chosen: dict[int, Frame] = {}
     left = torch.ones(len(points), dtype=torch.bool)
@@ -155,7 +166,7 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
     probes = []
     for i, frame in sorted(chosen.items()):
         column, row = project(points[i : i + 1], frame.camera)[0][0].tolist()
-        probes.append(Probe(points[i].detach().cpu(), frame, int(row), int(column)))
+        probes.append(Probe(names[i], points[i].detach().cpu(), frame, int(row), int(column)))
     return probes
 
 
@@ -206,6 +217,7 @@ def _nearest(weather: list[tuple[float, object]], time_s: float):
 
 def _figure(
     times: np.ndarray,
+    names: Sequence[str],
     model: np.ndarray,
     truth: np.ndarray | None,
     dots: Sequence[tuple[Sequence[float], Sequence[float]]],
@@ -221,7 +233,7 @@ def _figure(
     axes = figure.add_subplot()
     for i, curve in enumerate(model):
         color = f"C{i}"
-        axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=f"probe {i + 1}")
+        axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=names[i])
         if truth is not None:
             axes.plot(times / divisor, truth[i], color=color, linewidth=1.2, linestyle=(0, (4, 2)), alpha=0.8)
         elif dots:
@@ -230,5 +242,5 @@ def _figure(
     axes.set(xlabel=f"time ({word})", ylabel=f"temperature ({unit})" if unit == "°C" else unit)
     axes.set_title(f"{title}   (lines: model, {against})", fontsize=10)
     axes.grid(alpha=0.25)
-    axes.legend(fontsize=8, ncols=2)
+    axes.legend(fontsize=8, ncols=2, framealpha=0.7)
     return figure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from heatsplat.callbacks.images import spread
 from heatsplat.callbacks.metrics import CURVE_FILE, TEST_FILE, read_table
 from heatsplat.contracts import SceneData
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import COST, METRICS_FILE, TEST, RunResults, collect_versions, write_atomically
+from heatsplat.io.results import METRICS_FILE, RunResults, collect_versions, write_atomically
 from heatsplat.metrics import DEFINITIONS
 
 REPORT_FILE = "report.md"
@@ -39,7 +40,7 @@ HYPERPARAMETERS = (
 
 
 class Report(pl.Callback):
-    """Writes what a run found, once its test is over. Must stand after the callbacks that measure.
+    """Writes what a run found, once its test is over and all other callbacks have measured.
 
     * metrics.json: every number, or null with the reason (``heatsplat.io.results``).
     * report.md: the same for people, with pictures, readable without any tool.
@@ -159,12 +160,10 @@ def report(
     run, reasons = content["run"], content["reasons"]
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
     lines += ["## Scores and what they cost", "", "| score | value | | cost | value |", "|---|---|---|---|---|"]
-    left = [(name, _number(content["test"][name]), unit_of(name, content)) for name in content["test"]]
-    right = [(name, _number(content["cost"][name]), COST_UNITS.get(name, "")) for name in content["cost"]]
-    blank = ("", "", "")
-    for i in range(max(len(left), len(right))):
-        a, b = left[i] if i < len(left) else blank, right[i] if i < len(right) else blank
-        lines.append(f"| {a[0]} | {' '.join(a[1:]).strip()} | | {b[0]} | {' '.join(b[1:]).strip()} |")
+    for (score, value), (cost, price) in zip_longest(
+        cells(content, "test"), cells(content, "cost"), fillvalue=("", "")
+    ):
+        lines.append(f"| {score} | {value} | | {cost} | {price} |")
     missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
     if missing:
         lines += ["", "Not to be had:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
@@ -192,15 +191,17 @@ def report(
     return "\n".join(lines)
 
 
-def unit_of(name: str, content: Mapping[str, Any]) -> str:
-    """The unit of a score, empty where it has none or the value is missing."""
-    return DEFINITIONS[name].unit if name in DEFINITIONS and content["test"][name] is not None else ""
+def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
+    """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
+    units = COST_UNITS | {name: definition.unit for name, definition in DEFINITIONS.items()}
+    return [
+        (name, "–" if value is None else f"{_number(value)} {units.get(name, '')}".rstrip())
+        for name, value in content[section].items()
+    ]
 
 
-def _number(value: float | None) -> str:
-    """Four significant digits, whole numbers as they are, and a dash for what could not be had."""
-    if value is None:
-        return "–"
+def _number(value: float) -> str:
+    """Four significant digits, and whole numbers as they are."""
     if float(value).is_integer() or abs(value) >= 1e4:
         return f"{value:,.0f}"
     return f"{value:.4g}"
@@ -211,9 +212,18 @@ def _bullets(values: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, value in values.items():
         if isinstance(value, Mapping):
-            value = ", ".join(f"{key} {item}" for key, item in value.items()) or "on"
-        lines.append(f"- {name}: {'–' if value is None else value}")
+            value = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on"
+        lines.append(f"- {name}: {_words(value)}")
     return lines
+
+
+def _words(value: Any) -> str:
+    """A value for people: lists with commas, floats with six digits, a dash for nothing."""
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_words(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "–" if value is None else str(value)
 
 
 def show(results: RunResults, folder: Path, picture: Path | None, console: Console | None = None) -> None:
@@ -224,10 +234,8 @@ def show(results: RunResults, folder: Path, picture: Path | None, console: Conso
     table = Table(title=f"{run.get('method') or run.get('thermal_model')} on {run.get('scene')}", title_justify="left")
     for column, justify in (("score", "left"), ("", "right"), ("cost", "left"), (" ", "right")):
         table.add_column(column, justify=justify)
-    scores = [(name, f"{_number(content['test'][name])} {unit_of(name, content)}".strip()) for name in TEST]
-    costs = [(name, f"{_number(content['cost'][name])} {COST_UNITS[name]}".strip()) for name in COST]
-    for i in range(max(len(scores), len(costs))):
-        table.add_row(*(scores[i] if i < len(scores) else ("", "")), *(costs[i] if i < len(costs) else ("", "")))
+    for score, cost in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", "")):
+        table.add_row(*score, *cost)
     console.print(table)
     console.print(f"report:  {folder / REPORT_FILE}", soft_wrap=True)
     if picture is not None:

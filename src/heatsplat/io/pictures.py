@@ -198,7 +198,7 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
 
 
 def figure_picture(figure: Figure) -> np.ndarray:
-    """A matplotlib figure as pixels, uint8 RGB. Figures are made as objects (``Figure(...)``); pyplot keeps global state."""
+    """A matplotlib figure as pixels, uint8 RGB. Make it as an object (``Figure(...)``): pyplot keeps global state."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

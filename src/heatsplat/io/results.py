@@ -81,8 +81,10 @@ class RunResults:
         reasons = dict(self.reasons)
         plain = {section: _plain(getattr(self, section), section, reasons) for section in SECTIONS}
         for section, names in (("test", TEST), ("cost", COST)):
-            for name in names:
-                if plain[section].setdefault(name, None) is None:
+            found = plain[section]
+            plain[section] = {name: found.pop(name, None) for name in names} | found  # always in one order
+            for name, value in plain[section].items():
+                if value is None:
                     reasons.setdefault(f"{section}.{name}", "not measured in this run")
         return {**plain, "reasons": reasons}
 
