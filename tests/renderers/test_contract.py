@@ -122,6 +122,9 @@ def run(backend: str, scene: Scene, dtype: torch.dtype | None = None, **options:
     """What a backend gives for a scene, back on the CPU as float64, with the gradients of a fixed random loss."""
     device = "cuda" if backend == "gsplat" else "cpu"
     dtype = dtype or torch.float32
+    # The reference works on small tensors: on a busy machine two threads take four times as long as one. Numba changes
+    # the number of OpenMP threads, which torch shares, so it is set before every call.
+    torch.set_num_threads(1)
     leaves = {
         name: value.to(device, dtype, copy=True).requires_grad_()
         for name in GRADIENTS
@@ -184,6 +187,13 @@ def runnable(backend: str) -> str:
             raise
         pytest.skip(f"this checkout has no heatsplat.renderers.{backend}")
     return backend
+
+
+@pytest.fixture(autouse=True)
+def torch_threads():
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(
@@ -322,16 +332,15 @@ def test_reference_runs_on_cuda():
 
 # Every backend against the reference ---------------------------------------------------------------------------------
 
+# Four layouts of channels and no more: the CPU renderer compiles its kernels once for each.
 PLAIN = {
     "one channel": plain_scene(channels=(1,)),
     "one channel, antialiased": plain_scene(channels=(1,), antialiased=True),
     "rgb": plain_scene(channels=(3,)),
     "rgb, antialiased": plain_scene(channels=(3,), antialiased=True),
-    "four channels": plain_scene(channels=(4,)),
-    "rgb and thermal": plain_scene(channels=(3, 1)),
-    "rgb and thermal, antialiased": plain_scene(channels=(3, 1), antialiased=True),
-    "two thermal": plain_scene(channels=(1, 1)),
-    "seven channels": plain_scene(channels=(7,)),
+    "four channels": plain_scene(channels=(4,), absgrad=True),
+    "rgb and thermal": plain_scene(channels=(3, 1), absgrad=True),
+    "rgb and thermal, antialiased": plain_scene(channels=(3, 1), absgrad=True, antialiased=True),
     "width and height of no tile": plain_scene(channels=(1,), width=37, height=29),
 }
 
@@ -341,15 +350,14 @@ def test_images_and_gradients_of_plain_scenes(backend, name):
     assert_close(run(backend, PLAIN[name]), oracle(PLAIN[name]))
 
 
-@pytest.mark.parametrize("channels", [(3,), (3, 1)])
-def test_absolute_screen_gradients(backend, channels):
+@pytest.mark.parametrize("name", ["four channels", "rgb and thermal"])
+def test_absolute_screen_gradients(backend, name):
     # Sums of |gradient| over pixels and modalities: gsplat composites each modality on its own and cannot do otherwise.
-    scene = plain_scene(channels=channels)
-    actual, expected = run(backend, scene, absgrad=True), oracle(scene, absgrad=True)
-    assert_close(actual, expected)
-    summed, absolute = (actual.gradients[f"means2d.{name}"] for name in ("grad", "absgrad"))
-    assert (absolute >= summed.abs() * (1 - 1e-4) - 1e-6).all()
-    assert absolute.sum() > 1.2 * summed.abs().sum()  # gradients of different pixels do oppose each other
+    # That they are right is tested above; here, that they are what they claim to be.
+    gradients = run(backend, PLAIN[name]).gradients
+    summed, absolute = gradients["means2d.grad"].abs(), gradients["means2d.absgrad"]
+    assert (absolute >= summed * (1 - 1e-4) - 1e-6).all()
+    assert absolute.sum() > 1.2 * summed.sum()  # gradients of different pixels do oppose each other
 
 
 def test_without_absgrad_there_is_none(backend):
@@ -451,7 +459,7 @@ def test_screen_gradients_are_those_of_moved_centres(backend):
 def test_the_same_bits_on_every_run(backend, name):
     if backend == "gsplat":
         pytest.skip("gsplat adds gradients with atomics, in no fixed order")
-    first, second = (run(backend, PLAIN[name], absgrad=True) for _ in range(2))
+    first, second = (run(backend, PLAIN[name]) for _ in range(2))
     for key, image in (first.images() | first.gradients).items():
         assert torch.equal(image, (second.images() | second.gradients)[key]), key
     for key, value in first.output.meta.items():
@@ -510,14 +518,14 @@ def test_nothing_in_view_with_a_function(backend):
 
     def emit(ids: Tensor) -> Tensor:
         asked.append(ids)
-        return torch.zeros(len(ids), 5, device=ids.device)
+        return torch.zeros(len(ids), 3, device=ids.device)
 
     device = "cuda" if backend == "gsplat" else "cpu"
     scene = facing([[0, 0, -2.0]], 0.3)
     rows = (getattr(scene, name).to(device, torch.float32) for name in ("means", "quats", "scales", "opacities"))
     cameras = (scene.viewmat.to(device), scene.K.to(device))
     output = rasterization(*rows, emit, *cameras, 24, 20, backend=backend)
-    assert output.features.shape == (20, 24, 5)
+    assert output.features.shape == (20, 24, 3)
     assert [len(ids) for ids in asked] == [0]
 
 
