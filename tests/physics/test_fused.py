@@ -50,6 +50,20 @@ def test_kernel_equals_the_twin(frequencies, time):
         torch.testing.assert_close(gradient.double(), truth[name], rtol=2e-6, atol=1e-6 * scale, msg=name)
 
 
+@pytest.mark.parametrize("fall", [80.0, 87.4, 90.2, 103.0, 1e3, 1e13])
+def test_a_body_that_has_long_forgotten_its_start(fall):
+    """e^-fall leaves the normal numbers of float32 at 87.3, and all of them at 103.3."""
+    leaves, omega = case(40, 24)
+    leaves["rate"] = torch.full((40,), fall).requires_grad_()
+    weights = torch.ones(40)
+    values, gradients = run(visible_temperature, leaves, omega, 1.0, None, weights, torch.float32)
+    expected, truth = run(visible_temperature, leaves, omega, 1.0, None, weights, DOUBLE)
+    torch.testing.assert_close(values.double(), expected, rtol=1e-6, atol=1e-6)
+    for name, gradient in gradients.items():
+        scale = truth[name].abs().max().item()
+        torch.testing.assert_close(gradient.double(), truth[name], rtol=1e-5, atol=1e-6 * scale + 1e-30, msg=name)
+
+
 @pytest.mark.parametrize("count", [1, 15, 255, 256, 257, 1000])
 def test_only_rows_in_view_are_read_and_written(count):
     leaves, omega = case(count, 24)

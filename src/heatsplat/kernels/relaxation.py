@@ -123,7 +123,7 @@ def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch
             theta2 = theta2 * near + _SERIES[8 - term]
         theta = _f(0.5) - near * theta2
         phi_near = _f(1.0) - near * theta
-        fall_far = exp2(far * -_LOG2_E)
+        fall_far = exp2(maximum(far * -_LOG2_E, _f(-126.0)))  # 1e-38: exp2 knows no smaller number
         phi_far = (_f(1.0) - fall_far) / far
         small = y < _f(1.0)
         fall = select(small, _f(1.0) - near * phi_near, fall_far)
