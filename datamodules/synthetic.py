@@ -10,7 +10,7 @@ import torch
 
 from datamodules.assemble import RawFrame
 from datamodules.base import SceneDataModule
-from datamodules.synthetic_scene.film import SIZES, Recording, film
+from datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
 from datamodules.synthetic_scene.presets import PRESETS
 from datamodules.synthetic_scene.scene import Scene
 from heatsplat.contracts import SceneData, SceneError
@@ -59,7 +59,8 @@ class Synthetic(SceneDataModule):
         """The recording as a scene; its truth and probes come from the solver."""
         recording = film(Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
         preset = recording.scene.preset
-        probes, probe_names = probe_points(recording)
+        with own_threads():
+            probes, probe_names = probe_points(recording)
         return self.finish(
             self.scene_name,
             [
@@ -95,14 +96,25 @@ class Synthetic(SceneDataModule):
 def probe_points(recording: Recording) -> tuple[np.ndarray, list[str]]:
     """One point [n, 3] on each surface that the frames show, and the name of the surface.
 
-    It is the sparse point nearest to the mean of all sparse points of its surface, moved onto the surface.
+    A probe stands where its neighbourhood is as warm as itself, so that a model is not judged by which side of a border
+    its nearest Gaussian lies on: of the sparse points of a surface, moved onto it, the fifth with the least change of
+    start and flux within 4 cm are taken, and of these the one nearest to the middle of the surface.
     """
     scene = recording.scene
     on_surface, which = scene.nearest(torch.from_numpy(recording.points))
+    around = 0.04 * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 3)
     probes, names = [], []
     for number, surface in enumerate(scene.preset.surfaces):
         own = on_surface[which == number]
-        if len(own):
-            probes.append(own[(own - own.mean(0)).norm(dim=1).argmin()].numpy())
-            names.append(surface.name)
+        if not len(own):
+            continue
+        near, near_which = scene.nearest((own[:, None] + around).reshape(-1, 3))
+        heat = scene.heat_at(near, near_which)
+        warmth = heat.start_k + heat.flux_w_m2 / surface.material.exchange
+        change = warmth.reshape(len(own), -1).std(dim=1)
+        elsewhere = (near_which.reshape(len(own), -1) != number).any(1)
+        order = (change + elsewhere * change.max().clamp_min(1.0)).argsort()
+        even = own[order[: max(1, len(own) // 5)]]
+        probes.append(even[(even - own.mean(0)).norm(dim=1).argmin()].numpy())
+        names.append(surface.name)
     return np.stack(probes), names

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,16 +115,9 @@ def film(
         celsius[frame] = temperature.numpy()
         rgb[frame] = (color * 255.0).round().to(torch.uint8).numpy()
 
-    # One frame per thread: torch's own threads wait for each other after every small operation, which made this ten
-    # times slower on a busy machine.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(shoot, range(size.frames)))
-    finally:
-        torch.set_num_threads(threads)
-    points, colors = sparse_points(scene, lens, viewmats, size.points, seed)
+    with own_threads() as threads, ThreadPoolExecutor(threads) as pool:
+        list(pool.map(shoot, range(size.frames)))
+        points, colors = sparse_points(scene, lens, viewmats, size.points, seed)
     return Recording(
         scene=scene,
         lens=lens,
@@ -135,6 +129,20 @@ def film(
         points=points.numpy(),
         point_colors=colors.numpy(),
     )
+
+
+@contextmanager
+def own_threads() -> Iterator[int]:
+    """Turns torch's threads off within and gives their number, to be used for whole frames.
+
+    Its threads wait for each other after every small operation, which made filming ten times slower on a busy machine.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield threads
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
@@ -171,11 +179,11 @@ def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
         phase = torch.rand((), generator=generator, dtype=torch.float64)
         return torch.sin(2.0 * math.pi * (cycles * t + phase))
 
-    azimuth = torch.deg2rad(38.0 * sway(5.3) + 3.0 * sway(23.0))
-    elevation = torch.deg2rad(26.0 + 12.0 * sway(3.4) + 2.0 * sway(19.0))
-    radius = 2.15 + 0.2 * sway(2.3)
-    roll = torch.deg2rad(3.0 * sway(11.0))
-    aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.06 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
+    azimuth = torch.deg2rad(33.0 * sway(5.3) + 2.0 * sway(23.0))
+    elevation = torch.deg2rad(26.0 + 9.0 * sway(3.4) + 1.5 * sway(19.0))
+    radius = 2.2 + 0.15 * sway(2.3)
+    roll = torch.deg2rad(2.0 * sway(11.0))
+    aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.05 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
     flat = radius * torch.cos(elevation)
     center = aim + torch.stack(
         [flat * torch.sin(azimuth), -flat * torch.cos(azimuth), radius * torch.sin(elevation)], dim=1

@@ -94,7 +94,7 @@ def test_clean_pixels_are_the_truth_at_what_they_show(preset):
     assert (which >= 0).all()  # no ray leaves the room
     truth = clean.scene.truth(points, torch.tensor([time]))[:, 0].reshape(52, 64).numpy()
     error = np.abs(clean.celsius[frame] - truth)
-    assert np.mean(error < 1e-5) > 0.2  # float32 apart, one ray per pixel
+    assert np.mean(error < 1e-5) > 0.1  # float32 apart, one ray per pixel
     assert np.mean(error < 0.05) > 0.65
     padded = np.pad(truth, 1, mode="edge")
     around = [padded[i : i + 52, j : j + 64] for i, j in itertools.product(range(3), range(3))]
@@ -291,7 +291,12 @@ def test_probes_are_named_points_on_different_surfaces():
     on_surface, which = scene_of("heated").nearest(scene.probes)
     assert which.tolist() == list(range(len(TABLE_TOP)))
     assert (on_surface - scene.probes).norm(dim=1).max() < 1e-6
-    assert scene.truth(scene.probes, torch.tensor(scene.train.times_s)).shape == (len(TABLE_TOP), 16)
+    times = torch.tensor(scene.train.times_s)
+    truth = scene.truth(scene.probes, times)
+    assert truth.shape == (len(TABLE_TOP), 16)
+    # None stands on a border: a centimetre aside it is much the same, where the scene changes by tens of degrees.
+    for offset in 0.01 * torch.cat([torch.eye(3), -torch.eye(3)]):
+        assert (scene.truth(scene.probes + offset, times) - truth).abs().max() < 3.0
 
 
 def test_options_reach_the_scene():
