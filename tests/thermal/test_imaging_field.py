@@ -243,6 +243,16 @@ def test_companions_pass_untouched():
     assert (model.companions, model.modality_channels) == (("rgb",), (1, 3))
 
 
+def test_the_factor_is_told_for_pictures_without_leaving_a_trace():
+    model, splats = make(disturb=0.3)
+    told = model.attributes(splats, query(ids=torch.tensor([2, 5])))
+    assert set(told) == {"imaging_factor"} and not told["imaging_factor"].requires_grad
+    assert torch.equal(told["imaging_factor"], model.factor(splats.means[[2, 5]], query()))
+    model.regularisers(splats)
+    model.attributes(splats, query())
+    assert model.regularisers(splats) == {}
+
+
 def test_the_network_starts_from_the_generator_it_is_given():
     first, _ = make()
     torch.manual_seed(123)

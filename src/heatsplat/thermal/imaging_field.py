@@ -163,7 +163,10 @@ class ImagingField(ThermalModel):
         return terms
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return self.emission.attributes(splats, query)
+        """The emission's, and "imaging_factor", by which the field weakens what is emitted."""
+        with torch.no_grad():
+            factor = self.factor(query.rows(splats.means), query)
+        return self.emission.attributes(splats, query) | {"imaging_factor": factor}
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """That of the emission: what a sensor would see without anything in between."""
