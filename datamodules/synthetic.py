@@ -20,7 +20,7 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: name of a preset: static, cooling, heated, ... (``datamodules.synthetic_scene.presets``).
+        scene: name of a preset: static, cooling, heated, glass, ... (``datamodules.synthetic_scene.presets``).
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from datamodules.formats.lens import Lens
 from datamodules.synthetic_scene.scene import Scene
-from datamodules.synthetic_scene.shapes import trace
 from heatsplat.contracts import ThermalRange
 from heatsplat.training.rng import generator_for
 
@@ -72,6 +71,13 @@ class Recording:
     thermal_range: ThermalRange
     points: np.ndarray
     point_colors: np.ndarray
+
+    def shows(self, frame: int, surface: str) -> np.ndarray:
+        """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
+        number = [one.name for one in self.scene.preset.surfaces].index(surface)
+        rays = pixel_rays(self.lens, _pixel_centres(self.lens))
+        _, which = hits(self.scene, torch.from_numpy(self.viewmats[frame]), rays)
+        return (which == number).reshape(self.lens.height, self.lens.width).numpy()
 
     def grey(self, frame: int, dtype: type = np.uint8) -> np.ndarray:
         """Stored image [H, W] of a frame: ``thermal_range`` over the whole of an integer type, rounded and clipped."""
@@ -242,17 +248,18 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
     """
     when = torch.tensor([time_s], dtype=torch.float64)
 
-    def look(directions: Tensor) -> tuple[Tensor, Tensor]:
+    def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
-        return scene.celsius(scene.heat_at(points, which), when)[:, 0], scene.color(points, which)
+        color = scene.visible(points, which, directions @ viewmat[:3, :3])
+        return scene.celsius(scene.heat_at(points, which), when)[:, 0], color, scene.transmits[which] > 0
 
-    celsius, color = look(rays)
+    celsius, color, clear = look(rays)
     image = celsius.reshape(1, 1, lens.height, lens.width)
     around = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
-    edges = ((image - around).abs() > _EDGE_K).reshape(-1).nonzero()[:, 0]
+    edges = (((image - around).abs() > _EDGE_K).reshape(-1) | clear).nonzero()[:, 0]  # behind glass, heat has none
     third = torch.tensor([-1 / 3, 0.0, 1 / 3], dtype=torch.float64)
     within = torch.cartesian_prod(third, third)
-    fine_celsius, fine_color = look(pixel_rays(lens, (_pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
+    fine_celsius, fine_color, _ = look(pixel_rays(lens, (_pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
     celsius[edges] = fine_celsius.reshape(-1, len(within)).mean(1)
     color[edges] = fine_color.reshape(-1, len(within), 3).mean(1)
     return celsius.reshape(lens.height, lens.width), color.reshape(lens.height, lens.width, 3)
@@ -261,23 +268,26 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
 def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """First points [n, 3] on the rays ``directions`` [n, 3] (camera axes), and their surfaces [n] (-1: none)."""
     rotation = viewmat[:3, :3]
-    center = -rotation.T @ viewmat[:3, 3]
-    world = directions @ rotation
-    distance, which = trace(scene.shapes, center[None], world)
-    missed = torch.isinf(distance)
-    return center + distance.masked_fill(missed, 0.0)[:, None] * world, which.masked_fill(missed, -1)
+    return scene.first_hits(-(rotation.T @ viewmat[:3, 3])[None], directions @ rotation)
 
 
 def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, 3 mm off their surface."""
+    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, 3 mm off their surface.
+
+    Where light passes a surface, every other point is one that thermal images show and the next lies behind it.
+    """
     generator = generator_for(seed, 0, "sparse points")
     frames = torch.randint(len(viewmats), (count,), generator=generator)
     extent = torch.tensor([lens.width, lens.height], dtype=torch.float64)
     rays = pixel_rays(lens, torch.rand(count, 2, generator=generator, dtype=torch.float64) * extent)
-    points, which = torch.empty(count, 3, dtype=torch.float64), torch.empty(count, dtype=torch.int64)
+    points, which = torch.empty(count, 3, dtype=torch.float64), torch.full((count,), -1)
+    odd = torch.arange(count) % 2 == 1
     for frame in frames.unique().tolist():
         here = frames == frame
         points[here], which[here] = hits(scene, viewmats[frame], rays[here])
+        passing = here & (scene.transmits[which] > 0) & odd
+        if passing.any():
+            points[passing], which[passing] = scene.beyond(points[passing], rays[passing] @ viewmats[frame][:3, :3])
     found = which >= 0
     colors = scene.color(points, which)[found]
     noise = 0.003 * torch.randn(count, 3, generator=generator, dtype=torch.float64)

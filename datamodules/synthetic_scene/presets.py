@@ -65,6 +65,7 @@ class Surface:
         material: what it is made of.
         absorbs: absorbed share of the lamp's flux over the surface, in [0, 1]; dark paint in the colour image too.
         color: its colour where it absorbs nothing, in [0, 1].
+        transmits: share of visible light that passes straight through, in [0, 1]; heat does not.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Surface:
     material: Material
     absorbs: Pattern = Pattern(0.6)
     color: Point = (0.8, 0.8, 0.8)
+    transmits: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,7 @@ RUBBER = Material(conductivity=0.25, heat_capacity=1.6e6, depth_m=0.008, exchang
 PLASTIC = Material(conductivity=0.3, heat_capacity=1.6e6, depth_m=0.003, exchange=13.0)
 PLASTER = Material(conductivity=0.4, heat_capacity=1.0e6, depth_m=0.0095, exchange=10.0)
 LINOLEUM = Material(conductivity=0.2, heat_capacity=1.4e6, depth_m=0.006, exchange=10.0)
+GLASS = Material(conductivity=1.0, heat_capacity=2.1e6, depth_m=0.006, exchange=13.0)
 
 TABLE_TOP = (
     Surface("floor", Plane((0, 0, 0), (0, 0, 1)), LINOLEUM, Pattern(0.55, 0.1, 1.1, 0.15, 0.45), (0.75, 0.72, 0.68)),
@@ -157,6 +160,11 @@ TABLE_TOP = (
     Surface("vase", Sphere((0.05, -0.15, 0.22), 0.22), CERAMIC, Pattern(0.6, 0.1, 0.4, 0.2, 0.17), (0.4, 0.6, 0.9)),
     Surface("ball", Sphere((-0.5, -0.4, 0.15), 0.15), RUBBER, Pattern(0.55, 0.2, 0.3), (0.5, 0.85, 0.5)),
     Surface("can", Cylinder((0.5, -0.35, 0.0), 0.14, 0.42), STEEL, Pattern(0.6, 0.0, 1.0, 0.2, 0.14), (0.9, 0.8, 0.3)),
+)
+
+# Window glass passes nine tenths of visible light and reflects most of the rest; in the thermal band it is a wall.
+PANE = Surface(
+    "pane", Box((0.05, -0.65, 0.37), (1.1, 0.012, 0.74)), GLASS, Pattern(0.0), (0.8, 0.9, 0.92), transmits=0.9
 )
 
 # Warm out of the oven, each at its own temperature: 22 °C surroundings, up to about 62 °C.
@@ -199,4 +207,5 @@ PRESETS: dict[str, Preset] = {
     "static": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP),
     "cooling": Preset(start_k=_WARM, surfaces=TABLE_TOP),
     "heated": Preset(start_k=_LUKEWARM, lamp=_LAMP, surfaces=TABLE_TOP),
+    "glass": Preset(start_k=_WARM | {"pane": Pattern(4.0, 2.0, 0.5)}, held=True, surfaces=(*TABLE_TOP, PANE)),
 }

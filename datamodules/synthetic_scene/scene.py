@@ -17,7 +17,7 @@ _SUN = (-0.398, -0.597, 0.697)
 _SKYLIGHT = 0.4
 # Paint that absorbs all heat reflects this share of the colour that a bare surface does.
 _DARKEST = 0.3
-# Shadow rays start this far off their surface, in metres: above rounding at any size, far below any pixel.
+# Rays that leave a surface start this far off it, in metres: above rounding at any size, far below any pixel.
 _OFF_SURFACE_M = 1e-6
 
 
@@ -49,9 +49,26 @@ class Scene:
     def __init__(self, preset: Preset) -> None:
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
+        # By number of surface; the last entry is that of -1, no surface.
+        self.transmits = torch.tensor([*(surface.transmits for surface in preset.surfaces), 0.0], dtype=torch.float64)
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         waveform = preset.lamp.waveform if preset.lamp else heat.CONSTANT
         self.responses = heat.solve(self.materials, waveform, preset.duration_s)
+
+    def first_hits(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """First points [n, 3] on rays, and their surfaces [n]; the origin and -1 where there is none.
+
+        Args:
+            origins: [n, 3], or [1, 3] when all rays start at one point.
+            directions: [n, 3].
+        """
+        distance, which = trace(self.shapes, origins, directions)
+        missed = torch.isinf(distance)
+        return origins + distance.masked_fill(missed, 0.0)[:, None] * directions, which.masked_fill(missed, -1)
+
+    def beyond(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """What ``first_hits`` finds on rays that go on from surface points [n, 3] along ``directions`` [n, 3]."""
+        return self.first_hits(points + _OFF_SURFACE_M * directions, directions)
 
     def heat_at(self, points: Tensor, which: Tensor) -> SurfaceHeat:
         """Start, flux and material at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
@@ -110,7 +127,7 @@ class Scene:
         return self.celsius(self.heat_at(on_surface, which), times_s.to("cpu", torch.float64).reshape(-1))
 
     def color(self, points: Tensor, which: Tensor) -> Tensor:
-        """Visible colour [n, 3] in [0, 1] of surface points: Lambertian, dark where the paint absorbs heat."""
+        """Colour [n, 3] in [0, 1] that surface points reflect: Lambertian, dark where the paint absorbs heat."""
         color = torch.zeros_like(points)
         for number, surface in enumerate(self.preset.surfaces):
             here = which == number
@@ -120,4 +137,18 @@ class Scene:
             daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (surface.shape.normals(on) @ on.new_tensor(_SUN)).clamp_min(0.0)
             albedo = 1 - (1 - _DARKEST) * surface.absorbs(surface.shape.local(on)).clamp(0.0, 1.0)
             color[here] = (albedo * daylight)[:, None] * on.new_tensor(surface.color)
+        return color
+
+    def visible(self, points: Tensor, which: Tensor, directions: Tensor) -> Tensor:
+        """Colour [n, 3] in [0, 1] seen along rays that first meet ``points`` [n, 3] on surfaces ``which`` [n].
+
+        A surface that transmits light adds its own colour to that of what lies behind it.
+        """
+        color = self.color(points, which)
+        share = self.transmits[which]
+        clear = share.nonzero()[:, 0]
+        if len(clear):
+            onwards = directions[clear]
+            behind = self.visible(*self.beyond(points[clear], onwards), onwards)
+            color[clear] = torch.lerp(color[clear], behind, share[clear, None])
         return color
