@@ -80,19 +80,21 @@ class Photometric:
     Args:
         dssim_weight: w in [0, 1]. At 0 SSIM is absent: not computed, not reported.
         dssim_half: halves 1 - SSIM (ETGS, Eq. 36), so that it lies in [0, 1].
+        modality: which image: that of a companion, such as "rgb", or None for the model's own.
 
     Raises:
         ValueError: w is outside [0, 1]; or, when called, the images or the mask do not fit together.
     """
 
-    def __init__(self, dssim_weight: float = 0.2, dssim_half: bool = False) -> None:
+    def __init__(self, dssim_weight: float = 0.2, dssim_half: bool = False, modality: str | None = None) -> None:
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight is a share of the loss in [0, 1], got {dssim_weight}")
         self.l1_weight = 1.0 - dssim_weight
         self.dssim_weight = 0.5 * dssim_weight if dssim_half else dssim_weight
+        self.modality = modality
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
-        prediction, target, mask = inputs.prediction, inputs.target, inputs.mask
+        (prediction, target), mask = inputs.pair(self.modality), inputs.mask
         if prediction.shape != target.shape or prediction.ndim != 3:
             raise ValueError(
                 f"prediction and target must both be [H, W, C], got {list(prediction.shape)} and {list(target.shape)}"

@@ -14,12 +14,12 @@ from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.clipping import CLIPS, clipped
 
 log = logging.getLogger(__name__)
 
 PARAMS = ("rate", "faithful")
 REDUCTIONS = ("sum", "mean_over_gaussians")
-CLIPS = ("straight_through", "hard", "none")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
@@ -153,11 +153,7 @@ class NewtonHarmonic(ThermalModel):
         if query.time_s is None:
             raise ValueError("a scene that changes needs the time at which it is seen: give time_s")
         state = self._state(splats, query.time_s, query.ids)
-        if self.clip == "straight_through":
-            state = _StraightThroughClamp.apply(state)
-        elif self.clip == "hard":
-            state = state.clamp(0, 1)
-        return Emission(state[:, None])
+        return Emission(clipped(state, self.clip)[:, None])
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         if self.range_c.isnan().any():
@@ -191,15 +187,3 @@ class NewtonHarmonic(ThermalModel):
     def cost(self) -> int:
         # One exponential and 4 operations for relaxation; per frequency 3 weights, 2 responses of 3 and 2 gains.
         return 12 + 11 * self.omega.numel()
-
-
-class _StraightThroughClamp(torch.autograd.Function):
-    """Values clamped to [0, 1] with the gradient of the identity."""
-
-    @staticmethod
-    def forward(ctx, values: Tensor) -> Tensor:
-        return values.clamp(0, 1)
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        return grad

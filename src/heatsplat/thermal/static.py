@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import KELVIN_AT_0_C, SceneData, ThermalRange
 from heatsplat.geometry import spherical_harmonics
-from heatsplat.kernels import spherical_harmonics as kernel
-from heatsplat.kernels.compilation import announced
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
-
-_COMPILING = "compiling the kernels of spherical harmonics; this takes some seconds and happens once"
+from heatsplat.thermal.harmonics import harmonics
 
 
 class Static(ThermalModel):
@@ -72,11 +68,8 @@ class Static(ThermalModel):
             self.active_degree = min(self.degree, step // self.degree_every)
 
     def features(self, splats: Splats, query: Query) -> Emission:
-        if self.active_degree == 0:
-            return Emission((spherical_harmonics.C0 * query.rows(splats["sh0"])[:, 0] + 0.5).clamp(min=0.0))
-        if query.camera is None:
-            raise ValueError(f"static emission of degree {self.active_degree} depends on the view: give a camera")
-        values = _harmonics(splats, query, self.active_degree)
+        rest = splats["sh_rest"] if self.active_degree > 0 else None
+        values = harmonics(splats["sh0"], rest, splats.means, query, self.active_degree)
         return Emission((values + 0.5).clamp(min=0.0))
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
@@ -93,37 +86,3 @@ class Static(ThermalModel):
         (channels,) = self.modality_channels
         basis = {0: 0, 1: 12, 2: 27, 3: 48}[self.degree]  # normalising the direction and the polynomials in it
         return basis + self.bands * channels
-
-
-def _harmonics(splats: Splats, query: Query, degree: int) -> Tensor:
-    """Sums of harmonics of the direction from the camera, [n, C]: by the fused kernel, or in plain torch."""
-    center = query.camera.center.to(splats.means)
-    if center.device.type == "cpu" and center.dtype == torch.float32:
-        return _FusedHarmonics.apply(splats["sh0"], splats["sh_rest"], splats.means, center, query.ids, degree)
-    coefficients = torch.cat((query.rows(splats["sh0"]), query.rows(splats["sh_rest"])), 1)
-    return spherical_harmonics.evaluate(coefficients, query.rows(splats.means) - center, degree)
-
-
-class _FusedHarmonics(torch.autograd.Function):
-    """The kernel with its gradients; ids are unique, as a renderer's visible ids are."""
-
-    @staticmethod
-    def forward(ctx, constant, rest, means, center, ids, degree):
-        ids = torch.arange(len(means)) if ids is None else ids
-        values = constant.new_empty(len(ids), constant.shape[2])
-        arrays = [tensor.detach().contiguous().numpy() for tensor in (constant, rest, means, center, ids)]
-        with announced(_COMPILING):
-            kernel.forward(*arrays, degree, values.numpy())
-        ctx.inputs = *arrays[1:], degree
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, v_values):
-        rest, means, _, ids, _ = ctx.inputs
-        allocate = torch.empty if len(ids) == len(means) else torch.zeros  # rows out of view get no gradient
-        v_constant = allocate(len(means), 1, v_values.shape[1])
-        gradients = v_constant, allocate(rest.shape), allocate(means.shape)
-        with announced(_COMPILING):
-            kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
-        return *gradients, None, None, None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,7 @@ class SplatTraining(pl.LightningModule):
         loss: what is minimised.
         init: how splats start.
         optim: learning rates and schedule.
-        stages: which parameters stand still at which steps, or None where all train throughout.
+        stages: which parameters stand still at which steps; None: all train throughout.
         seed: seed of every random draw.
         output_dir: folder of the run.
     """
@@ -64,7 +63,8 @@ class SplatTraining(pl.LightningModule):
         super().__init__()
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
-        self.stages, self.seed, self.output_dir = stages, seed, Path(output_dir)
+        self.stages = stages or Stages({})
+        self.seed, self.output_dir = seed, Path(output_dir)
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
         self.results = RunResults()
@@ -123,8 +123,7 @@ class SplatTraining(pl.LightningModule):
             for inner, parameter in part.named_parameters()
         ]
         optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps)
-        if self.stages is not None:
-            self.stages.check(optimizer)
+        self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     # One step ----------------------------------------------------------------------------------------
@@ -182,7 +181,7 @@ class SplatTraining(pl.LightningModule):
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
         inner = getattr(optimizer, "optimizer", optimizer)
-        with nullcontext() if self.stages is None else self.stages.on_step(step, inner):
+        with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, inner, self._density_state)
         if self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density")) is not None:

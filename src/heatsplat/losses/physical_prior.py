@@ -1,0 +1,60 @@
+"""The physical prior of RaViGS: emissivity and reflectance are shares, and their sum is at most one."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from heatsplat.geometry.spherical_harmonics import C0
+from heatsplat.losses.compose import LossInputs
+
+OF = ("activated", "coefficients")
+
+
+def outside(shares: Tensor) -> Tensor:
+    """How far values lie outside [0, 1], any shape; 0 within (B of RaViGS, Eq. 15)."""
+    return (-shares).relu() + (shares - 1.0).relu()
+
+
+def kirchhoff_excess(emissivity: Tensor, reflectance: Tensor, tolerance: float) -> Tensor:
+    """How far ε + ρ exceeds 1 + δ, any shape; 0 where it does not. A body cannot emit and reflect more than all."""
+    return (emissivity + reflectance - (1.0 + tolerance)).relu()
+
+
+class PhysicalPrior:
+    """The mean over Gaussians of B(ε)² + B(ρ)² + ReLU(ε + ρ - (1 + δ))² (RaViGS, Eq. 15), of the constant harmonics.
+
+    Gaussians without both attributes have no such prior, and the term is absent.
+
+    Args:
+        tolerance: δ.
+        of: "activated" takes ε and ρ as they act, the sigmoid of the constant harmonic: B is then zero by construction
+            and the sum is what counts. "coefficients" takes the coefficients of the constant harmonics themselves, as
+            the paper prints; it pulls ε and ρ towards 1/2, as a coefficient in [0, 1] is a share of 0.50 to 0.57.
+        emissivity, reflectance: names of the tensors, [N, 1, 1] before the sigmoid.
+
+    Raises:
+        ValueError: ``of`` is unknown.
+    """
+
+    def __init__(
+        self,
+        tolerance: float = 0.05,
+        of: str = "activated",
+        emissivity: str = "emissivity",
+        reflectance: str = "reflectance",
+    ) -> None:
+        if of not in OF:
+            raise ValueError(f"of must be one of {', '.join(OF)}, got '{of}'")
+        self.tolerance, self.activated = tolerance, of == "activated"
+        self.names = emissivity, reflectance
+
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
+        if not all(name in inputs.splats for name in self.names):
+            return {}
+        emissivity, reflectance = (inputs.splats[name] for name in self.names)
+        excess = 0.0
+        if self.activated:
+            emissivity, reflectance = ((C0 * values).sigmoid() for values in (emissivity, reflectance))
+        else:
+            excess = outside(emissivity).square() + outside(reflectance).square()
+        return (excess + kirchhoff_excess(emissivity, reflectance, self.tolerance).square()).mean()

@@ -1,0 +1,194 @@
+"""RaViGS: every Gaussian is a grey body that emits and reflects in the thermal band, and it has a visible colour."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from heatsplat.contracts import SceneData
+from heatsplat.geometry import spherical_harmonics
+from heatsplat.physics.grey_body import radiance, temperature_of
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.clipping import CLIPS, clipped
+from heatsplat.thermal.harmonics import harmonics
+
+DEGREES = {"emissivity": 1, "temperature": 1, "reflectance": 0}
+ATTRIBUTES = tuple(DEGREES)
+REFLECTANCES = ("free", "kirchhoff")
+START = (0.05, 0.98)  # of temperature: below, 4 T³ leaves hardly a gradient; above, hardly the sigmoid's
+
+
+class Radiative(ThermalModel):
+    """Thermal emission clip(ε σ T⁴ + ρ L, 0, 1) beside a colour image, on the same Gaussians (RaViGS, Eq. 4-9).
+
+    Emissivity ε, temperature T and reflectance ρ of a Gaussian are sigmoids of spherical harmonics of the direction of
+    view; the gain σ and the radiance L of the surroundings belong to the scene. Each image has opacities of its own, so
+    that a pane may be clear in one band and opaque in the other.
+
+    **Convention:** everything is in image units. Only the sum ε σ T⁴ + ρ L is observed, so that T orders surfaces by
+    heat but is no temperature in kelvin; temperatures are those of the image, through the scene's range.
+
+    Tensors: "emissivity", "temperature", "reflectance" [N, 1, 1] (the constant harmonic, before the sigmoid) and, from
+    degree 1, "emissivity_rest" and so on, [N, B - 1, 1]; those of ``color``. Without the three parameters there is
+    "radiance" in their place.
+
+    Args:
+        color: model of the visible image, of modality "rgb", such as ``Static``.
+        three_parameter: False emits max(0, 1/2 + harmonics) as 3DGS does, without ε, T, ρ, σ and L (Tab. 3).
+        dual_opacity: False composites both images with one opacity (Tab. 3).
+        reflectance: "free", as the paper has it, or "kirchhoff": ρ = 1 - ε, as it is for opaque bodies.
+        degrees: degree of the harmonics of each attribute, 0 to 3; that of "temperature" serves "radiance" too.
+        emissivity, reflectance_start, gain, surroundings: ε, ρ, σ and L before training. T starts at what then gives
+            the grey value of the training images, within 0.05 and 0.98.
+        clip: how values above 1 are shown: "straight_through" clamps them but lets gradients pass; "hard" stops their
+            gradient (the paper's Eq. 5); "none" shows them as they are.
+        color_l2: λ_sh, weight of the squared higher harmonics of the colour, summed over harmonics and channels and
+            averaged over Gaussians (Eq. 14); applied inside the optimiser. 0 leaves it out.
+        lr_attributes: learning rate of constant harmonics of ε, T and ρ.
+        lr_rest: that of the further ones.
+        lr_attributes_end: factor on both at the end of the run.
+        lr: learning rate of σ and L before softplus and sigmoid.
+
+    Raises:
+        ValueError: an option is unknown, or a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        color: ThermalModel,
+        three_parameter: bool = True,
+        dual_opacity: bool = True,
+        reflectance: str = "free",
+        degrees: Mapping[str, int] = DEGREES,
+        emissivity: float = 0.9,
+        reflectance_start: float = 0.1,
+        gain: float = 1.0,
+        surroundings: float = 0.2,
+        clip: str = "straight_through",
+        color_l2: float = 1e-4,
+        lr_attributes: float = 2.5e-3,
+        lr_rest: float = 1.25e-4,
+        lr_attributes_end: float = 0.1,
+        lr: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (("reflectance", reflectance, REFLECTANCES), ("clip", clip, CLIPS)):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        if not (0 < emissivity < 1 and 0 < reflectance_start < 1 and 0 < surroundings < 1 and gain > 0):
+            raise ValueError(
+                "emissivity, reflectance_start and surroundings lie between 0 and 1 and gain is positive, got "
+                f"{emissivity}, {reflectance_start}, {surroundings} and {gain}"
+            )
+        if color.modality != "rgb" or color.companions:
+            raise ValueError(f"color must explain rgb images and nothing else, got a model of {color.modality} images")
+        if set(degrees) != set(ATTRIBUTES):
+            raise ValueError(f"degrees must name {', '.join(ATTRIBUTES)}, got {', '.join(degrees)}")
+        self.three_parameter, self.kirchhoff, self.clip = three_parameter, reflectance == "kirchhoff", clip
+        if not three_parameter:
+            self.degrees = {"radiance": degrees["temperature"]}
+        else:
+            self.degrees = {name: degrees[name] for name in ATTRIBUTES[: 2 if self.kirchhoff else 3]}
+        self.bands = {name: spherical_harmonics.band_count(degree) for name, degree in self.degrees.items()}
+        self.color, self.companions, self.needs = color, (color.modality,), color.needs
+        self.modality_channels, self.shared_opacity = (1, *color.modality_channels), not dual_opacity
+        self.emissivity, self.reflectance = emissivity, 1 - emissivity if self.kirchhoff else reflectance_start
+        self.color_l2, self.lr = color_l2, lr
+        self.lr_attributes, self.lr_rest, self.lr_attributes_end = lr_attributes, lr_rest, lr_attributes_end
+        if three_parameter:
+            self.raw_gain = nn.Parameter(torch.tensor(math.log(math.expm1(gain))))
+            self.raw_surroundings = nn.Parameter(torch.logit(torch.tensor(surroundings)))
+
+    @property
+    def gain(self) -> Tensor:
+        """σ, positive."""
+        return softplus(self.raw_gain)
+
+    @property
+    def surroundings(self) -> Tensor:
+        """L, in (0, 1)."""
+        return self.raw_surroundings.sigmoid()
+
+    # What the contract asks -----------------------------------------------------------------------------
+
+    def prepare(self, scene: SceneData) -> None:
+        self.check(scene)
+        self.color.prepare(scene)
+
+    @torch.no_grad()
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        grey, tensors = seeds.values[:, :1], {}
+        for name, start in self._starts(grey).items():
+            constant = start[:, None] / spherical_harmonics.C0
+            tensors[name] = PerGaussian(constant, self.lr_attributes, lr_end=self.lr_attributes_end)
+            if self.bands[name] > 1:
+                rest = grey.new_zeros(len(grey), self.bands[name] - 1, 1)
+                tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end)
+        colored = self.color.per_gaussian(Seeds(seeds.means, seeds.values[:, 1:], seeds.generator))
+        for name, part in colored.items():
+            if name.endswith("_rest") and self.color_l2 > 0:
+                colored[name] = replace(part, l2=self.color_l2, l2_mean=True)
+        return tensors | colored
+
+    def _starts(self, grey: Tensor) -> dict[str, Tensor]:
+        """What the sums of harmonics start at, by name of attribute, [N, 1]: they give the grey values [N, 1]."""
+        if not self.three_parameter:
+            return {"radiance": grey - 0.5}
+        emissivity, reflectance = torch.full_like(grey, self.emissivity), torch.full_like(grey, self.reflectance)
+        temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings).clamp(*START)
+        values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
+        return {name: torch.logit(values[name]) for name in self.degrees}
+
+    def features(self, splats: Splats, query: Query) -> Emission:
+        heat = self._heat(splats, query)
+        return Emission(torch.cat((heat, self.color.features(splats, query).features), dim=1))
+
+    def on_step(self, step: int) -> None:
+        self.color.on_step(step)
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Emissivity, temperature (in (0, 1), no kelvin) and reflectance; nothing without the three parameters."""
+        if not self.three_parameter:
+            return {}
+        return {name: values[:, 0] for name, values in self._body(splats, query).items()}
+
+    def effects(self) -> dict[str, dict]:
+        effects = self.color.effects()
+        if self.three_parameter:
+            effects["grey_emission"] = {"law": "ε σ T⁴", "degrees": dict(self.degrees)}
+            effects["reflected_surroundings"] = {"reflectance": "1 - ε" if self.kirchhoff else "learned"}
+        if not self.shared_opacity:
+            effects["opacity_per_band"] = {"opacities": len(self.opacity_channels)}
+        return effects
+
+    @property
+    def cost(self) -> int:
+        directions = {1: 0, 4: 12, 9: 27, 16: 48}  # by number of harmonics: normalising, and the polynomials
+        formula = 6 + 4 * len(self.degrees) if self.three_parameter else 1  # the sum, and a sigmoid per attribute
+        return self.color.cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
+
+    # The thermal band -----------------------------------------------------------------------------------
+
+    def _heat(self, splats: Splats, query: Query) -> Tensor:
+        """What is emitted in the thermal band, [n, 1]."""
+        if not self.three_parameter:
+            return (self._sum(splats, query, "radiance") + 0.5).clamp(min=0.0)
+        body = self._body(splats, query)
+        sent = radiance(body["emissivity"], body["temperature"], self.gain, body["reflectance"], self.surroundings)
+        return clipped(sent, self.clip)
+
+    def _body(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """ε, T and ρ in the direction of view, each [n, 1]."""
+        body = {name: self._sum(splats, query, name).sigmoid() for name in self.degrees}
+        return body | {"reflectance": 1.0 - body["emissivity"]} if self.kirchhoff else body
+
+    def _sum(self, splats: Splats, query: Query, name: str) -> Tensor:
+        """The sum of harmonics of an attribute, [n, 1]."""
+        degree = self.degrees[name]
+        return harmonics(splats[name], splats[f"{name}_rest"] if degree > 0 else None, splats.means, query, degree)
