@@ -104,6 +104,9 @@ class FakeModule(pl.LightningModule):
         image[:, : WIDTH // 2] = self.value.detach() * float(warmth(frame.time_s))
         return image.clamp(0, 1)
 
+    def attribute_maps(self, frame):
+        return {}
+
     def training_step(self, view, batch_idx):
         target = view.image(self.modality)[:, : WIDTH // 2].mean()
         data = (self.value * float(warmth(view.time_s)) - target).square()

@@ -44,7 +44,14 @@ def test_every_key_has_a_comment(file):
 
 def test_an_evaluation_has_the_measuring_part():
     evaluate, default = (yaml.safe_load(file.read_text()) for file in FILES)
-    assert list(evaluate) == ["costs", "metrics", "images", "probes", "report"]  # costs first: its clock stops first
+    assert list(evaluate) == [
+        "costs",
+        "metrics",
+        "images",
+        "attributes",
+        "probes",
+        "report",
+    ]  # costs first, report last
     assert default["defaults"] == ["evaluate", "_self_"]
     assert not set(evaluate) & set(default)
     assert "${" not in FILES[0].read_text()  # needs nothing of a training's configuration

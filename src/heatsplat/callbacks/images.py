@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytorch_lightning as pl
+from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.contracts import Frame
+from heatsplat.contracts import Frame, SceneData, View
 from heatsplat.io.pictures import comparison_picture, write_png
 from heatsplat.metrics import mae_c, psnr
 
@@ -16,7 +18,8 @@ from heatsplat.metrics import mae_c, psnr
 class ImagePanels(pl.Callback):
     """Draws ground truth | render | error in °C of a few views into TensorBoard and as PNG into renders/.
 
-    The same validation views every time (renders/val holds their latest state, TensorBoard all of them), and test views
+    So too, with "_rgb" and the like after the name, the images that a model explains besides (its companions). The same
+    validation views every time (renders/val holds their latest state, TensorBoard all of them), and test views
     at the end (renders/test).
 
     Args:
@@ -42,22 +45,28 @@ class ImagePanels(pl.Callback):
             self._draw("test", module, outputs, trainer.global_step)
 
     def _draw(self, split: str, module: pl.LightningModule, outputs: dict[str, Any], step: int) -> None:
-        view = outputs["view"]
-        prediction, target = outputs["prediction"].float().cpu(), view.image(module.modality).cpu()
-        mask = None if view.mask is None else view.mask.cpu()
-        thermal_range = module.scene.thermal_range if module.modality == "thermal" else None
-        title = [view.frame.name]
-        if view.frame.time_s is not None:
-            title.append(f"t = {view.frame.time_s:.4g} s")
-        scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
-        if thermal_range is not None and target.shape[-1] == 1:
-            scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
-        title += [text.format(value) for value, text in scores if value is not None]
-        picture = comparison_picture(target, prediction, thermal_range, mask, title="   ·   ".join(title))
-        write_png(module.output_dir / "renders" / split / f"{file_stem(view.frame)}.png", picture)
-        writer = board(module)
-        if writer is not None:
-            writer.add_image(f"{split}/{file_stem(view.frame)}", picture, step, dataformats="HWC")
+        view, writer = outputs["view"], board(module)
+        for modality, image in ({module.modality: outputs["prediction"]} | outputs.get("companions", {})).items():
+            name = file_stem(view.frame) + ("" if modality == module.modality else f"_{modality}")
+            picture = panels(view, modality, image, module.scene)
+            write_png(module.output_dir / "renders" / split / f"{name}.png", picture)
+            if writer is not None:
+                writer.add_image(f"{split}/{name}", picture, step, dataformats="HWC")
+
+
+def panels(view: View, modality: str, prediction: Tensor, scene: SceneData) -> np.ndarray:
+    """Ground truth, render and error of one image of a view, with its scores, uint8 RGB."""
+    prediction, target = prediction.float().cpu(), view.image(modality).cpu()
+    mask = None if view.mask is None else view.mask.cpu()
+    thermal_range = scene.thermal_range if modality == "thermal" else None
+    title = [view.frame.name]
+    if view.frame.time_s is not None:
+        title.append(f"t = {view.frame.time_s:.4g} s")
+    scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
+    if thermal_range is not None and target.shape[-1] == 1:
+        scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
+    title += [text.format(value) for value, text in scores if value is not None]
+    return comparison_picture(target, prediction, thermal_range, mask, title="   ·   ".join(title))
 
 
 def spread(count: int, chosen: int) -> list[int]:

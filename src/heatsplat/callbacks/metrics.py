@@ -13,7 +13,15 @@ from torch import Tensor
 from heatsplat.callbacks.board import board
 from heatsplat.contracts import SceneData
 from heatsplat.io.results import write_atomically
-from heatsplat.metrics import DEFINITIONS, LpipsUnavailable, Scorer, load_lpips, mean_of_images, scene_threshold
+from heatsplat.metrics import (
+    DEFINITIONS,
+    IMAGE_SCORES,
+    LpipsUnavailable,
+    Scorer,
+    load_lpips,
+    mean_of_images,
+    scene_threshold,
+)
 
 CURVE_FILE = "curve.csv"
 TEST_FILE = "test_per_image.csv"
@@ -26,6 +34,9 @@ class QualityMetrics(pl.Callback):
     Validation: means over the views as ``val/*`` against steps and as ``val_by_seconds/*`` against seconds of training
     (evaluation excluded), and a row in curve.csv. Test: means into ``module.results.test``, every image's scores into
     test_per_image.csv, what the scores mean into ``module.results.definitions``.
+
+    Images that a model explains besides (its companions) are scored as images, under names such as ``rgb_psnr``;
+    methods without companions have no such scores.
 
     Args:
         lpips_net: "alex" or "vgg"; values of one net say nothing about the other's. None leaves LPIPS out.
@@ -44,7 +55,8 @@ class QualityMetrics(pl.Callback):
         self.lpips_net, self.lpips_weights = lpips_net, lpips_weights
         self.lpips_in_validation, self.cold_scene = lpips_in_validation, cold_scene
         self.curve: list[dict[str, float | None]] = []
-        self._scorer = Scorer()
+        self._scorer = self._image_scorer = Scorer()
+        self._companions: tuple[str, ...] = ()
         self._rows: list[dict[str, Any]] = []
         self._no_lpips = "not asked for"
 
@@ -61,13 +73,26 @@ class QualityMetrics(pl.Callback):
             except LpipsUnavailable as error:
                 self._no_lpips = str(error)
         self._scorer = Scorer(thermal_range, threshold, self.cold_scene, network)
+        self._image_scorer = Scorer(lpips=network)
 
     def _score(self, module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Adds one image's row."""
         view, prediction = outputs["view"], outputs["prediction"]
         frame = view.frame
         row = {"name": frame.name, "frame_id": frame.frame_id, "time_s": frame.time_s, "seconds": outputs["seconds"]}
-        self._rows.append(row | self._scorer(prediction, view.image(module.modality), view.mask))
+        row |= self._scorer(prediction, view.image(module.modality), view.mask)
+        companions = outputs.get("companions", {})
+        for modality, image in companions.items():
+            scores = self._image_scorer(image, view.image(modality), view.mask)
+            row |= {f"{modality}_{name}": scores[name] for name in IMAGE_SCORES}
+        self._companions = tuple(companions)
+        self._rows.append(row)
+
+    @property
+    def _names(self) -> dict[str, str]:
+        """Names of all scores of this pass, and under which each is defined."""
+        of_companions = {f"{modality}_{name}": name for modality in self._companions for name in IMAGE_SCORES}
+        return {name: name for name in DEFINITIONS} | of_companions
 
     # Validation ------------------------------------------------------------------------------------------------------
 
@@ -80,14 +105,14 @@ class QualityMetrics(pl.Callback):
     def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if trainer.sanity_checking or not self._rows:
             return
-        means = {name: mean_of_images(self._rows, name) for name in DEFINITIONS}
+        means = {name: mean_of_images(self._rows, name) for name in self._names}
         step, seconds = trainer.global_step, module.results.cost.get("train_seconds")
         self._log(module, "val", means, step)
         if seconds is not None:
             self._log(module, "val_by_seconds", means, round(seconds))
         self.curve = [row for row in self.curve if row["step"] < step]
         self.curve.append({"step": step, "train_seconds": seconds, "gaussians": len(module.splats), **means})
-        write_table(module.output_dir / CURVE_FILE, CURVE_COLUMNS, self.curve)
+        write_table(module.output_dir / CURVE_FILE, tuple(self.curve[-1]), self.curve)
 
     # Test ------------------------------------------------------------------------------------------------------------
 
@@ -101,15 +126,17 @@ class QualityMetrics(pl.Callback):
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         results, count = module.results, len(self._rows)
-        for name, definition in DEFINITIONS.items():
+        for name, defined_as in self._names.items():
+            definition = DEFINITIONS[defined_as]
             value = mean_of_images(self._rows, name) if count else None
-            results.put("test", name, value, None if value is not None else self._why_not(name, module))
+            results.put("test", name, value, None if value is not None else self._why_not(defined_as, module))
             having = sum(row[name] is not None for row in self._rows)
             unit = f"{definition.unit}, " if definition.unit else ""
             some = f"; mean of the {having} of {count} test images that have one" if 0 < having < count else ""
             results.definitions[name] = f"{unit}{definition.better} is better: {definition.sentence}{some}"
         if self._scorer.lpips is not None:
-            results.definitions["lpips"] = f"lower is better: {self._scorer.lpips.description}"
+            for name in (name for name, defined_as in self._names.items() if defined_as == "lpips"):
+                results.definitions[name] = f"lower is better: {self._scorer.lpips.description}"
         results.definitions["scored"] = (
             f"the image that the camera would record, clamped to [0, 1], {module.modality}; mean of {count} test images"
         )

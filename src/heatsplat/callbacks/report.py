@@ -194,10 +194,11 @@ def report(
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
     """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
     units = COST_UNITS | {name: definition.unit for name, definition in DEFINITIONS.items()}
-    return [
-        (name, "–" if value is None else f"{_number(value)} {units.get(name, '')}".rstrip())
-        for name, value in content[section].items()
-    ]
+    cells = []
+    for name, value in content[section].items():
+        unit = units.get(name, units.get(name.rpartition("_")[2], ""))  # rgb_psnr has the unit of psnr
+        cells.append((name, "–" if value is None else f"{_number(value)} {unit}".rstrip()))
+    return cells
 
 
 def _number(value: float) -> str:

@@ -10,6 +10,7 @@ from heatsplat.metrics.mae_roi import scene_threshold as scene_threshold
 from heatsplat.metrics.otsu import otsu_level as otsu_level
 from heatsplat.metrics.psnr import psnr as psnr
 from heatsplat.metrics.scores import DEFINITIONS as DEFINITIONS
+from heatsplat.metrics.scores import IMAGE_SCORES as IMAGE_SCORES
 from heatsplat.metrics.scores import Scorer as Scorer
 from heatsplat.metrics.scores import mean_of_images as mean_of_images
 from heatsplat.metrics.ssim import ssim as ssim

@@ -53,6 +53,8 @@ DEFINITIONS = {
     ),
 }
 
+IMAGE_SCORES = ("psnr", "ssim", "lpips")  # those of any image, temperature or not
+
 
 @dataclass(frozen=True)
 class Scorer:

@@ -1,0 +1,60 @@
+"""Pictures of what a thermal model knows of its Gaussians besides the image: emissivity, temperature and the like."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytorch_lightning as pl
+
+from heatsplat.callbacks.board import board
+from heatsplat.callbacks.images import file_stem, spread
+from heatsplat.contracts import Frame
+from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
+
+COLORMAP = "viridis"  # not that of temperatures
+
+
+class AttributeMaps(pl.Callback):
+    """Draws the attributes of the thermal model (``module.attribute_maps``) as images, side by side.
+
+    The same validation views every time (renders/attributes/val), and test views at the end (renders/attributes/test);
+    TensorBoard holds all of them. Models without attributes have no such pictures.
+
+    Args:
+        val_views: how many validation views, spread evenly; 0 for none.
+        test_views: how many test views, spread evenly; 0 for none.
+    """
+
+    def __init__(self, val_views: int = 1, test_views: int = 2) -> None:
+        self.val_views, self.test_views = val_views, test_views
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking:
+            self._draw("val", module, self.val_views, trainer.global_step)
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._draw("test", module, self.test_views, trainer.global_step)
+
+    def _draw(self, split: str, module: pl.LightningModule, count: int, step: int) -> None:
+        frames = getattr(module.scene, split).frames
+        for i in spread(len(frames), count):
+            picture = attribute_picture(module, frames[i])
+            if picture is None:
+                return
+            name = file_stem(frames[i])
+            write_png(module.output_dir / "renders" / "attributes" / split / f"{name}.png", picture)
+            writer: Any = board(module)
+            if writer is not None:
+                writer.add_image(f"attributes/{split}/{name}", picture, step, dataformats="HWC")
+
+
+def attribute_picture(module: pl.LightningModule, frame: Frame) -> np.ndarray | None:
+    """The attribute maps of a view side by side, each with its bar, uint8 RGB; None for models without attributes."""
+    panels = []
+    for name, image in module.attribute_maps(frame).items():
+        values = image.double().cpu().numpy()
+        known = values[np.isfinite(values)]
+        low, high = (float(x) for x in np.percentile(known, (0.1, 99.9))) if known.size else (0.0, 1.0)
+        panels.append(Panel(colorize(values, low, high, COLORMAP), name, Bar(low, high, "", COLORMAP)))
+    return compose(panels, frame.name) if panels else None
