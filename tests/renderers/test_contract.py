@@ -49,6 +49,9 @@ class Result:
         return {"features": output.features, "alpha": output.alpha, "depth": output.depth}
 
 
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+
+
 def camera_matrix(focal: float, width: int, height: int) -> Tensor:
     # Unequal focal lengths and an off-centre principal point, so that no axis can stand for the other.
     return torch.tensor([[focal, 0, 0.46 * width], [0, 1.1 * focal, 0.55 * height], [0, 0, 1]], dtype=torch.float64)
@@ -661,6 +664,44 @@ def test_below_the_opacity_cut_nothing_is_seen(backend):
     actual = run(backend, scene)
     assert_unseen(actual, [0, 1])
     assert_finite(actual)
+
+
+def test_extents_reach_to_the_opacity_cut(backend):
+    # Spheres on the axis, whose alpha falls to 1/255 at a distance that is known.
+    opacities = torch.tensor([0.9, 0.3, 0.05, 0.006, 0.004], dtype=torch.float64)
+    scene = facing([[0.0, 0.0, 2.0]] * 5, [0.4] * 3, opacities)
+    for axis, focal in enumerate((20.0, 22.0)):
+        deviation = math.sqrt((0.4 * focal / 2) ** 2 + BLUR)
+        expected = (deviation * (2 * (255 * opacities).log()).sqrt()).ceil()
+        assert run(backend, scene).output.meta["radii"][:, axis].tolist() == expected.tolist()
+
+
+def test_a_gaussian_beyond_the_border_is_seen_by_its_tail(backend):
+    # Its centre lies so far left of the image that only the first column has an alpha above the cut.
+    deviation = math.sqrt((0.05 * 20 / 2) ** 2 + BLUR)
+    reach = deviation * math.sqrt(2 * math.log(255 * 0.9))
+    x = 0.5 + 0.02 - reach
+    scene = facing([[2 * (x - 0.46 * 24) / 20, 2 * (10.5 - 11.0) / 22, 2.0]], 0.0, 0.9)
+    scene = rounded(replace(scene, scales=torch.tensor([[0.05, 0.05, 0.0]], dtype=torch.float64), quats=UPRIGHT))
+    alpha = run(backend, scene).output.alpha[0]
+    assert alpha[10, 0].item() == pytest.approx(0.9 * math.exp(-0.5 * ((reach - 0.02) / deviation) ** 2), rel=1e-3)
+    assert (alpha[:, 1:] == 0).all()
+
+
+def test_a_gaussian_may_be_opaque_in_one_modality_only(backend):
+    scene = plain_scene(40, (3, 1), absgrad=True)
+    opacities = scene.opacities.clone()
+    opacities[0, ::2], opacities[1, 1::2] = 0.001, 0.002
+    scene = rounded(replace(scene, opacities=opacities))
+    actual = run(backend, scene)
+    assert_close(actual, oracle(scene))
+    for m in (0, 1):  # each modality is what it would be alone
+        part = slice(0, 3) if m == 0 else slice(3, 4)
+        alone = replace(
+            scene, opacities=opacities[m : m + 1], features=scene.features[:, part], background=scene.background[part]
+        )
+        alone = oracle(alone, modality_channels=(part.stop - part.start,))
+        assert relative(actual.output.features[..., part], alone.output.features) < 1e-4
 
 
 def test_bounds_never_cut_what_counts(backend):
