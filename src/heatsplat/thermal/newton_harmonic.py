@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -44,13 +45,14 @@ class NewtonHarmonic(ThermalModel):
         tau_min_s: shortest time constant, bounds the frequencies; None takes max(median gap of the times, span / 200).
         frequency_gain: steady-state amplitude below which a frequency is left out, in (0, 1].
         source_l2: weight of the penalty on gains.
-        l2_reduction: "sum" over Gaussians and frequencies (the paper; grows with the number of Gaussians) or
-            "mean_over_gaussians" (a sum over frequencies alone).
+        l2_reduction: "mean_over_gaussians" (a sum over frequencies alone) or "sum" over Gaussians and frequencies (the
+            paper), which grows with their number and, in these units, suppresses the source it should only tame.
         gauge_l2: weight of the prior (log C)² in faithful form.
         ambient: "measured" (the scene's, else learned), "learned" (from the measured one, if any) or a number in °C.
         clip: how values outside the range are shown: "straight_through" clamps values but lets gradients pass, so that
             a Gaussian outside comes back; "hard" stops its gradient (the paper's Eq. 9); "none" shows them as they are.
         lr_initial, lr_gain, lr_rate, lr_ambient: learning rates.
+        lr_end: factor on them at the last step, log-linear in between.
 
     Raises:
         ValueError: an option is unknown.
@@ -65,7 +67,7 @@ class NewtonHarmonic(ThermalModel):
         tau_min_s: float | None = None,
         frequency_gain: float = math.sqrt(0.5),
         source_l2: float = 1e-5,
-        l2_reduction: str = "sum",
+        l2_reduction: str = "mean_over_gaussians",
         gauge_l2: float = 1e-5,
         ambient: str | float = "measured",
         clip: str = "straight_through",
@@ -73,6 +75,7 @@ class NewtonHarmonic(ThermalModel):
         lr_gain: float = 2.5e-3,
         lr_rate: float = 5e-3,
         lr_ambient: float = 1e-3,
+        lr_end: float = 0.1,
     ) -> None:
         super().__init__()
         for name, value, known in (
@@ -88,7 +91,8 @@ class NewtonHarmonic(ThermalModel):
         self.tau_min_s, self.frequency_gain = tau_min_s, frequency_gain
         self.source_l2, self.l2_mean, self.gauge_l2 = source_l2, l2_reduction == "mean_over_gaussians", gauge_l2
         self.clip = clip
-        self.lr_initial, self.lr_gain, self.lr_rate, self.lr = lr_initial, lr_gain, lr_rate, lr_ambient
+        self.lr_initial, self.lr_gain, self.lr_rate = lr_initial, lr_gain, lr_rate
+        self.lr, self.lr_end = lr_ambient, lr_end
         self._ambient_from = ambient
         self._ambient_unknown = False
         self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
@@ -138,15 +142,16 @@ class NewtonHarmonic(ThermalModel):
             with torch.no_grad():
                 self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
         log_rate = torch.full_like(initial, math.log(INITIAL_RATE))
-        tensors = {"initial_state": PerGaussian(initial, self.lr_initial)}
+        tensor = partial(PerGaussian, l2_mean=self.l2_mean, lr_end=self.lr_end)
+        tensors = {"initial_state": tensor(initial, self.lr_initial)}
         if self.param == "rate":
-            tensors["log_rate"] = PerGaussian(log_rate, self.lr_rate)
+            tensors["log_rate"] = tensor(log_rate, self.lr_rate)
         else:
-            tensors["log_capacity"] = PerGaussian(torch.zeros_like(initial), self.lr_rate, self.gauge_l2, self.l2_mean)
-            tensors["log_conductance"] = PerGaussian(log_rate, self.lr_rate)
+            tensors["log_capacity"] = tensor(torch.zeros_like(initial), self.lr_rate, self.gauge_l2)
+            tensors["log_conductance"] = tensor(log_rate, self.lr_rate)
         if self.omega.numel() > 0:
             gains = initial.new_zeros(count, 2, self.omega.numel())
-            tensors["source_gains"] = PerGaussian(gains, self.lr_gain, self.source_l2, self.l2_mean)
+            tensors["source_gains"] = tensor(gains, self.lr_gain, self.source_l2)
         return tensors
 
     def features(self, splats: Splats, query: Query) -> Emission:

@@ -20,8 +20,8 @@ from heatsplat.training.module import SplatTraining
 
 log = logging.getLogger("heatsplat")
 
-# Lightning's remarks that no user can act on: on workers, its products, a torch deprecation, checkpoints of another folder,
-# and on loaders that cannot resume (ours takes the step from the trainer, so a resumed run sees the views it would have).
+# Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
+# folder, and loaders that cannot resume (ours takes the step from the trainer, so a resumed run sees the right views).
 NOISE = (
     r".*does not have many workers.*",
     r".*LeafSpec.*",
