@@ -1,4 +1,4 @@
-"""The preset with a pane, clear to the eye and a wall to heat: what is filmed, and what one and two opacities make of it."""
+"""A pane that is clear to the eye and a wall to heat: what is filmed, and what one and two opacities make of it."""
 
 from __future__ import annotations
 
