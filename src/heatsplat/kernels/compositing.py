@@ -21,15 +21,16 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.compilation import inline, kernel, part
 from heatsplat.kernels.layout import (
     channels,
     has_absgrad,
+    has_depth,
     modalities,
     modality_of,
     moment_count,
 )
-from heatsplat.kernels.projection import GEOMETRY, LOG2_ALPHA_MIN, TILE
+from heatsplat.kernels.projection import DEPTH_MOMENT, GEOMETRY, LOG2_ALPHA_MIN, OPACITY_MOMENTS, TILE
 from heatsplat.kernels.scheduling import take
 from heatsplat.kernels.simd import (
     LANES,
@@ -97,7 +98,7 @@ def _unfinished_blocks(layout, tile, transmittances):
     return blocks
 
 
-@inline
+@part
 def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, pixels, transmittances, image):
     """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
 
@@ -152,7 +153,7 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, pixel
     return last
 
 
-@inline
+@part
 def _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth):
     """Copies the state of a tile into the images, background added, pixel by pixel."""
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
@@ -190,7 +191,7 @@ def composite(
     tiles_x = (width + TILE - 1) // TILE
     tiles = tile_ends.shape[0]
     for _ in prange(workers):
-        tile = take(ticket)
+        tile = take(ticket, 1)
         while tile < tiles:
             tile_ends[tile] = _composite_tile(
                 layout,
@@ -205,10 +206,10 @@ def composite(
                 image,
             )
             _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth)
-            tile = take(ticket)
+            tile = take(ticket, 1)
 
 
-@inline
+@part
 def _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v_depth, v_pixels, worker):
     """Copies the gradients of a tile's pixels into block order; pixels outside the image get zero."""
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
@@ -233,7 +234,7 @@ def _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v
                 v_pixels[block, channels(layout) + modality, lane] = value
 
 
-@inline
+@part
 def _start_remainders(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
     """Fills a worker's state with transmittance one and the whole of v . image - v_alpha T_final."""
     size = channels(layout) + modalities(layout)
@@ -255,7 +256,7 @@ def _start_remainders(layout, tile, colours, transmittances, image, v_pixels, wo
             v_background[tile, channel] += total(behind * load(v_pixels, (pixels + channel) * LANES))
 
 
-@inline
+@part
 def _store_moments(layout, moments, slots, place):
     """Writes the sums over lanes of the moments from ``place`` on, up to the end of the slot."""
     if moment_count(layout) <= LANES:
@@ -265,7 +266,13 @@ def _store_moments(layout, moments, slots, place):
             store_scalar(slots, place + k, total(moments[k]))
 
 
-@inline
+@part
+def _store_zeros(layout, slots, place):
+    for k in range(0, moment_count(layout), LANES):
+        store_first(slots, place + k, splat(_ZERO), slots.shape[1] - k)
+
+
+@part
 def _composite_tile_backward(
     layout, tile, tiles_x, records, instances, begin, end, pixels, v_pixels, worker, state, slots
 ):
@@ -279,6 +286,10 @@ def _composite_tile_backward(
     for instance in range(begin, end):
         prefetch(records, np.int64(instances[min(instance + AHEAD, end - 1), 0]) * records.shape[1])
         blocks = np.int64(instances[instance, 2])
+        slot = np.int64(instances[instance, 1]) * slots.shape[1]
+        if blocks == 0:
+            _store_zeros(layout, slots, slot)
+            continue
         record = np.int64(instances[instance, 0])
         offset = _offset(records, record, tile_x, tile_y)
         for k in range(moment_count(layout)):
@@ -313,11 +324,12 @@ def _composite_tile_backward(
                 rest = rest - gain
                 store(state, place + LANES, rest)
                 v_log_alpha = select(free & taken, gain - rest * (alpha / (_ONE - alpha)), _ZERO)
-                moments[5 + modality] = moments[5 + modality] + v_log_alpha
+                k = OPACITY_MOMENTS + modality
+                moments[k] = moments[k] + v_log_alpha
                 gradient = gradient + v_log_alpha
                 if has_absgrad(layout):
                     g1, g2 = v_log_alpha * u1, v_log_alpha * u2
-                    k = 5 + modalities(layout) + channels(layout)
+                    k = moment_count(layout) - 2
                     moments[k] = moments[k] + absolute(g1 * records[record, 2])
                     moments[k + 1] = moments[k + 1] + absolute(g1 * records[record, 3] + g2 * records[record, 4])
             g1, g2 = gradient * u1, gradient * u2
@@ -327,10 +339,11 @@ def _composite_tile_backward(
             moments[3] = moments[3] + g1 * u2
             moments[4] = moments[4] + g2 * u2
             for channel in range(channels(layout)):
-                k = 5 + modalities(layout) + channel
+                is_depth = has_depth(layout) and channel == channels(layout) - 1
+                k = DEPTH_MOMENT if is_depth else OPACITY_MOMENTS + modalities(layout) + channel
                 v_pixel = load(v_pixels, (v_block + channel) * LANES)
                 moments[k] = moments[k] + weights[modality_of(layout, channel)] * v_pixel
-        _store_moments(layout, moments, slots, np.int64(instances[instance, 1]) * slots.shape[1])
+        _store_moments(layout, moments, slots, slot)
 
 
 @kernel
@@ -350,7 +363,7 @@ def composite_backward(
     tiles_x = (width + TILE - 1) // TILE
     tiles = tile_ends.shape[0]
     for worker in prange(workers):
-        tile = take(ticket)
+        tile = take(ticket, 1)
         while tile < tiles:
             for channel in range(v_features.shape[2]):
                 v_backgrounds[tile, channel] = _ZERO
@@ -373,7 +386,5 @@ def composite_backward(
                 slots,
             )
             for instance in range(tile_ends[tile], tile_starts[tile + 1]):
-                slot = np.int64(instances[instance, 1])
-                for k in range(moment_count(layout)):
-                    slots[slot, k] = _ZERO
-            tile = take(ticket)
+                _store_zeros(layout, slots, np.int64(instances[instance, 1]) * slots.shape[1])
+            tile = take(ticket, 1)

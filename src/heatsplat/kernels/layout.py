@@ -18,11 +18,13 @@ class Layout:
     Args:
         modality_of: one entry per channel, the modality whose opacity composites it.
         modalities: how many modalities there are; one without channels still has an alpha.
+        depth: whether the last channel is depth, which is composited without a background.
         absgrad: whether the backward pass also gathers absolute screen gradients.
     """
 
     modality_of: tuple[int, ...]
     modalities: int = 1
+    depth: bool = False
     absgrad: bool = False
 
     @property
@@ -37,8 +39,8 @@ class Layout:
 
     @property
     def moments(self) -> int:
-        """Numbers per gradient slot: five of geometry, the opacities, the features, two absolute values."""
-        return 5 + self.modalities + self.channels + 2 * self.absgrad
+        """Numbers per gradient slot (heatsplat.kernels.projection has their order)."""
+        return 6 + self.modalities + self.channels - self.depth + 2 * self.absgrad
 
     @property
     def slot(self) -> int:
@@ -54,7 +56,7 @@ class LayoutType(types.Type):
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        super().__init__(f"Layout({layout.modality_of}, {layout.modalities}, {layout.absgrad})")
+        super().__init__(f"Layout({layout.modality_of}, {layout.modalities}, {layout.depth}, {layout.absgrad})")
 
 
 @typeof_impl.register(Layout)
@@ -92,6 +94,7 @@ def _constant(read):
 channels = _constant(lambda layout: layout.channels)
 modalities = _constant(lambda layout: layout.modalities)
 moment_count = _constant(lambda layout: layout.moments)
+has_depth = _constant(lambda layout: layout.depth)
 has_absgrad = _constant(lambda layout: layout.absgrad)
 
 

@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numba import prange
 
-from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.compilation import inline, kernel, part
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -38,11 +38,13 @@ from heatsplat.kernels.simd import (
     mask_of,
     maximum,
     minimum,
+    prefetch,
     select,
     splat,
     sqrt,
     store,
     store_columns,
+    store_first,
     to_int,
     total,
 )
@@ -51,7 +53,21 @@ BLUR = np.float32(0.3)
 ALPHA_MIN = np.float32(1.0 / 255.0)
 CHUNK = 1024  # Gaussians per parallel task: small enough to balance, large enough that its instances stay in the cache
 TILE = 16
+
+# A row of ``screen``, one cache line per Gaussian: the first six numbers describe its ellipse, see above.
+MEAN_X, MEAN_Y, FIRST, MIXED, SECOND, LOG_OPACITY = range(6)
 GEOMETRY = 6
+DEPTH, LEFT, RIGHT, TOP, BOTTOM, SLOPE_X, SLOPE_Y, RANK = range(6, 14)
+SCREEN = 16
+
+# A gradient slot: five moments of the density's gradient, the depth's gradient, the gradients of the logarithms of the
+# opacities, those of the features, two absolute ones where they are wanted.
+DEPTH_MOMENT = 5
+OPACITY_MOMENTS = 6
+# Its sum keeps the first six; the seventh is the gradient of the logarithm of all opacities at once.
+LOG_OPACITY_SUM = 6
+SUMS = 8
+AHEAD = 16
 
 WHITENING = np.float32(math.sqrt(math.log2(math.e) / 2.0))
 LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
@@ -160,13 +176,13 @@ def _tile_range(center, reach, tiles):
     return minimum(maximum(low, _ZERO), tiles), minimum(maximum(high, _ZERO), tiles)
 
 
-@inline
+@part
 def _project_block(
     first, means, quats, scales, opacities, camera, width, height, antialiased,
-    geometry, depths, rectangles, means2d, radii, visible, position, scratch, scratch_row,
+    screen, depths, means2d, radii, seen_lanes, ids, position, scratch, chunk,
 ):  # fmt: skip
     """Projects Gaussians ``first`` to ``first + 15``; returns how many tiles the visible ones may touch and where to go on
-    in ``visible``."""
+    in ``ids``."""
     rows = means.shape[0] - first
     x, y, z = load_columns(means, first, 3, rows)
     x, y, z = _to_camera(camera, x, y, z)
@@ -208,31 +224,33 @@ def _project_block(
     store_columns(radii, first, (radius_x, radius_y), rows)
 
     lanes = bits(seen)
+    seen_lanes[first // LANES] = lanes
     if lanes == 0:
         return 0, position
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     left, right = _tile_range(mean_x, reach_x, tiles_x)
     top, bottom = _tile_range(mean_y, reach_y, tiles_y)
+    first_u, mixed, second = whitening_1 * WHITENING, whitening_12 * WHITENING, whitening_2 * WHITENING
     fields = (
-        mean_x, mean_y, whitening_1 * WHITENING, whitening_12 * WHITENING, whitening_2 * WHITENING, log_opacity,
-        z, select(seen, left, _ZERO), select(seen, right, _ZERO), select(seen, top, _ZERO), select(seen, bottom, _ZERO),
+        mean_x, mean_y, first_u, mixed, second, log_opacity, z,
+        select(seen, left, _ZERO), select(seen, right, _ZERO), select(seen, top, _ZERO), select(seen, bottom, _ZERO),
+        -mixed / first_u, -first_u * mixed / (mixed * mixed + second * second),
     )  # fmt: skip
-    for k in range(11):
-        store(scratch, (scratch_row * 16 + k) * LANES, fields[k])
+    for field in range(RANK):
+        store(scratch, (chunk * SCREEN + field) * LANES, fields[field])
     tiles = 0
     while lanes != 0:
-        k = lowest_bit(lanes)
+        lane = lowest_bit(lanes)
         lanes &= lanes - 1
-        gaussian = first + k
-        for field in range(GEOMETRY):
-            geometry[gaussian, field] = scratch[scratch_row, field, k]
-        depths[gaussian] = scratch[scratch_row, 6, k]
-        for field in range(4):
-            rectangles[gaussian, field] = np.int32(scratch[scratch_row, 7 + field, k])
-        tiles += (rectangles[gaussian, 1] - rectangles[gaussian, 0]) * (
-            rectangles[gaussian, 3] - rectangles[gaussian, 2]
+        gaussian = first + lane
+        for field in range(RANK):
+            screen[gaussian, field] = scratch[chunk, field, lane]
+        screen[gaussian, RANK] = position - chunk * CHUNK
+        depths[gaussian] = screen[gaussian, DEPTH]
+        tiles += np.int64(screen[gaussian, RIGHT] - screen[gaussian, LEFT]) * np.int64(
+            screen[gaussian, BOTTOM] - screen[gaussian, TOP]
         )
-        visible[position] = gaussian
+        ids[position] = gaussian
         position += 1
     return tiles, position
 
@@ -240,42 +258,54 @@ def _project_block(
 @kernel
 def project(
     means, quats, scales, opacities, camera, width, height, antialiased,
-    geometry, depths, rectangles, means2d, radii, visible, visible_counts, tile_counts, scratch,
+    screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
 ):  # fmt: skip
-    """Writes what the screen sees of each Gaussian, and per CHUNK of them the visible ids and two counts.
+    """Writes what the screen sees of each Gaussian; returns how many are visible and how many tiles they may touch.
 
     Args:
         means, quats, scales, opacities: [N, 3], [N, 4], [N, 3], [M, N].
         camera: float32 vector, see above.
-        geometry: out [N, GEOMETRY], mean x and y, whitening, log2 of the largest opacity; of visible ones only.
-        depths: out [N], camera z.
-        rectangles: out [N, 4] int32, the tiles of the bounding box: left, right (exclusive), top, bottom (exclusive).
+        screen: out [N, SCREEN], rows of visible Gaussians only: the ellipse, camera z, the tiles of the bounding box (left,
+            right, top, bottom, the second and fourth exclusive), where u1^2 + u2^2 is smallest along a line (dx per dy,
+            dy per dx), and the place among the visible ones of its chunk.
+        depths: out [N], camera z of the visible ones once more, side by side.
         means2d, radii: out [N, 2]; zero where a Gaussian is not seen.
-        visible: out [N] int32; from each multiple of CHUNK on the visible ids of that chunk, ascending.
-        visible_counts, tile_counts: out [chunks] int64, visible Gaussians and bounding-box tiles of each chunk.
-        scratch: [chunks, 16, LANES], overwritten.
+        seen: out [blocks of LANES Gaussians], bits of the visible ones.
+        ids: out [N] int64, begins with the visible ones, ascending.
+        first_ranks: out [chunks], how many visible ones there are before a chunk.
+        bounds: scratch [chunks].
+        scratch: scratch [chunks, SCREEN, LANES].
     """
     count = means.shape[0]
-    for chunk in prange(visible_counts.shape[0]):
+    chunks = first_ranks.shape[0]
+    for chunk in prange(chunks):
         begin = chunk * CHUNK
         position = begin
         tiles = 0
         for block in range(begin, min(begin + CHUNK, count), LANES):
             touched, position = _project_block(
                 block, means, quats, scales, opacities, camera, width, height, antialiased,
-                geometry, depths, rectangles, means2d, radii, visible, position, scratch, chunk,
+                screen, depths, means2d, radii, seen, ids, position, scratch, chunk,
             )  # fmt: skip
             tiles += touched
-        visible_counts[chunk] = position - begin
-        tile_counts[chunk] = tiles
+        first_ranks[chunk] = position - begin
+        bounds[chunk] = tiles
+    visible = np.int64(0)
+    bound = np.int64(0)
+    for chunk in range(chunks):
+        here = first_ranks[chunk]
+        first_ranks[chunk] = visible
+        for k in range(here):
+            ids[visible + k] = ids[chunk * CHUNK + k]
+        visible += here
+        bound += bounds[chunk]
+    return visible, bound
 
 
-@kernel
-def gather_ids(visible, visible_counts, first_ranks, ids):
-    """Writes the chunks' visible ids side by side into ``ids`` [n] int64."""
-    for chunk in prange(visible_counts.shape[0]):
-        for k in range(visible_counts[chunk]):
-            ids[first_ranks[chunk] + k] = visible[chunk * CHUNK + k]
+@inline
+def feature_row(gaussian, screen, rows_are_ranks, first_ranks):
+    """The row of a Gaussian in features that are given for all Gaussians, or for the visible ones only."""
+    return first_ranks[gaussian // CHUNK] + np.int64(screen[gaussian, RANK]) if rows_are_ranks else gaussian
 
 
 @inline
@@ -291,9 +321,9 @@ def _quaternion_gradient(q, length, r):
     return (gw - along * w) * scale, (gx - along * x) * scale, (gy - along * y) * scale, (gz - along * z) * scale
 
 
-@inline
+@part
 def _project_block_backward(
-    first, seen, lanes, row, means, quats, scales, camera, antialiased,
+    first, seen, sums, means, quats, scales, camera, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
     """Gradients of Gaussians ``first`` to ``first + 15`` from the moments of their densities, see ``project_backward``."""
@@ -312,13 +342,9 @@ def _project_block_backward(
     a, b, c, determinant, sharp = _screen_covariance(u, v)
     l1, l12, l2 = _whitening(a, b, c, determinant)
 
-    m1 = load(lanes, row * LANES) / WHITENING
-    m2 = load(lanes, (row + 1) * LANES) / WHITENING
-    m11 = load(lanes, (row + 2) * LANES) * TWO_LN_2
-    m12 = load(lanes, (row + 3) * LANES) * TWO_LN_2
-    m22 = load(lanes, (row + 4) * LANES) * TWO_LN_2
-    v_log_opacity = load(lanes, (row + 5) * LANES)
-    v_depth = load(lanes, (row + 6) * LANES)
+    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _ = load_columns(sums, first, SUMS, rows)
+    m1, m2 = m1 / WHITENING, m2 / WHITENING
+    m11, m12, m22 = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
 
     v_mean_x, v_mean_y = l1 * m1, l12 * m1 + l2 * m2
     mixed = l12 * m11 + l2 * m12
@@ -386,68 +412,72 @@ def _project_block_backward(
 
 
 @kernel
-def project_backward(
-    means, quats, scales, opacities, camera, antialiased, has_depth, visible, visible_counts, ranges, slots,
-    rows_are_ranks, first_ranks, v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, absgrad, v_cameras,
-    sums, lanes,
+def add_up_slots(
+    ids, slot_starts, slots, screen, opacities, has_depth, rows_are_ranks, first_ranks,
+    sums, v_opacities, v_features, absgrad,
 ):  # fmt: skip
-    """Gradients of the Gaussians from the moments that ``compositing.composite_backward`` left in their slots.
+    """Adds up the moments of each visible Gaussian and finishes the gradients that need no projection.
 
-    A Gaussian's slots lie side by side in order of its index and are summed one after the other, so the result depends
-    on nothing but the image: not on threads, not on the run.
+    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the image:
+    not on threads, not on the run.
 
     Args:
-        ranges: [N, 2], first slot of each visible Gaussian and the one after its last.
-        slots: [slots, moments], see ``compositing.composite_backward``.
+        ids: [n] visible Gaussians front to back, the order of the slots.
+        slot_starts: [n + 1], the first slot of each of them.
+        slots: [slots, moments], see ``compositing.composite_backward``; the first of each Gaussian is overwritten.
         rows_are_ranks, first_ranks: see ``binning.find_instances``.
-        v_means ... v_means2d: out, all rows are written.
+        sums: out [N, SUMS], for ``project_backward``; rows of visible Gaussians only, as in all that follow.
+        v_opacities, v_features: out [M, N] and [N or n, C].
         absgrad: out [N, 2], or [0, 0] where it is not wanted.
-        v_cameras: out, added to: [chunks, 12], or [chunks, 0] where it is not wanted.
-        sums, lanes: scratch [chunks, moments in whole vectors] and [chunks, 7, LANES].
     """
-    count = means.shape[0]
-    moments, modalities, colours = slots.shape[1], opacities.shape[0], v_features.shape[1]
-    opacity_sums, feature_sums = 5, 5 + modalities
-    absolute_sums = feature_sums + colours + has_depth
-    for chunk in prange(visible_counts.shape[0]):
-        begin = chunk * CHUNK
-        position, end = begin, begin + visible_counts[chunk]
-        for block in range(begin, min(begin + CHUNK, count), LANES):
-            for field in range(7):
-                store(lanes, (chunk * 7 + field) * LANES, splat(_ZERO))
-            for gaussian in range(block, min(block + LANES, count)):
-                for modality in range(modalities):
-                    v_opacities[modality, gaussian] = _ZERO
-                for channel in range(0 if rows_are_ranks else colours):
-                    v_features[gaussian, channel] = _ZERO
-                for axis in range(absgrad.shape[1]):
-                    absgrad[gaussian, axis] = _ZERO
-            seen = 0
-            while position < end and visible[position] < block + LANES:
-                gaussian = np.int64(visible[position])
-                lane = gaussian - block
-                seen |= 1 << lane
-                for field in range(0, moments, LANES):
-                    summed = splat(_ZERO)
-                    for slot in range(ranges[gaussian, 0], ranges[gaussian, 1]):
-                        summed = summed + load(slots, slot * moments + field)
-                    store(sums, chunk * sums.shape[1] + field, summed)
-                for field in range(5):
-                    lanes[chunk, field, lane] = sums[chunk, field]
-                for modality in range(modalities):
-                    v_log_opacity = sums[chunk, opacity_sums + modality]
-                    opacity = opacities[modality, gaussian]
-                    lanes[chunk, 5, lane] += v_log_opacity
-                    v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else _ZERO
-                row = first_ranks[chunk] + position - begin if rows_are_ranks else gaussian
-                for channel in range(colours):
-                    v_features[row, channel] = sums[chunk, feature_sums + channel]
-                if has_depth:
-                    lanes[chunk, 6, lane] = sums[chunk, feature_sums + colours]
-                for axis in range(absgrad.shape[1]):
-                    absgrad[gaussian, axis] = sums[chunk, absolute_sums + axis] * TWO_LN_2
-                position += 1
+    modalities, colours = opacities.shape[0], v_features.shape[1]
+    moments = slots.shape[1]
+    for rank in prange(ids.shape[0]):
+        ahead = np.int64(ids[min(rank + AHEAD, ids.shape[0] - 1)])
+        prefetch(sums, ahead * SUMS)
+        prefetch(opacities, ahead)
+        prefetch(v_opacities, ahead)
+        prefetch(v_features, ahead * colours)
+        gaussian = np.int64(ids[rank])
+        begin, end = slot_starts[rank], slot_starts[rank + 1]
+        if begin == end:
+            store_first(sums, gaussian * SUMS, splat(_ZERO), SUMS)
+            continue
+        for field in range(0, moments, LANES):
+            summed = load(slots, begin * moments + field)
+            for slot in range(begin + 1, end):
+                summed = summed + load(slots, slot * moments + field)
+            store_first(slots, begin * moments + field, summed, moments - field)
+        store_first(sums, gaussian * SUMS, load(slots, begin * moments), SUMS)
+        sums[gaussian, LOG_OPACITY_SUM] = _ZERO
+        for modality in range(modalities):
+            v_log_opacity = slots[begin, OPACITY_MOMENTS + modality]
+            opacity = opacities[modality, gaussian]
+            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else _ZERO
+            sums[gaussian, LOG_OPACITY_SUM] += v_log_opacity
+        field = OPACITY_MOMENTS + modalities
+        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
+        for channel in range(colours):
+            v_features[row, channel] = slots[begin, field + channel]
+        for axis in range(absgrad.shape[1]):
+            absgrad[gaussian, axis] = slots[begin, field + colours + axis] * TWO_LN_2
+
+
+@kernel
+def project_backward(
+    means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
+):  # fmt: skip
+    """Gradients of the geometry from the summed moments of each Gaussian.
+
+    Args:
+        seen: [blocks], see ``project``.
+        sums: [N, SUMS], see ``add_up_slots``.
+        v_means ... v_means2d: out, all rows are written.
+        v_cameras: out, added to: [chunks, 12], or [chunks, 0] where it is not wanted.
+    """
+    for chunk in prange(v_cameras.shape[0]):
+        for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
             _project_block_backward(
-                block, mask_of(seen), lanes, chunk * 7, means, quats, scales, camera, antialiased,
+                block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, antialiased,
                 v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
             )  # fmt: skip

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import numba
-from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
 
 @intrinsic
-def take(typing_context, counter):
-    """The number in ``counter[0]`` (int64), which then counts on by one; safe between threads.
+def take(typing_context, counter, amount):
+    """The number in ``counter[0]`` (int64), which grows by ``amount`` at the same moment; safe between threads.
 
-    A tile's work depends on its content, so equal shares of tiles would leave threads idle (tiles do not depend on each
-    other, so the result does not depend on who takes which).
+    Tasks differ in work by what they hold, so equal shares would leave threads idle: each thread takes the next task when
+    it is done with one. Results must not depend on who takes which.
     """
 
     def generate(context, builder, signature, values):
         data = context.make_array(counter)(context, builder, values[0]).data
-        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+        amount = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
+        return builder.atomic_rmw("add", data, amount, "monotonic")
 
-    return types.int64(counter), generate
+    return types.int64(counter, amount), generate
 
 
 def thread_count() -> int:

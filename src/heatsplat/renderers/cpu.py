@@ -38,7 +38,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
     background = features.new_zeros(features.shape[1]) if inputs.background is None else inputs.background
     with announced(f"compiling the CPU renderer's kernels for C = {features.shape[1]}, once, about 10 s ..."):
         image, alpha, depth = _Rasterize.apply(
-            frame, channels, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
+            frame, channels, ids, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
             inputs.viewmat, frame.means2d,
         )  # fmt: skip
     meta = {"means2d": frame.means2d, "radii": frame.radii, "visible_ids": ids}
@@ -59,10 +59,10 @@ class _Rasterize(torch.autograd.Function):
     """The rendering of a projected frame as one differentiable operation."""
 
     @staticmethod
-    def forward(ctx, frame, channels, means, quats, scales, opacities, features, background, viewmat, means2d):
+    def forward(ctx, frame, channels, ids, means, quats, scales, opacities, features, background, viewmat, means2d):
         ctx.frame, ctx.means2d = frame, means2d
         ctx.save_for_backward(means, quats, scales, opacities, features)
-        frame.find_instances(channels, features)
+        frame.find_instances(channels, ids, features)
         return frame.composite(background)
 
     @staticmethod
@@ -71,11 +71,11 @@ class _Rasterize(torch.autograd.Function):
         frame = ctx.frame
         means, quats, scales, opacities, features = ctx.saved_tensors
         v_background = frame.composite_backward(v_image, v_alpha, v_depth)
-        gradients = frame.project_backward(means, quats, scales, opacities, features, ctx.needs_input_grad[8])
+        gradients = frame.project_backward(means, quats, scales, opacities, features, ctx.needs_input_grad[9])
         if frame.inputs.absgrad:
             ctx.means2d.absgrad = gradients.pop("absgrad")
         v_means, v_quats, v_scales, v_opacities, v_features, v_means2d, v_viewmat = gradients.values()
-        return None, None, v_means, v_quats, v_scales, v_opacities, v_features, v_background, v_viewmat, v_means2d
+        return None, None, None, v_means, v_quats, v_scales, v_opacities, v_features, v_background, v_viewmat, v_means2d
 
 
 class _Buffers:
@@ -133,49 +133,48 @@ class _Frame:
         self.means2d = torch.empty(self.count, 2)
         self.radii = torch.empty(self.count, 2, dtype=torch.int32)
         self.depths = array("depths", np.float32, self.count)
-        self.geometry = array("geometry", np.float32, self.count, projection.GEOMETRY)
-        self.rectangles = array("rectangles", np.int32, self.count, 4)
-        self.visible = array("visible", np.int32, self.chunks * projection.CHUNK)
-        self.visible_counts = array("visible_counts", np.int64, self.chunks)
-        self.bounds = array("bounds", np.int64, self.chunks)
-        projection.project(
+        self.screen = array("screen", np.float32, self.count, projection.SCREEN)
+        self.seen = array("seen", np.int32, -(-self.count // LANES))
+        self.first_ranks = array("first_ranks", np.int64, self.chunks)
+        ids = torch.empty(self.count, dtype=torch.int64)
+        visible, self.bound = projection.project(
             _numpy(inputs.means), _numpy(inputs.quats), _numpy(inputs.scales), _numpy(inputs.opacities),
             self.camera, self.width, self.height, inputs.antialiased,
-            self.geometry, self.depths, self.rectangles, self.means2d.numpy(), self.radii.numpy(),
-            self.visible, self.visible_counts, self.bounds, array("projection", np.float32, self.chunks, 16, LANES),
+            self.screen, self.depths, self.means2d.numpy(), self.radii.numpy(), self.seen, ids.numpy(),
+            self.first_ranks, array("bounds", np.int64, self.chunks),
+            array("projection", np.float32, self.chunks, projection.SCREEN, LANES),
         )  # fmt: skip
-        self.first_ranks = np.cumsum(self.visible_counts) - self.visible_counts
-        ids = torch.empty(int(self.visible_counts.sum()), dtype=torch.int64)
-        projection.gather_ids(self.visible, self.visible_counts, self.first_ranks, ids.numpy())
+        ids = ids[:visible]
         self.means2d.requires_grad_(inputs.means.requires_grad or inputs.viewmat.requires_grad)
         return ids
 
-    def find_instances(self, channels: tuple[int, ...], features: Tensor) -> None:
+    def find_instances(self, channels: tuple[int, ...], visible: Tensor, features: Tensor) -> None:
         """Bins the projected Gaussians, with their ``features``, into tiles front to back."""
         array, inputs = self.buffers.array, self.inputs
         modality_of = tuple(m for m, count in enumerate(channels) for _ in range(count)) + (0,) * inputs.depth
-        self.layout = Layout(modality_of, len(channels), inputs.absgrad)
-        self.records = array("records", np.float32, self.count, self.layout.record)
-        self.ranges = array("ranges", np.int32, self.count, 2)
-        first_slots = np.cumsum(self.bounds) - self.bounds
-        self.slots = int(self.bounds.sum())
-        tiles, masks = array("instance_tiles", np.int32, self.slots), array("instance_masks", np.int32, self.slots)
-        binning.find_instances(
-            self.geometry, self.rectangles, self.width, self.height, self.visible, self.visible_counts,
-            first_slots, _numpy(features), callable(inputs.features), self.first_ranks, _numpy(inputs.opacities),
-            self.depths, inputs.depth, self.records, tiles, masks, self.ranges,
-        )  # fmt: skip
-        ids, other_ids = array("ids", np.int32, self.count), array("other_ids", np.int32, self.count)
-        keys, other_keys = array("keys", np.float32, self.count), array("other_keys", np.float32, self.count)
-        seen = binning.sort_by_depth(
-            self.depths, self.visible, self.visible_counts, ids, keys, other_ids, other_keys,
+        self.layout = Layout(modality_of, len(channels), inputs.depth, inputs.absgrad)
+        seen, slabs, slots = len(visible), binning.SLABS * self.workers, self.bound
+        self.ids, other_ids = array("ids", np.int32, seen), array("other_ids", np.int32, seen)
+        keys, other_keys = array("keys", np.float32, seen), array("other_keys", np.float32, seen)
+        binning.sort_by_depth(
+            visible.numpy(), self.depths, self.ids, keys, other_ids, other_keys,
             array("histogram", np.int64, binning.BUCKETS),
         )  # fmt: skip
-        self.instances = array("instances", np.int32, self.slots, binning.INSTANCE)
+        self.records = array("records", np.float32, seen, self.layout.record)
+        found = array("found", np.int32, slots, 2)
+        found_starts, found_counts = array("found_starts", np.int64, slabs), array("found_counts", np.int32, seen)
+        counts = array("counts", np.int64, slabs, self.tiles)
+        binning.find_instances(
+            self.workers, self.ids, self.screen, self.width, _numpy(features), callable(inputs.features),
+            self.first_ranks, _numpy(inputs.opacities), inputs.depth, np.zeros((2, 1), np.int64),
+            self.records, found, found_starts, found_counts, counts,
+        )  # fmt: skip
+        self.slot_starts = array("slot_starts", np.int64, seen + 1)
+        self.instances = array("instances", np.int32, slots, binning.INSTANCE)
         self.tile_starts = array("tile_starts", np.int64, self.tiles + 1)
         binning.deal_to_tiles(
-            ids, seen, self.ranges, tiles, masks, array("counts", np.int64, self.workers, self.tiles),
-            self.tile_starts, self.instances,
+            self.workers, found, found_starts, found_counts, counts, np.zeros(1, np.int64),
+            array("slab_starts", np.int64, slabs), self.slot_starts, self.tile_starts, self.instances,
         )  # fmt: skip
 
     def composite(self, background: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -207,7 +206,7 @@ class _Frame:
         array, layout = self.buffers.array, self.layout
         rows = self.workers * compositing.BLOCKS
         v_background = array("v_background", np.float32, self.tiles, v_image.shape[2])
-        self.moments = array("moments", np.float32, self.slots, layout.slot)
+        self.moments = array("moments", np.float32, int(self.slot_starts[-1]), layout.slot)
         compositing.composite_backward(
             layout, self.workers, self.width, self.height, self.records, self.instances, self.tile_starts,
             self.tile_ends, self.transmittances, self.composited, self._pixels(), np.zeros(1, np.int64),
@@ -221,25 +220,28 @@ class _Frame:
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: bool
     ) -> dict[str, Tensor | None]:
         """Gradients by name, of the inputs in the order of the arguments, of ``means2d`` and of the view matrix."""
-        layout, inputs = self.layout, self.inputs
+        inputs = self.inputs
         inputs_and_screen = {
             "means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features,
             "means2d": self.means2d,
         }  # fmt: skip
         v = {name: torch.empty(tensor.shape) for name, tensor in inputs_and_screen.items()}
+        v["opacities"].zero_()
+        v["features"].zero_()
         if inputs.absgrad:
-            v["absgrad"] = torch.empty(self.means2d.shape)
-        v_camera = np.zeros((self.chunks, 12 if camera else 0))
-        array = self.buffers.array
-        projection.project_backward(
-            _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera,
-            inputs.antialiased, inputs.depth, self.visible, self.visible_counts, self.ranges, self.moments,
-            callable(inputs.features), self.first_ranks, v["means"].numpy(), v["quats"].numpy(), v["scales"].numpy(),
-            v["opacities"].numpy(), v["features"].numpy(), v["means2d"].numpy(),
-            v["absgrad"].numpy() if inputs.absgrad else _NO_DEPTH, v_camera,
-            array("sums", np.float32, self.chunks, -(-layout.slot // LANES) * LANES), array("lanes", np.float32, self.chunks, 7, LANES),
+            v["absgrad"] = torch.zeros(self.means2d.shape)
+        v_cameras = np.zeros((self.chunks, 12 if camera else 0))
+        sums = self.buffers.array("sums", np.float32, self.count, projection.SUMS)
+        projection.add_up_slots(
+            self.ids, self.slot_starts, self.moments, self.screen, _numpy(opacities), inputs.depth,
+            callable(inputs.features), self.first_ranks, sums, v["opacities"].numpy(), v["features"].numpy(),
+            v["absgrad"].numpy() if inputs.absgrad else _NO_DEPTH,
         )  # fmt: skip
-        v["viewmat"] = _viewmat_gradient(v_camera) if camera else None
+        projection.project_backward(
+            _numpy(means), _numpy(quats), _numpy(scales), self.camera, inputs.antialiased, self.seen, sums,
+            v["means"].numpy(), v["quats"].numpy(), v["scales"].numpy(), v["means2d"].numpy(), v_cameras,
+        )  # fmt: skip
+        v["viewmat"] = _viewmat_gradient(v_cameras) if camera else None
         return v
 
 
