@@ -35,8 +35,8 @@ class ThermalRange:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.min_c) and math.isfinite(self.max_c) and self.min_c < self.max_c):
             raise SceneError(
-                f"thermal range {self.min_c} .. {self.max_c} °C is not a range: the minimum must be finite and below the "
-                "maximum. Check the bounds file of the scene."
+                f"thermal range {self.min_c} .. {self.max_c} °C is not a range: the minimum must be finite and below "
+                "the maximum. Check the bounds file of the scene."
             )
 
     @property
@@ -254,8 +254,9 @@ class RenderOutput:
         alpha: [M, H, W] accumulated opacity of each modality.
         depth: [H, W] accumulated depth of the first modality (sum of weight times camera z; divide by alpha for the
             expected depth), or None when it was not asked for.
-        meta: "means2d" [N, 2] in pixels, a tensor whose .grad is filled by the backward pass (and whose .absgrad is, with
-            absgrad=True); "radii" [N, 2] int32 extents in pixels, 0 where a Gaussian is not seen; "visible_ids" [n] int64.
+        meta: "means2d" [N, 2] in pixels, a tensor whose .grad is filled by the backward pass (and whose .absgrad is,
+            with absgrad=True: sums over pixels and modalities); "radii" [N, 2] int32 extents in pixels, 0 where a
+            Gaussian is not seen; "visible_ids" [n] int64.
     """
 
     features: Tensor

@@ -14,8 +14,8 @@ class Splats(nn.Module):
     """N Gaussians as named raw tensors, each with first dimension N.
 
     Every tensor that belongs to a Gaussian lives here, geometry and heat alike, so that density control can add and
-    remove rows in one place. Geometry: ``means`` [N, 3] in world units, ``log_scales`` [N, 3], ``quats`` [N, 4] wxyz (need
-    not have unit length), ``opacity_logits`` [N, M], one column per modality. A thermal model adds its own names.
+    remove rows in one place. Geometry: ``means`` [N, 3] in world units, ``log_scales`` [N, 3], ``quats`` [N, 4] wxyz
+    (need not have unit length), ``opacity_logits`` [N, M], one column per modality. A thermal model adds its own names.
 
     Args:
         tensors: name -> [N, ...] float tensor; must hold the four geometry names.

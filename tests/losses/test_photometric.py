@@ -18,13 +18,13 @@ def images(height, width, channels, seed=0, dtype=torch.float64):
     return prediction.permute(1, 2, 0).to(dtype).contiguous(), target.permute(1, 2, 0).to(dtype).contiguous()
 
 
-def inputs(prediction, target, mask=None, key=None):
-    return LossInputs(prediction, target, mask, view=None, splats=None, step=0, max_steps=1, target_key=key)
+def inputs(prediction, target, mask=None):
+    return LossInputs(prediction, target, mask, view=None, splats=None, step=0, max_steps=1)
 
 
-def loss_and_gradient(photometric, prediction, target, mask=None, key=None):
+def loss_and_gradient(photometric, prediction, target, mask=None):
     prediction = prediction.clone().requires_grad_()
-    terms = photometric(inputs(prediction, target, mask, key))
+    terms = photometric(inputs(prediction, target, mask))
     sum(terms.values()).backward()
     return {name: value.item() for name, value in terms.items()}, prediction.grad
 

@@ -64,8 +64,8 @@ def rasterization(
 ) -> RenderOutput:
     """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
 
-    **Convention:** OpenCV axes; ``viewmats`` maps world to camera; pixel centres at +0.5; quaternions wxyz, any length but
-    zero; front to back in order of camera z, equal depths in order of index.
+    **Convention:** OpenCV axes; ``viewmats`` maps world to camera; pixel centres at +0.5; quaternions wxyz, any length
+    but zero; front to back in order of camera z, equal depths in order of index.
 
     Args:
         means: [N, 3] centres.
