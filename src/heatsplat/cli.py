@@ -173,3 +173,14 @@ def _restored(config: DictConfig, output_dir: Path) -> tuple[Any, Any, dict[str,
     module = build(stored["module"], output_dir=str(output_dir))
     module.recipe = stored
     return module, build(stored["data"] | changed), {**stored, "checkpoint": checkpoint}
+
+
+@hydra.main(version_base="1.3", config_path=CONF, config_name="study")
+@_job
+def study(config: DictConfig, output_dir: Path) -> None:
+    """Runs a study; its tables and pictures lie in the run's folder."""
+    from heatsplat.training.session import prepare_machine
+
+    prepare_machine(config.threads)
+    build(OmegaConf.to_container(config.study, resolve=True), output_dir=output_dir)
+    log.info("%s", output_dir)

@@ -107,3 +107,15 @@ def test_a_method_that_needs_time_refuses_a_scene_without(tmp_path, monkeypatch)
     monkeypatch.setattr(Synthetic, "load", without_time)
     with pytest.raises(SceneError, match="NewtonHarmonic needs time, which scene 'cooling' does not have"):
         run(tmp_path, *SHORT, "method=etgs")
+
+
+def test_penalties_inside_the_optimiser_are_logged_beside_the_loss_terms(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    module, _ = run(tmp_path, *SHORT, "method=etgs", "test=false", "callbacks.statistics.every=40")
+    events = EventAccumulator(str(tmp_path / "tb"))
+    events.Reload()
+    logged = events.Scalars("loss/penalty/source_gains")[-1]
+    gains = module.splats["source_gains"].detach()
+    assert logged.step == 40
+    assert logged.value == pytest.approx(1e-5 * gains.square().sum().item() / len(gains), rel=1e-4)

@@ -1,0 +1,107 @@
+"""Every command of the README runs: on the tiny scene, a few steps, with the paths of a reader's machine replaced."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "README.md").read_text()
+COMMANDS = [
+    line.split("#")[0].strip()
+    for block in re.findall(r"^```sh\n(.*?)^```", TEXT, re.M | re.S)
+    for line in block.splitlines()
+]
+SHORT = ["data.size=tiny", "max_steps=6", "callbacks.probes=null", "callbacks.costs.fps_repeats=1"]
+
+
+def shell(arguments: list[str], cwd: Path, **environment: str) -> str:
+    done = subprocess.run(
+        arguments, cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """The RUN of the README: a tiny finished run."""
+    folder = tmp_path_factory.mktemp("readme") / "run"
+    shell([sys.executable, str(ROOT / "src/train.py"), "method=etgs", *SHORT, f"hydra.run.dir={folder}"], ROOT)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """The /data of the README: the synthetic scene written in the layouts that it names."""
+    from datamodules.synthetic_scene.film import film
+    from datamodules.synthetic_scene.presets import PRESETS
+    from datamodules.synthetic_scene.scene import Scene
+    from datamodules.synthetic_scene.writers import LAYOUTS
+
+    folder = tmp_path_factory.mktemp("data")
+    recording = film(Scene(PRESETS["cooling"]), "tiny", seed=0, noise_k=0.05)
+    LAYOUTS["rhd"](recording, folder / "RHD" / "cooling_bench")
+    LAYOUTS["colmap"](recording, folder / "my_scene")
+    return folder
+
+
+def test_the_readme_names_its_main_commands():
+    assert COMMANDS[:2] == ["make demo", "make test"]
+    assert any(command.startswith("python src/train.py method=etgs data=rhd") for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("python")])
+def test_python_commands_run(command, trained, data, tmp_path):
+    words = command.replace("RUN/", f"{trained}/").replace("/data/", f"{data}/").split()
+    words = [sys.executable, str(ROOT / words[1]), *words[2:]]
+    if "train.py" in command:
+        words += SHORT if "data=" not in command else SHORT[1:]
+        words += [f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep"]
+        if "ablation=" in command:  # two of its jobs
+            words += ["hydra.sweeper.params={thermal.frequencies:'8,16',seed:'0'}"]
+    elif "render.py" in command:
+        words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
+    else:
+        words += [f"hydra.run.dir={tmp_path}/evaluation"]
+    output = shell(words, tmp_path)
+    if "train.py" in command or "evaluate.py" in command:
+        assert "psnr" in output
+        assert len(list(tmp_path.rglob("metrics.json"))) == (
+            3 if " -m " in command else 2 if "ablation" in command else 1
+        )
+    else:
+        assert (tmp_path / "views" / "video.mp4").exists()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_demo_runs():
+    ready = ROOT / ".venv" / ".ready"
+    if not ready.exists():
+        pytest.skip("the environment was not set up by make install")
+    output = shell(["make", "demo", f"ARGS={' '.join(SHORT)}"], ROOT)
+    assert "psnr" in output and "picture" in output
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize("target", re.findall(r"`?make (\w+)`?", TEXT))
+def test_make_targets_exist(target):
+    assert f"make {target} " in shell(["make", "help"], ROOT)
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate", "render", "study"])
+def test_console_commands_answer(name):
+    program = Path(sys.executable).parent / f"heatsplat-{name}"
+    if not program.exists():
+        pytest.skip("heatsplat is not installed (pip install -e .)")
+    choice = {"train": ["method=etgs"], "study": ["study=renderer"]}.get(name, [])
+    assert "threads" in shell([str(program), *choice, "--cfg", "job"], ROOT)
+
+
+def test_its_pictures_exist():
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", TEXT)
+    assert pictures and all((ROOT / picture).exists() for picture in pictures)
