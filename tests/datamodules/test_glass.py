@@ -114,9 +114,9 @@ def scores(tmp_path_factory):
         *TINY,
         "method=ravigs",
         "data.scene=glass",
-        "max_steps=300",
+        "max_steps=600",
         "density.recipe.cap_max=2000",
-        "trainer.val_check_interval=300",
+        "trainer.val_check_interval=600",
         "callbacks.attributes=null",
         "test=false",
         "threads=1",
@@ -135,13 +135,13 @@ def scores(tmp_path_factory):
 
 
 def test_one_opacity_fails_in_the_pane_and_two_do_not(scores):
-    """Measured: two 31.4 dB heat and 28.5 dB colour, one 29.9 dB and 23.2 dB."""
+    """Measured: 34.3 dB heat and 30.4 dB colour with two, 31.6 dB and 24.2 dB with one."""
     two, one = scores[True], scores[False]
-    assert two["thermal"] > 30.0 and two["rgb"] > 27.0
-    assert one["rgb"] < 25.0 and two["rgb"] - one["rgb"] > 3.0
-    assert two["thermal"] > one["thermal"] + 0.5
+    assert two["thermal"] > 33.0 and two["rgb"] > 29.0
+    assert two["thermal"] - one["thermal"] > 1.5 and two["rgb"] - one["rgb"] > 4.0
 
 
 def test_the_pane_is_dense_to_heat_and_thin_to_light(scores):
+    """Measured: medians of 0.27 and 0.018, which co-support leaves standing."""
     heat, light = scores["pane"]
-    assert heat > 3 * light
+    assert heat > 5 * light > 5 * 0.005

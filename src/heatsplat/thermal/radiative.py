@@ -71,7 +71,7 @@ class Radiative(ThermalModel):
         gain: float = 1.0,
         surroundings: float = 0.2,
         clip: str = "straight_through",
-        color_l2: float = 1e-4,
+        color_l2: float = 5e-5,
         lr_attributes: float = 2.5e-3,
         lr_rest: float = 1.25e-4,
         lr_attributes_end: float = 0.1,

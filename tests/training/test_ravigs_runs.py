@@ -1,0 +1,112 @@
+"""Whole runs of RaViGS: both images are scored and drawn, toggles leave their part out, missing colour is refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from running import TINY, run
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from heatsplat.callbacks.metrics import read_table
+from heatsplat.contracts import SceneError, ViewSet
+
+SHORT = (
+    "data.size=tiny",
+    "threads=1",
+    "method=ravigs",
+    "max_steps=12",
+    "trainer.val_check_interval=6",
+    "callbacks.images.test_views=1",
+    "callbacks.attributes.test_views=1",
+    "callbacks.costs.fps_repeats=1",
+    "trainer.limit_test_batches=2",
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ravigs")
+    module, _ = run(folder, *SHORT)
+    return module, folder, json.loads((folder / "metrics.json").read_text())
+
+
+def test_both_images_are_scored(finished):
+    _, folder, found = finished
+    assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5 and 0 < found["test"]["rgb_ssim"] <= 1
+    assert found["test"]["rgb_lpips"] is not None or "LPIPS" in found["reasons"]["test.rgb_lpips"]
+    assert "data range 1" in found["definitions"]["rgb_psnr"]
+    rows = read_table(folder / "test_per_image.csv")
+    assert found["test"]["rgb_psnr"] == pytest.approx(sum(row["rgb_psnr"] for row in rows) / len(rows))
+    assert [row["step"] for row in read_table(folder / "curve.csv")] == [6, 12]
+    assert read_table(folder / "curve.csv")[1]["rgb_psnr"] > 5
+    assert f"| rgb_psnr | {found['test']['rgb_psnr']:.4g} dB |" in (folder / "report.md").read_text()
+
+
+def test_both_images_and_the_attributes_are_drawn(finished):
+    module, folder, _ = finished
+    assert sorted(path.name for path in folder.glob("renders/test/*.png")) == [
+        "0000_frame_00000.png",
+        "0000_frame_00000_rgb.png",
+    ]
+    assert [path.name for path in folder.glob("renders/attributes/test/*.png")] == ["0000_frame_00000.png"]
+    drawn = EventAccumulator(str(folder / "tb"), size_guidance={"images": 0}).Reload().Tags()["images"]
+    assert {"attributes/test/0000_frame_00000", "attributes/val/0000_frame_00000", "test/0000_frame_00000_rgb"} <= set(
+        drawn
+    )
+    frame = module.scene.test.frames[0]
+    maps = module.attribute_maps(frame)
+    assert list(maps) == ["emissivity", "temperature", "reflectance"]
+    for image in maps.values():
+        seen = image[image.isfinite()]
+        assert image.shape == (52, 64) and len(seen) > 2000 and seen.min() > 0 and seen.max() < 1
+    # After 12 steps emissivity is still near its start, and warm pixels are those of high temperature.
+    assert maps["emissivity"].nanmedian().item() == pytest.approx(0.9, abs=0.02)
+    heat = module.predict(frame)[..., 0]
+    warm, cold = heat > heat.quantile(0.8), heat < heat.quantile(0.2)
+    assert maps["temperature"][warm].nanmean() > maps["temperature"][cold].nanmean() + 0.05
+
+
+def test_the_effects_are_told(finished):
+    effects = finished[2]["effects"]
+    assert effects["grey_emission"]["degrees"] == {"emissivity": 1, "temperature": 1, "reflectance": 0}
+    assert effects["opacity_per_band"] == {"opacities": 2}
+
+
+def test_a_run_without_any_part_has_none_of_them(tmp_path):
+    off = ("thermal.dual_opacity=false", "thermal.three_parameter=false", "loss=ravigs_reconstruction", "stages=none")
+    module, trainer = run(tmp_path, *SHORT, *off, "density=adaptive")
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5
+    assert not {"grey_emission", "opacity_per_band"} & set(found["effects"])
+    assert module.splats.opacities.shape[0] == 1
+    assert sorted(set(module.splats.names) - {"means", "quats", "log_scales", "opacity_logits"}) == [
+        "radiance",
+        "radiance_rest",
+        "sh0",
+        "sh_rest",
+    ]
+    assert [name for name, _ in module.thermal.named_parameters()] == []
+    assert not any(group["weight_decay"] for group in trainer.optimizers[0].param_groups)
+    assert not (tmp_path / "renders" / "attributes").exists()
+    scalars = EventAccumulator(str(tmp_path / "tb")).Reload().Tags()["scalars"]
+    terms = {name for name in scalars if name.startswith("loss/")}
+    assert terms == {"loss/total", "loss/thermal/l1", "loss/thermal/dssim", "loss/rgb/l1", "loss/rgb/dssim"}
+
+
+def test_a_scene_without_colour_is_refused(tmp_path, monkeypatch):
+    from datamodules.synthetic import Synthetic
+
+    loaded = Synthetic.load
+
+    def colourless(views: ViewSet) -> ViewSet:
+        return ViewSet(views.frames, lambda i: replace(views[i], rgb=None))
+
+    def without_colour(self):
+        scene = loaded(self)
+        return replace(scene, train=colourless(scene.train), val=colourless(scene.val), test=colourless(scene.test))
+
+    monkeypatch.setattr(Synthetic, "load", without_colour)
+    with pytest.raises(
+        SceneError, match="view frame_00001.png has no rgb image; choose a method or data set that fits"
+    ):
+        run(tmp_path, *TINY, "method=ravigs", "max_steps=2")
