@@ -1,0 +1,45 @@
+"""What the processor can do at most: the rate of multiply-adds on sixteen lanes, against which kernels are judged."""
+
+from __future__ import annotations
+
+import time
+
+import numba
+import numpy as np
+
+from heatsplat.kernels.compilation import kernel
+from heatsplat.kernels.simd import LANES, load, store
+
+_CHAINS = 8  # independent sums, enough to hide the latency of one multiply-add
+
+
+def use_threads(count: int) -> None:
+    """Makes the kernels run on ``count`` threads from now on."""
+    numba.set_num_threads(count)
+
+
+def vector_rate(threads: int, repeats: int = 5) -> float:
+    """Multiply-adds on sixteen floats per second, measured over ``threads`` threads; the best of ``repeats``."""
+    use_threads(threads)
+    rounds = 2_000_000
+    values = np.full((threads, (2 * _CHAINS + 1) * LANES), 0.5, np.float32)
+    _multiply_add(values, 1)
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        _multiply_add(values, rounds)
+        best = min(best, time.perf_counter() - start)
+    return threads * rounds * _CHAINS / best
+
+
+@kernel
+def _multiply_add(values, rounds):
+    for row in numba.prange(values.shape[0]):
+        own = values[row]
+        factor = load(own, 16 * LANES)
+        a, b, c, d = load(own, 0), load(own, LANES), load(own, 2 * LANES), load(own, 3 * LANES)
+        e, f, g, h = load(own, 4 * LANES), load(own, 5 * LANES), load(own, 6 * LANES), load(own, 7 * LANES)
+        for _ in range(rounds):
+            a, b, c, d = a * factor + factor, b * factor + factor, c * factor + factor, d * factor + factor
+            e, f, g, h = e * factor + factor, f * factor + factor, g * factor + factor, h * factor + factor
+        store(own, 8 * LANES, a + b + c + d + e + f + g + h)
