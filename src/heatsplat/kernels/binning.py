@@ -195,7 +195,9 @@ def find_instances(
 
 
 @kernel
-def deal_to_tiles(workers, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, tile_starts, instances):
+def deal_to_tiles(
+    workers, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, tile_starts, instances
+):
     """Deals the instances out to the tiles, front to back, and numbers them.
 
     Args:
