@@ -8,14 +8,10 @@ import numba
 import numpy as np
 
 from heatsplat.kernels.compilation import kernel
+from heatsplat.kernels.scheduling import use_threads
 from heatsplat.kernels.simd import LANES, load, store
 
 _CHAINS = 8  # independent sums, enough to hide the latency of one multiply-add
-
-
-def use_threads(count: int) -> None:
-    """Makes the kernels run on ``count`` threads from now on."""
-    numba.set_num_threads(count)
 
 
 def vector_rate(threads: int, repeats: int = 5) -> float:

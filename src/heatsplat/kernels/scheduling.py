@@ -23,6 +23,11 @@ def take(typing_context, counter, amount):
     return types.int64(counter, amount), generate
 
 
+def use_threads(count: int) -> None:
+    """Makes the kernels run on ``count`` threads from now on, or on as many as there are (NUMBA_NUM_THREADS)."""
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+
+
 def thread_count() -> int:
-    """How many threads kernels run on (``numba.set_num_threads`` and NUMBA_NUM_THREADS set it)."""
+    """How many threads kernels run on (``use_threads`` sets it)."""
     return numba.get_num_threads()

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from heatsplat.geometry.projection import project_gaussians
-from heatsplat.kernels.peak import use_threads, vector_rate
+from heatsplat.kernels.peak import vector_rate
+from heatsplat.kernels.scheduling import use_threads
 from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, BLUR, FOV_MARGIN, rasterization
 
 log = logging.getLogger("heatsplat")

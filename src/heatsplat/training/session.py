@@ -16,6 +16,7 @@ import torch
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
+from heatsplat.kernels.scheduling import use_threads
 from heatsplat.training.module import SplatTraining
 
 log = logging.getLogger("heatsplat")
@@ -38,7 +39,7 @@ def prepare_machine(threads: int | None) -> None:
     """Fixes the number of CPU threads (None takes all cores) and quietens messages that no user can act on."""
     threads = threads or os.cpu_count() or 1
     torch.set_num_threads(threads)
-    os.environ["NUMBA_NUM_THREADS"] = str(threads)
+    use_threads(threads)
     for pattern in NOISE:
         warnings.filterwarnings("ignore", message=pattern)
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
