@@ -11,8 +11,8 @@ from numba.extending import intrinsic
 def take(typing_context, counter, amount):
     """The number in ``counter[0]`` (int64), which grows by ``amount`` at the same moment; safe between threads.
 
-    Tasks differ in work by what they hold, so equal shares would leave threads idle: each thread takes the next task
-    when it is done with one. Results must not depend on who takes which.
+    Tasks differ in work by what they hold, so equal shares would leave threads idle: each thread takes the next task when
+    it is done with one. Results must not depend on who takes which.
     """
 
     def generate(context, builder, signature, values):
@@ -23,6 +23,11 @@ def take(typing_context, counter, amount):
     return types.int64(counter, amount), generate
 
 
+def use_threads(count: int) -> None:
+    """Makes the kernels run on ``count`` threads from now on, or on as many as there are (NUMBA_NUM_THREADS)."""
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+
+
 def thread_count() -> int:
-    """How many threads kernels run on (``numba.set_num_threads`` and NUMBA_NUM_THREADS set it)."""
+    """How many threads kernels run on (``use_threads`` sets it)."""
     return numba.get_num_threads()
