@@ -93,20 +93,21 @@ def test_a_run_without_any_part_has_none_of_them(tmp_path):
     assert terms == {"loss/total", "loss/thermal/l1", "loss/thermal/dssim", "loss/rgb/l1", "loss/rgb/dssim"}
 
 
-def test_a_scene_without_colour_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("kept", "told"), [(0, "16 of the views"), (5, "11 of the views")])
+def test_views_without_colour_are_refused_before_training(tmp_path, monkeypatch, kept, told):
+    """None of the 16 training views has a colour image, or not every one."""
     from datamodules.synthetic import Synthetic
 
     loaded = Synthetic.load
 
     def colourless(views: ViewSet) -> ViewSet:
-        return ViewSet(views.frames, lambda i: replace(views[i], rgb=None))
+        return ViewSet(views.frames, lambda i: views[i] if i < kept else replace(views[i], rgb=None))
 
     def without_colour(self):
         scene = loaded(self)
-        return replace(scene, train=colourless(scene.train), val=colourless(scene.val), test=colourless(scene.test))
+        return replace(scene, train=colourless(scene.train))
 
     monkeypatch.setattr(Synthetic, "load", without_colour)
-    with pytest.raises(
-        SceneError, match="view frame_00001.png has no rgb image; choose a method or data set that fits"
-    ):
+    message = f"Radiative explains rgb images too, but {told} of scene 'glass' have none, frame_.* first. Give each"
+    with pytest.raises(SceneError, match=message):
         run(tmp_path, *TINY, "method=ravigs", "max_steps=2")

@@ -114,7 +114,8 @@ class ThermalModel(nn.Module, ABC):
         return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels
 
     def check(self, scene: SceneData) -> None:
-        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``."""
+        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``, or a view
+        has no image of a companion."""
         missing = sorted(self.needs - scene.metadata)
         if missing:
             raise SceneError(
@@ -122,6 +123,15 @@ class ThermalModel(nn.Module, ABC):
                 f"(it has: {', '.join(sorted(scene.metadata)) or 'images only'}). Choose a method that does without, "
                 "or give the data set the missing metadata."
             )
+        for modality in self.companions:
+            parts = scene.train, scene.val, scene.test
+            without = [view.frame.name for part in parts for view in part if getattr(view, modality) is None]
+            if without:
+                raise SceneError(
+                    f"{type(self).__name__} explains {modality} images too, but {len(without)} of the views of "
+                    f"scene '{scene.name}' have none, {without[0]} first. Give each thermal image its {modality} image "
+                    "(of the same name), or choose a method that explains thermal images alone."
+                )
 
     @abstractmethod
     def prepare(self, scene: SceneData) -> None:

@@ -118,7 +118,6 @@ class Radiative(ThermalModel):
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
         self.color.prepare(scene)
 
     @torch.no_grad()

@@ -1,0 +1,71 @@
+"""Maps of a model's attributes: which views, what the picture shows, and none without attributes or companions."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from fake_run import HEIGHT, WIDTH, FakeModule, evaluate, events, fit, trainer, wall
+
+from heatsplat.callbacks.attributes import AttributeMaps, attribute_picture
+from heatsplat.callbacks.metrics import QualityMetrics, read_table
+from heatsplat.contracts import ViewSet
+
+
+class Telling(FakeModule):
+    """Knows the emissivity and the age of the wall."""
+
+    def attribute_maps(self, frame):
+        ramp = torch.linspace(0.2, 0.8, WIDTH).expand(HEIGHT, WIDTH).clone()
+        ramp[:5] = torch.nan
+        return {"emissivity": ramp, "age": 3.0 + torch.zeros(HEIGHT, WIDTH)}
+
+
+def test_maps_are_drawn_at_validation_and_at_the_end(tmp_path):
+    module = Telling(wall(), tmp_path)
+    watchers = [AttributeMaps(val_views=2, test_views=1)]
+    fit(module, trainer(tmp_path, watchers, steps=4, every=2))
+    evaluate(module, trainer(tmp_path, watchers))
+    drawn = sorted(path.relative_to(tmp_path / "renders").as_posix() for path in tmp_path.glob("renders/*/*/*.png"))
+    assert drawn == ["attributes/test/0009_000.png", "attributes/val/0006_000.png", "attributes/val/0007_001.png"]
+    assert {"attributes/val/0006_000", "attributes/test/0009_000"} <= set(events(tmp_path).Tags()["images"])
+
+
+def test_the_picture_shows_each_map_beside_its_bar(tmp_path):
+    module = Telling(wall(), tmp_path)
+    picture = attribute_picture(module, module.scene.test.frames[0])
+    single = attribute_picture(FakeModule(wall(), tmp_path), module.scene.test.frames[0])
+    assert single is None
+    grey = (picture == 128).all(axis=-1)
+    factor = round(260 / HEIGHT)
+    assert grey.sum() >= 5 * factor * WIDTH * factor  # what is not known
+    colors = np.unique(picture.reshape(-1, 3), axis=0)
+    assert len(colors) > 200  # the ramp runs through the whole map
+
+
+def test_models_without_attributes_or_companions_leave_nothing(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    watchers = [AttributeMaps(), QualityMetrics(lpips_net=None)]
+    fit(module, trainer(tmp_path, watchers, steps=4, every=2))
+    evaluate(module, trainer(tmp_path, watchers))
+    assert not (tmp_path / "renders").exists()
+    assert not [name for name in module.results.test if name.startswith("rgb")]
+    assert not [name for name in read_table(tmp_path / "test_per_image.csv")[0] if name.startswith("rgb")]
+
+
+def test_companions_are_scored_as_images(tmp_path):
+    class Joint(FakeModule):
+        def validation_step(self, view, batch_idx):
+            return super().validation_step(view, batch_idx) | {"companions": {"rgb": view.rgb * 0.9}}
+
+        test_step = validation_step
+
+    scene = wall()
+
+    def decode(i):
+        return replace(scene.test[i], rgb=torch.full((HEIGHT, WIDTH, 3), 0.5))
+
+    module = Joint(replace(scene, test=ViewSet(scene.test.frames, decode)), tmp_path)
+    evaluate(module, trainer(tmp_path, [QualityMetrics(lpips_net=None)]))
+    assert abs(module.results.test["rgb_psnr"] - 20 * np.log10(1 / 0.05)) < 1e-4
+    assert module.results.reasons["test.rgb_lpips"] == "not asked for"
+    assert module.results.test["psnr"] != module.results.test["rgb_psnr"]
