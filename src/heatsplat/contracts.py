@@ -100,6 +100,72 @@ class Environment:
     pressure_hpa: float | None = None
 
 
+WEATHER_COLUMNS = ("air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "pressure_hpa")
+
+
+@dataclass(frozen=True)
+class Weather:
+    """The weather over a scene's record: what drives its temperature. Every series is linear between its samples.
+
+    **Convention:** seconds since the first training frame, so a record may begin before 0; directions are unit vectors
+    in the world's axes. Night is exactly zero in ``direct_w_m2`` and ``diffuse_w_m2``.
+
+    Args:
+        times_s: [T] float64, strictly increasing.
+        air_c: air temperature in °C, [T] float64, or None (as every further series) when the record lacks it.
+        wind_m_s: wind speed, 0 or more.
+        humidity_percent: relative humidity, 0 to 100.
+        irradiance_w_m2: irradiance on a horizontal surface by sun and sky (global horizontal), 0 or more.
+        pressure_hpa: air pressure.
+        direct_w_m2: irradiance by the sun alone on a surface that faces it (direct normal).
+        diffuse_w_m2: irradiance by the sky alone on a horizontal surface (diffuse horizontal).
+        sun: [T, 3] direction towards the sun, below the horizon too.
+        up: [3] direction away from the ground.
+        notes: what the reader found, left out and assumed, for the report.
+    """
+
+    times_s: Tensor
+    air_c: Tensor | None = None
+    wind_m_s: Tensor | None = None
+    humidity_percent: Tensor | None = None
+    irradiance_w_m2: Tensor | None = None
+    pressure_hpa: Tensor | None = None
+    direct_w_m2: Tensor | None = None
+    diffuse_w_m2: Tensor | None = None
+    sun: Tensor | None = None
+    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.times_s)
+        if self.times_s.dtype != torch.float64 or count < 2 or not bool((self.times_s.diff() > 0).all()):
+            raise SceneError("weather needs two or more samples at strictly increasing times, as float64 seconds")
+        for name in (*WEATHER_COLUMNS, "direct_w_m2", "diffuse_w_m2", "sun"):
+            series = getattr(self, name)
+            if series is not None and (len(series) != count or not bool(series.isfinite().all())):
+                raise SceneError(f"weather.{name} must hold {count} finite samples, as many as weather.times_s")
+
+    def at(self, time_s: float) -> Environment:
+        """The weather at a moment. Raises SceneError where the record does not reach it."""
+        first, last = float(self.times_s[0]), float(self.times_s[-1])
+        if not first <= time_s <= last:
+            raise SceneError(
+                f"there is no weather for second {time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s after the "
+                "first training frame. Give a record that covers every frame."
+            )
+        above = int(torch.searchsorted(self.times_s, time_s).clamp(1, len(self.times_s) - 1))
+        before, after = float(self.times_s[above - 1]), float(self.times_s[above])
+        share = (time_s - before) / (after - before)
+        columns = {name: getattr(self, name) for name in WEATHER_COLUMNS}
+        return Environment(
+            **{
+                name: float(series[above - 1] * (1 - share) + series[above] * share)
+                for name, series in columns.items()
+                if series is not None
+            }
+        )
+
+
 @dataclass(frozen=True)
 class Frame:
     """What is known of one image without its pixels.
@@ -207,6 +273,9 @@ class SceneData:
         thermal_range: bounds in °C, or None when image values are no temperatures.
         ambient_c: temperature of the surroundings in °C, or None.
         metres_per_unit: scale of the world, or None when unknown.
+        weather: the weather over the record, or None. Frames then carry its values at their time, too.
+        labels: [P] int64 class of each point (land cover), or None.
+        point_features: [P, D] float32 features of each point that a file gives, or None.
         notes: what the loader found and assumed, for the report: name -> value or sentence.
         probes: scene points [n, 3] whose temperature over time is drawn, or None to let the training choose.
         truth: function (points [n, 3], times_s [F]) -> °C [n, F] on synthetic scenes, or None.
@@ -221,6 +290,9 @@ class SceneData:
     thermal_range: ThermalRange | None = None
     ambient_c: float | None = None
     metres_per_unit: float | None = None
+    weather: Weather | None = None
+    labels: Tensor | None = None
+    point_features: Tensor | None = None
     notes: dict[str, Any] = field(default_factory=dict)
     probes: Tensor | None = None
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
@@ -240,7 +312,9 @@ class SceneData:
             "thermal_range": self.thermal_range is not None,
             "ambient": self.ambient_c is not None,
             "metres": self.metres_per_unit is not None,
-            "weather": all(frame.environment is not None for frame in self.train.frames) and len(self.train) > 0,
+            "weather": self.weather is not None,
+            "labels": self.labels is not None,
+            "point_features": self.point_features is not None,
         }
         return frozenset(name for name, there in has.items() if there)
 
