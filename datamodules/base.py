@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader
 from datamodules.assemble import CELSIUS, Counts, RawFrame, build_scene
 from datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from datamodules.formats.lens import Lens
+from datamodules.lowres import degraded
 from datamodules.splits import SplitRule
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
@@ -44,6 +45,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule); used where it exists.
         mask_keep: "white" when white pixels count (COLMAP), "black" when they are left out.
         alpha_mask: True to leave out transparent pixels.
+        degrade, upsample: how training images lose resolution, and are enlarged again (``datamodules.lowres``).
     """
 
     def __init__(
@@ -61,11 +63,14 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         masks: str = "masks",
         mask_keep: str = "white",
         alpha_mask: bool = False,
+        degrade: str | None = None,
+        upsample: str | None = None,
     ) -> None:
         super().__init__()
         if mask_keep not in ("white", "black"):
             raise SceneError(f"data.mask_keep must be white or black, got {mask_keep!r}")
         self.root = root
+        self.degrade, self.upsample = degrade, upsample
         self.scene_name = scene
         self.downscale = downscale
         self.split = SplitRule(
@@ -83,8 +88,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
 
     @cached_property
     def scene(self) -> SceneData:
-        """The loaded scene."""
-        return self.load()
+        """The loaded scene, its training images reduced where that is asked for."""
+        return degraded(self.load(), self.degrade, self.upsample)
 
     def setup(self, stage: str | None = None) -> None:
         """Loads the scene, so that bad input is reported before anything else is built."""

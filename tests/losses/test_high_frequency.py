@@ -61,19 +61,19 @@ class Oracle:
 
 
 def test_detail_is_what_averages_lose():
-    term = HighFrequency(Interpolation("lanczos"), inner=1, outer=7)
+    term = HighFrequency(lambda: Interpolation("lanczos"), inner=1, outer=7)
     assert term.detail(torch.full((9, 9, 2), 0.7)).abs().max() < 1e-6  # at the border too
     spike = torch.zeros(21, 21, 1)
     spike[10, 10] = 1.0
     assert term.detail(spike)[10, 10].item() == pytest.approx(1 - 1 / 49)
     assert term.detail(spike)[10, 13].item() == pytest.approx(-1 / 49)
-    band = HighFrequency(Interpolation("lanczos"), inner=3, outer=7)
+    band = HighFrequency(lambda: Interpolation("lanczos"), inner=3, outer=7)
     assert band.detail(spike)[10, 10].item() == pytest.approx(1 / 9 - 1 / 49)
     assert averaged(spike, 3)[0, 0] == 0 and averaged(torch.ones(5, 5, 1), 3)[0, 0] == 1
 
 
 def test_confidence_falls_where_the_teacher_departs_from_the_record():
-    term = HighFrequency(Interpolation("lanczos"))
+    term = HighFrequency(lambda: Interpolation("lanczos"))
     record = noise()
     enlarged = resampled(record, FACTOR * HEIGHT, FACTOR * WIDTH, "bilinear")
     assert torch.equal(term.confidence(enlarged, record), torch.ones(FACTOR * HEIGHT, FACTOR * WIDTH, 1))
@@ -88,7 +88,7 @@ def test_confidence_falls_where_the_teacher_departs_from_the_record():
 def test_the_truth_costs_nothing_and_a_blurred_one_does_with_a_gradient_towards_it():
     fine = smooth()
     record = resampled(fine, HEIGHT, WIDTH, "bicubic")
-    term = HighFrequency(Oracle(fine))
+    term = HighFrequency(lambda: Oracle(fine))
     assert term(inputs(fine, record)).item() == pytest.approx(0.0, abs=2e-4)  # lessons are kept in half precision
     blurred = averaged(fine, 9).requires_grad_()
     loss = term(inputs(blurred, record))
@@ -101,13 +101,13 @@ def test_the_truth_costs_nothing_and_a_blurred_one_does_with_a_gradient_towards_
 def test_levels_do_not_matter_only_detail_does():
     fine = smooth()
     record = resampled(fine, HEIGHT, WIDTH, "bicubic")
-    term = HighFrequency(Oracle(fine))
+    term = HighFrequency(lambda: Oracle(fine))
     assert term(inputs(fine + 0.3, record)).item() == pytest.approx(0.0, abs=2e-4)
 
 
 def test_a_lesson_is_made_once_per_image():
     teacher = Oracle(smooth())
-    term = HighFrequency(teacher)
+    term = HighFrequency(lambda: teacher)
     for index in (0, 0, 1, 0):
         term(inputs(smooth(seed=1), index=index))
     assert teacher.asked == 2
@@ -119,23 +119,23 @@ def test_near_masked_pixels_nothing_counts():
     record = noise()
     record[5, 6] = float("nan")
     prediction = smooth(seed=2).requires_grad_()
-    loss = HighFrequency(Interpolation("lanczos"))(inputs(prediction, record, mask))
+    loss = HighFrequency(lambda: Interpolation("lanczos"))(inputs(prediction, record, mask))
     loss.backward()
     assert loss.isfinite() and prediction.grad.isfinite().all()
     assert prediction.grad[20:24, 24:28].abs().max() < prediction.grad.abs().max() * 0.5
-    assert HighFrequency(Interpolation("lanczos"))(inputs(prediction, noise(), torch.zeros_like(mask))) == 0
+    assert HighFrequency(lambda: Interpolation("lanczos"))(inputs(prediction, noise(), torch.zeros_like(mask))) == 0
 
 
 def test_the_teacher_is_not_asked_before_its_stage():
     teacher = Oracle(smooth())
-    term = Weighted(HighFrequency(teacher), 0.1, lambda progress: cosine(progress, 0.65, 0.95))
+    term = Weighted(HighFrequency(lambda: teacher), 0.1, lambda progress: cosine(progress, 0.65, 0.95))
     assert term(inputs(smooth(), step=65)) == {} and teacher.asked == 0
     assert term(inputs(smooth(), step=66)) != {} and teacher.asked == 1
 
 
 def test_preparing_asks_for_every_training_image_and_says_who_was_asked():
     teacher = Oracle(smooth())
-    term = HighFrequency(teacher)
+    term = HighFrequency(lambda: teacher)
     assert term.prepare(make_scene(3), "thermal") == {"teacher": "the truth"}
     assert teacher.asked == 3
     term(inputs(smooth(), index=2))
@@ -144,7 +144,7 @@ def test_preparing_asks_for_every_training_image_and_says_who_was_asked():
 
 def test_another_factor_is_named():
     with pytest.raises(ValueError, match="2 times as fine as the training image, the loss expects 4; set both"):
-        HighFrequency(Interpolation("lanczos"))(inputs(noise(24, 32)))
+        HighFrequency(lambda: Interpolation("lanczos"))(inputs(noise(24, 32)))
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_another_factor_is_named():
 )
 def test_options_out_of_range(options, message):
     with pytest.raises(ValueError, match=message):
-        HighFrequency(Interpolation("lanczos"), **options)
+        HighFrequency(lambda: Interpolation("lanczos"), **options)
 
 
 # Teachers -------------------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def test_enlarged_images_are_found_by_name_and_read_to_full_depth(tmp_path, bits
 def test_an_enlarged_image_of_the_wrong_size_is_refused_before_training(tmp_path):
     for index in range(2):
         Image.fromarray(np.zeros((40, 64), np.uint8)).save(tmp_path / f"{index:03d}.png")
-    term = HighFrequency(load_teacher(str(tmp_path)))
+    term = HighFrequency(lambda: load_teacher(str(tmp_path)))
     message = "000.png has 64 x 40 pixels, but 4 times the training image sub/000.JPG is 64 x 48"
     with pytest.raises(SceneError, match=message):
         term.prepare(make_scene(), "thermal")

@@ -262,7 +262,7 @@ def test_the_network_starts_from_the_generator_it_is_given():
 
 def test_cost_counts_the_multiply_adds_of_the_layers():
     narrow = ImagingField(Static())
-    assert narrow.cost == Static().cost + 60 * 64 + 64 * 64 + 64 * 4 + 80
+    assert narrow.cost == Static().cost + 60 * 32 + 32 * 32 + 32 * 4 + 80
     paper = ImagingField(Static(), width=256, depth=8, skip=5)
     assert 0.48e6 < paper.cost < 0.50e6
     wide, splats = make(width=32, depth=4, skip=2, disturb=0.2)

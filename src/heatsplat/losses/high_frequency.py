@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -26,7 +27,7 @@ class HighFrequency:
     record is near, nothing counts.
 
     Args:
-        teacher: where the fine image comes from.
+        teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
         factor: how much finer than the training images the prediction is.
         gamma_pixel, gamma_gradient: how fast confidence falls with |teacher - enlarged record| and with the sum of the
             differences of their slopes per pixel.
@@ -38,7 +39,7 @@ class HighFrequency:
 
     def __init__(
         self,
-        teacher: Teacher,
+        teacher: Callable[[], Teacher],
         factor: int = 4,
         gamma_pixel: float = 10.0,
         gamma_gradient: float = 5.0,
@@ -51,19 +52,21 @@ class HighFrequency:
             raise ValueError(
                 f"gammas must not be negative and factor at least 1, got {gamma_pixel}, {gamma_gradient}, {factor}"
             )
-        self.teacher, self.factor = teacher, factor
+        self._hire, self._teacher, self.factor = teacher, None, factor
         self.gamma_pixel, self.gamma_gradient = gamma_pixel, gamma_gradient
         self.inner, self.outer = inner, outer
         self._made: dict[int, tuple[Tensor, Tensor]] = {}
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Checks that the teacher can serve every training image, asks it for all of them and forgets it."""
-        log.info("super-resolution teacher: %s", self.teacher.description)
+        teacher = self._hired()
+        log.info("super-resolution teacher: %s", teacher.description)
         for frame in scene.train.frames:
-            self.teacher.check(frame, self.factor)
+            teacher.check(frame, self.factor)
         for view in scene.train:
             self._lesson(view, view.image(modality))
-        return {"teacher": self.teacher.description}
+        self._teacher = None
+        return {"teacher": teacher.description}
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         if fineness(inputs) != self.factor:
@@ -90,13 +93,18 @@ class HighFrequency:
         departure = self.gamma_pixel * (fine - enlarged).abs() + self.gamma_gradient * gradient
         return torch.exp(-departure.mean(2, keepdim=True))
 
+    def _hired(self) -> Teacher:
+        if self._teacher is None:
+            self._teacher = self._hire()
+        return self._teacher
+
     @torch.no_grad()
     def _lesson(self, view: View, target: Tensor) -> tuple[Tensor, Tensor]:
         """H(teacher) and W for a training image, made when it is first seen."""
         key = view.frame.frame_id
         if key not in self._made:
             record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
-            fine = self.teacher(record, view.frame, self.factor)
+            fine = self._hired()(record, view.frame, self.factor)
             self._made[key] = (self.detail(fine).half(), self.confidence(fine, record).half())
         return self._made[key]
 

@@ -34,8 +34,8 @@ class GainControl(SensorPart):
         stretch_max: float = 2.0,
         shift_max: float = 1.0,
         weight: float = 5e-4,
-        lr: float = 1e-3,
-        lr_end: float = 0.01,
+        lr: float = 0.03,
+        lr_end: float = 0.1,
     ) -> None:
         super().__init__()
         if stretch_max <= 1 or shift_max < 0:

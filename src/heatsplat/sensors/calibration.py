@@ -37,8 +37,8 @@ class Calibration(SensorPart):
         bias_max: float = 0.05,
         vignetting_max: float = 0.5,
         weight: float = 5e-4,
-        lr: float = 1e-3,
-        lr_end: float = 0.01,
+        lr: float = 0.03,
+        lr_end: float = 0.1,
     ) -> None:
         super().__init__()
         if grid < 2:

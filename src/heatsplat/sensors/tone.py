@@ -21,6 +21,9 @@ class Tone(SensorPart):
     which stays within a quarter of an 8-bit step of asking it at every pixel and costs a thousandth. Brightness beyond
     [0, 1] is corrected like its end.
 
+    A level and a factor that all brightnesses share belong to the scene: the straight line that fits the correction best
+    over [0, 1] is taken away, and what stays is the curve's bend.
+
     The start is fixed, without a draw: bends evenly over [0, 1] in the first layer, an orthogonal mixture of them in
     the second, zero in the last.
 
@@ -28,6 +31,7 @@ class Tone(SensorPart):
         width: units of each of the two hidden layers.
         gain_max, offset_max: m and o, the largest change as a factor and in image units.
         weight: of the penalty mean of δ_m² + δ_o² over the levels.
+        straight: leaves the straight line in (as the paper prints); brightness is then arbitrary within the bounds.
         exact: asks the network at every pixel (the paper); slow.
         lr, lr_end: learning rate and the factor on it at the end of the run.
     """
@@ -38,6 +42,7 @@ class Tone(SensorPart):
         gain_max: float = 0.08,
         offset_max: float = 0.04,
         weight: float = 1e-3,
+        straight: bool = False,
         exact: bool = False,
         lr: float = 1e-3,
         lr_end: float = 0.01,
@@ -45,7 +50,8 @@ class Tone(SensorPart):
         super().__init__()
         if width < 2 or min(gain_max, offset_max) < 0:
             raise ValueError(f"tone needs width >= 2 and bounds >= 0, got {width}, {gain_max}, {offset_max}")
-        self.weight, self.exact, self.lr, self.lr_end = weight, exact, lr, lr_end
+        self.weight, self.lr, self.lr_end = weight, lr, lr_end
+        self.straight, self.exact = straight, exact
         first, second, last = nn.Linear(1, width), nn.Linear(width, width), nn.Linear(width, 2)
         self.network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
         with torch.no_grad():
@@ -64,11 +70,21 @@ class Tone(SensorPart):
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         brightness = image.mean(2)
+        curve = self.bounds * self.network(self.levels).tanh()
         if self.exact:
             change = self.bounds * self.network(brightness.clamp(0, 1)[..., None]).tanh()
         else:
-            change = _interpolated(self.bounds * self.network(self.levels).tanh(), brightness)
+            change = _interpolated(curve, brightness)
+        if not self.straight:
+            change = change - self._line(curve)
         return image * (1.0 + change[..., :1]) + change[..., 1:]
+
+    def _line(self, curve: Tensor) -> Tensor:
+        """Slope and level of the line that fits the correction of a curve [L, 2] best over [0, 1], [2]."""
+        correction = self.levels[:, 0] * curve[:, 0] + curve[:, 1]
+        offsets = self.levels[:, 0] - 0.5
+        slope = (offsets * correction).sum() / offsets.square().sum()
+        return torch.stack((slope, correction.mean() - 0.5 * slope))
 
     def regulariser(self) -> Tensor | None:
         if self.weight == 0:

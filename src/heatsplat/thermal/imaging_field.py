@@ -55,7 +55,7 @@ class ImagingField(ThermalModel):
     def __init__(
         self,
         emission: ThermalModel,
-        width: int = 64,
+        width: int = 32,
         depth: int = 2,
         skip: int | None = None,
         position_frequencies: int = 10,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ class SplatTraining(pl.LightningModule):
         optim: learning rates and schedule.
         stages: which parameters stand still at which steps; None: all train throughout.
         seed: seed of every random draw.
+        supersample: how much finer than the training images training renders; the loss compares on their grid.
         output_dir: folder of the run.
     """
 
@@ -58,6 +60,7 @@ class SplatTraining(pl.LightningModule):
         optim: Optimisation,
         stages: Stages | None = None,
         seed: int = 0,
+        supersample: int = 1,
         output_dir: Path | str = ".",
     ) -> None:
         super().__init__()
@@ -67,6 +70,7 @@ class SplatTraining(pl.LightningModule):
         self.seed, self.output_dir = seed, Path(output_dir)
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
+        self.supersample = supersample
         self.results = RunResults()
         self.scene: SceneData | None = None
         self.splats: Splats | None = None
@@ -80,6 +84,8 @@ class SplatTraining(pl.LightningModule):
         """Builds splats from the scene of the trainer's data module, once."""
         if self.scene is None:
             self.attach(self.trainer.datamodule.scene)
+        if stage == "fit":
+            self.results.data |= self.loss.prepare(self.scene, self.modality)
 
     def attach(self, scene: SceneData) -> None:
         """Builds all that depends on the scene. Refuses a scene that lacks what the thermal model needs."""
@@ -155,9 +161,10 @@ class SplatTraining(pl.LightningModule):
         step = self.global_step
         view = view.to(self.device)
         self.thermal.on_step(step)
-        output = self.render(view.frame, absgrad=self.density.absgrad)
+        frame = self._fine(view.frame)
+        output = self.render(frame, absgrad=self.density.absgrad)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
-        prediction = self.sensor(image, view.frame)
+        prediction = self.sensor(image, frame)
         inputs = LossInputs(
             prediction,
             view.image(self.modality),
@@ -169,12 +176,19 @@ class SplatTraining(pl.LightningModule):
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
-        self._rendered = (output, view)
+        self._rendered = (output, frame.camera)
         return {"loss": sum(terms.values()), "terms": {name: term.detach() for name, term in terms.items()}}
 
+    def _fine(self, frame: Frame) -> Frame:
+        """The frame on the grid on which training renders."""
+        if self.supersample == 1:
+            return frame
+        camera, factor = frame.camera, self.supersample
+        return replace(frame, camera=camera.resized(factor * camera.width, factor * camera.height))
+
     def on_after_backward(self) -> None:
-        output, view = self._rendered
-        self.density.observe(self._density_state, output, view.camera, self.global_step)
+        output, camera = self._rendered
+        self.density.observe(self._density_state, output, camera, self.global_step)
         self._rendered = None
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
