@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numba
 from numba.core import event
@@ -18,8 +21,8 @@ log = logging.getLogger(__name__)
 # nothing (measured: the image is wrong by 0.21), 'nnan' because comparisons with NaN must stay false: they cull.
 FASTMATH = {"contract", "nsz", "arcp"}
 
-# Numba's cache looks only at the file of the function itself; with this in the names of its files it also notices changed
-# helpers in other files, and never unpickles types of another version of this package.
+# Numba's cache looks only at the file of the function itself; with this in the names of its files it also notices
+# changed helpers in other files, and never unpickles types of another version of this package.
 _FINGERPRINT = hashlib.sha256(
     b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
 ).hexdigest()[:12]
@@ -34,18 +37,32 @@ class _Cache(FunctionCache):
     _impl_class = _CacheFiles
 
 
+# Numba's 'workqueue' threads, the fallback where there is no OpenMP, abort the process if two Python threads use them
+# at once; and two kernels at once would only share the same cores.
+_ONE_AT_A_TIME = threading.Lock()
+
+
+def _callable(function: Callable, **options: bool) -> Callable:
+    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, **options)(function)
+    compiled._cache = _Cache(function)
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        with _ONE_AT_A_TIME:
+            return compiled(*arguments)
+
+    call.compiled = compiled
+    return call
+
+
 def kernel(function: Callable) -> Callable:
     """``function`` compiled for Python callers: parallel over ``prange``, without the GIL, cached on disk."""
-    compiled = numba.njit(parallel=True, fastmath=FASTMATH, error_model="numpy", nogil=True)(function)
-    compiled._cache = _Cache(function)
-    return compiled
+    return _callable(function, parallel=True)
 
 
 def serial_kernel(function: Callable) -> Callable:
     """``function`` compiled for Python callers, to run in one thread."""
-    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True)(function)
-    compiled._cache = _Cache(function)
-    return compiled
+    return _callable(function)
 
 
 def inline(function: Callable) -> Callable:

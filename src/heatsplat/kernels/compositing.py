@@ -1,19 +1,22 @@
 """Front-to-back compositing of the instances of a tile, and its gradient; a vector is a block of 4x4 pixels.
 
-Plain twin: heatsplat.renderers.reference.
+Plain twin: heatsplat.renderers.reference, under autograd.
 
-Pixel state lives in blocks: entry (tile, block) of a state array is one vector per modality or channel. A pixel that is
-finished keeps its transmittance with the sign flipped: the next transmittance is then negative as well, so the one
-comparison with TRANSMITTANCE_MIN turns away finished pixels and those about to finish.
+A pixel takes a Gaussian's colour with weight alpha T, where T is the transmittance left by those in front, and is
+finished before T would fall to TRANSMITTANCE_MIN. The transmittance of a finished pixel is kept with its sign
+flipped: whatever comes next, T (1 - alpha) is negative too, so one comparison turns away finished pixels and those
+about to finish.
 
-The backward pass walks front to back as the forward pass does, with what remains of the loss behind each Gaussian,
+The backward pass walks front to back as the forward pass did, with what remains of the loss behind each Gaussian,
 
-    R = sum over later j of w_j (v . f_j) + T_final v_T,   dL/d(log alpha_i) = w_i (v . f_i) - R_i alpha_i / (1 - alpha_i),
+    R_i = sum over j > i of w_j (v . f_j) + T_final v_T,
+    dL / d log(alpha_i) = w_i (v . f_i) - R_i alpha_i / (1 - alpha_i),
 
-so it needs neither per-pixel lists nor divisions of transmittances. The density is exp2(-|u|^2) of whitened offsets u, so
-the gradient of everything geometric is a linear function of five moments of g = dL/d(log alpha): the sums of g u1, g u2,
-g u1^2, g u1 u2 and g u2^2 over pixels. They stay in registers over the blocks of an instance and are added up across lanes
-once per instance, into a slot of its own.
+where f are features and v the gradients of a pixel, so it needs neither lists per pixel nor divisions of
+transmittances. With g = dL / d log(alpha) and a density exp2(-u1^2 - u2^2), the gradient of everything geometric is
+linear in five moments: the sums over pixels of g u1, g u2, g u1^2, g u1 u2 and g u2^2. They stay in registers over
+the blocks of an instance and are added up across lanes once, into the instance's own slot; so no two threads ever add
+to the same number.
 """
 
 from __future__ import annotations
@@ -21,16 +24,40 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
+from heatsplat.kernels.binning import feature_row
+from heatsplat.kernels.buffers import aligned
 from heatsplat.kernels.compilation import inline, kernel, part
+from heatsplat.kernels.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLOCK,
+    BLOCKS,
+    DEPTH_GRADIENT,
+    ELLIPSE,
+    FIRST,
+    LOG2_ALPHA_MIN,
+    LOG_OPACITY,
+    LOG_OPACITY_GRADIENT,
+    MEAN_X,
+    MEAN_Y,
+    MIXED,
+    OPACITY_GRADIENTS,
+    SECOND,
+    SUMS,
+    TILE,
+    TILE_BLOCKS,
+    TRANSMITTANCE_MIN,
+    TWO_LN_2,
+)
 from heatsplat.kernels.layout import (
     channels,
+    feature_column,
     has_absgrad,
     has_depth,
     modalities,
     modality_of,
-    moment_count,
+    slot_columns,
 )
-from heatsplat.kernels.projection import DEPTH_MOMENT, GEOMETRY, LOG2_ALPHA_MIN, OPACITY_MOMENTS, TILE
 from heatsplat.kernels.scheduling import take
 from heatsplat.kernels.simd import (
     LANES,
@@ -38,353 +65,385 @@ from heatsplat.kernels.simd import (
     bits,
     exp2,
     load,
+    load_vector,
     lowest_bit,
     minimum,
     prefetch,
     registers,
     select,
     splat,
-    store,
     store_first,
-    store_scalar,
+    store_vector,
     total,
     totals,
 )
 
-ALPHA_MIN = np.float32(1.0 / 255.0)
-ALPHA_MAX = np.float32(0.999)
-TRANSMITTANCE_MIN = np.float32(1e-4)
-BLOCKS = 16
-BATCH = 32  # instances between two looks at which blocks are finished
-AHEAD = 8  # instances ahead of use that records are fetched
-
-_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+BATCH = 64  # instances between two looks at which blocks are finished
+AHEAD = 8  # instances ahead of their use that records are fetched
+RANKS_AHEAD = 16
 
 
-@inline
-def _offset(records, record, tile_x, tile_y):
-    """u1 and u2 of the corner of a tile: what is left of the whitening once it is linear in the pixels of the tile."""
-    x, y = tile_x - records[record, 0], tile_y - records[record, 1]
-    return records[record, 2] * x + records[record, 3] * y, records[record, 4] * y
+def pixel_centres() -> np.ndarray:
+    """x of the pixels of each column of blocks and y of those of each row, from the corner of a tile, [2, 8, LANES]."""
+    lanes, blocks = np.arange(LANES), BLOCK * np.arange(TILE_BLOCKS)[:, None]
+    centres = aligned(np.float32, 2, TILE_BLOCKS, LANES)
+    centres[:] = blocks + lanes % BLOCK + 0.5, blocks + lanes // BLOCK + 0.5
+    return centres
 
 
 @inline
-def _whitened(records, record, offset, pixels, block):
-    """u1 and u2 of the pixels of a block."""
-    x, y = load(pixels, block * LANES), load(pixels, (BLOCKS + block) * LANES)
+def _corner(records, rank, tile, tiles_x):
+    """u1 and u2 at the corner of a tile."""
+    x = np.float32(tile % tiles_x * TILE) - records[rank, MEAN_X]
+    y = np.float32(tile // tiles_x * TILE) - records[rank, MEAN_Y]
+    return records[rank, FIRST] * x + records[rank, MIXED] * y, records[rank, SECOND] * y
+
+
+@inline
+def _whitened(records, rank, corner, centres, block):
+    """u1 and u2 at the pixels of a block."""
+    x = load_vector(centres, block % TILE_BLOCKS)
+    y = load_vector(centres, TILE_BLOCKS + block // TILE_BLOCKS)
     return (
-        records[record, 2] * x + (records[record, 3] * y + offset[0]),
-        records[record, 4] * y + offset[1],
+        records[rank, FIRST] * x + (records[rank, MIXED] * y + corner[0]),
+        records[rank, SECOND] * y + corner[1],
     )
 
 
 @inline
-def _alpha(layout, modality, density, reached, records, record):
-    """Alpha of a modality before it is clamped, and where it is not skipped."""
-    if modalities(layout) == 1:
-        return density, reached
-    alpha = density * records[record, GEOMETRY + modality]
-    return alpha, reached & (alpha >= ALPHA_MIN)
+def _density(records, rank, u1, u2):
+    """Density times the largest opacity, and where it is not skipped."""
+    exponent = records[rank, LOG_OPACITY] - u1 * u1 - u2 * u2
+    return exp2(exponent), exponent >= LOG2_ALPHA_MIN
 
 
 @inline
-def _unfinished_blocks(layout, tile, transmittances):
-    """A bit mask of the blocks of a tile with a pixel that still takes light."""
-    blocks = 0
+def _alpha(layout, modality, records, rank, density, passed):
+    """Alpha of a modality before it is clamped, and where it is not skipped."""
+    if modalities(layout) > 1:
+        density = density * records[rank, ELLIPSE + modality]
+        passed = passed & (density >= ALPHA_MIN)
+    return density, passed
+
+
+@inline
+def _take(alpha, passed, before):
+    """What an alpha does to pixels of a transmittance: alpha as it counts, weight, transmittance after, who took it."""
+    alpha = select(passed, minimum(alpha, ALPHA_MAX), 0.0)
+    weight = alpha * before
+    after = before - weight
+    taken = after > TRANSMITTANCE_MIN
+    return alpha, select(taken, weight, 0.0), select(taken, after, -absolute(before)), taken
+
+
+@inline
+def _unfinished(layout, tile, transmittances):
+    """A bit mask of the blocks of a tile that have a pixel which is not finished."""
+    mask = 0
     for block in range(BLOCKS):
         for modality in range(modalities(layout)):
-            place = ((tile * BLOCKS + block) * modalities(layout) + modality) * LANES
-            blocks |= (bits(load(transmittances, place) > _ZERO) != 0) << block
-    return blocks
+            left = load_vector(transmittances, (tile * BLOCKS + block) * modalities(layout) + modality)
+            mask |= np.int64(bits(left > 0.0) != 0) << block
+    return mask
 
 
 @part
-def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, pixels, transmittances, image):
+def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centres, transmittances, image):
     """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
 
-    Block masks are reduced to the blocks where a pixel took something, which is what the backward pass has to visit.
+    Masks are reduced to the blocks where a pixel took something, which are those that the backward pass visits.
     """
-    tile_x, tile_y = np.float32(tile % tiles_x * TILE), np.float32(tile // tiles_x * TILE)
     for block in range(tile * BLOCKS, (tile + 1) * BLOCKS):
         for modality in range(modalities(layout)):
-            store(transmittances, (block * modalities(layout) + modality) * LANES, splat(_ONE))
+            store_vector(transmittances, block * modalities(layout) + modality, splat(1.0))
         for channel in range(channels(layout)):
-            store(image, (block * channels(layout) + channel) * LANES, splat(_ZERO))
+            store_vector(image, block * channels(layout) + channel, splat(0.0))
     weights = registers(modalities(layout))
-    features = GEOMETRY + (modalities(layout) if modalities(layout) > 1 else 0)
     last = begin
     for batch in range(begin, end, BATCH):
-        unfinished = _unfinished_blocks(layout, tile, transmittances)
+        unfinished = _unfinished(layout, tile, transmittances)
         if unfinished == 0:
             break
         for instance in range(batch, min(batch + BATCH, end)):
-            prefetch(records, np.int64(instances[min(instance + AHEAD, end - 1), 0]) * records.shape[1])
-            record = np.int64(instances[instance, 0])
-            blocks = np.int64(instances[instance, 2]) & unfinished
-            offset = _offset(records, record, tile_x, tile_y)
-            used = 0
+            prefetch(records, (instances[min(instance + AHEAD, end - 1), 0] & 0xFFFFFFFF) * records.shape[1])
+            rank = instances[instance, 0] & 0xFFFFFFFF
+            blocks = instances[instance, 1] & unfinished
+            corner = _corner(records, rank, tile, tiles_x)
+            useful = 0
             while blocks != 0:
                 block = lowest_bit(blocks)
                 blocks &= blocks - 1
                 state = tile * BLOCKS + block
-                u1, u2 = _whitened(records, record, offset, pixels, block)
-                exponent = records[record, 5] - u1 * u1 - u2 * u2
-                reached = exponent >= LOG2_ALPHA_MIN
-                density = exp2(exponent)
-                anything = 0
+                u1, u2 = _whitened(records, rank, corner, centres, block)
+                density, reached = _density(records, rank, u1, u2)
+                taken_by_any = 0
                 for modality in range(modalities(layout)):
-                    alpha, passed = _alpha(layout, modality, density, reached, records, record)
-                    alpha = select(passed, minimum(alpha, ALPHA_MAX), _ZERO)
-                    place = (state * modalities(layout) + modality) * LANES
-                    before = load(transmittances, place)
-                    after = before - alpha * before
-                    taken = after > TRANSMITTANCE_MIN
-                    weights[modality] = select(taken, alpha * before, _ZERO)
-                    anything |= bits(taken & passed)
-                    store(transmittances, place, select(taken, after, -absolute(before)))
+                    alpha, passed = _alpha(layout, modality, records, rank, density, reached)
+                    place = state * modalities(layout) + modality
+                    _, weight, after, taken = _take(alpha, passed, load_vector(transmittances, place))
+                    store_vector(transmittances, place, after)
+                    weights[modality] = weight
+                    taken_by_any |= bits(taken & passed)
                 for channel in range(channels(layout)):
-                    place = (state * channels(layout) + channel) * LANES
-                    colour = weights[modality_of(layout, channel)] * records[record, features + channel]
-                    store(image, place, load(image, place) + colour)
-                used |= (anything != 0) << block
-            instances[instance, 2] = used
-            if used != 0:
+                    place = state * channels(layout) + channel
+                    colour = weights[modality_of(layout, channel)] * records[rank, feature_column(layout) + channel]
+                    store_vector(image, place, load_vector(image, place) + colour)
+                useful |= np.int64(taken_by_any != 0) << block
+            instances[instance, 1] = useful
+            if useful != 0:
                 last = instance + 1
     return last
 
 
 @part
-def _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth):
-    """Copies the state of a tile into the images, background added, pixel by pixel."""
+def _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth):
+    """Copies the state of a tile into the images, with the background behind it."""
+    height, width, colours = features.shape
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    colours = features.shape[2]
-    for y in range(top, min(top + TILE, height)):
-        for x in range(left, min(left + TILE, width)):
-            block = tile * BLOCKS + (y - top) // 4 * 4 + (x - left) // 4
-            lane = (y - top) % 4 * 4 + (x - left) % 4
+    for y in range(min(TILE, height - top)):
+        for x in range(min(TILE, width - left)):
+            block = tile * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
+            lane = y % BLOCK * BLOCK + x % BLOCK
             for modality in range(modalities(layout)):
                 transmittances[block, modality, lane] = abs(transmittances[block, modality, lane])
-                alpha[modality, y, x] = _ONE - transmittances[block, modality, lane]
-            for channel in range(channels(layout)):
-                if channel < colours:
-                    behind = transmittances[block, modality_of(layout, channel), lane]
-                    image[block, channel, lane] += behind * background[channel]
-                    features[y, x, channel] = image[block, channel, lane]
-                else:
-                    depth[y, x] = image[block, channel, lane]
+                alpha[modality, top + y, left + x] = np.float32(1.0) - transmittances[block, modality, lane]
+            for channel in range(colours):
+                behind = transmittances[block, modality_of(layout, channel), lane]
+                image[block, channel, lane] += behind * background[channel]
+                features[top + y, left + x, channel] = image[block, channel, lane]
+            if has_depth(layout):
+                depth[top + y, left + x] = image[block, colours, lane]
 
 
 @kernel
 def composite(
-    layout, workers, width, height, records, instances, tile_starts, background, pixels, ticket,
+    layout, workers, records, instances, tile_starts, centres, background, ticket,
     tile_ends, transmittances, image, features, alpha, depth,
 ):  # fmt: skip
     """Composites all tiles.
 
     Args:
-        workers: how many threads share the tiles, each taking the next one when it is done.
-        ticket: [1] int64, zero.
+        workers: how many threads share the tiles.
+        records, instances, tile_starts: see ``binning``; block masks of instances are overwritten.
+        centres: ``pixel_centres()``.
+        background, ticket: [C] and [1] int64, zero.
         tile_ends: out [tiles], the end of the instances that mattered to a tile.
-        transmittances, image: out, state by blocks: what is left of the light, and the channels with their background.
-        features, alpha, depth: out [H, W, C], [M, H, W], [H, W] (the last only where the layout has a channel for it).
+        transmittances, image: out [tiles * BLOCKS, modalities or channels, LANES], the final state of the pixels.
+        features, alpha, depth: out [H, W, C], [M, H, W], and [H, W] where the layout has depth.
     """
-    tiles_x = (width + TILE - 1) // TILE
-    tiles = tile_ends.shape[0]
-    for _ in prange(workers):
+    tiles_x = (features.shape[1] + TILE - 1) // TILE
+    for _worker in prange(workers):
         tile = take(ticket, 1)
-        while tile < tiles:
+        while tile < tile_ends.shape[0]:
             tile_ends[tile] = _composite_tile(
-                layout,
-                tile,
-                tiles_x,
-                records,
-                instances,
-                tile_starts[tile],
-                tile_starts[tile + 1],
-                pixels,
-                transmittances,
-                image,
-            )
-            _write_tile(layout, tile, tiles_x, width, height, transmittances, image, background, features, alpha, depth)
+                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_starts[tile + 1], centres,
+                transmittances, image,
+            )  # fmt: skip
+            _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth)
             tile = take(ticket, 1)
 
 
 @part
-def _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v_depth, v_pixels, worker):
-    """Copies the gradients of a tile's pixels into block order; pixels outside the image get zero."""
+def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker):
+    """Copies the gradients of a tile's pixels into blocks; those of pixels outside of the image are zero."""
+    height, width, colours = v_features.shape
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    colours = v_features.shape[2]
-    for y in range(TILE):
-        for x in range(TILE):
-            block = worker * BLOCKS + y // 4 * 4 + x // 4
-            lane = y % 4 * 4 + x % 4
-            inside = (top + y < height) & (left + x < width)
-            for channel in range(channels(layout)):
-                value = _ZERO
-                if inside:
-                    if channel < colours:
-                        value = v_features[top + y, left + x, channel]
-                    else:
-                        value = v_depth[top + y, left + x]
-                v_pixels[block, channel, lane] = value
+    if left + TILE > width or top + TILE > height:
+        for k in range(BLOCKS * v_pixels.shape[1]):
+            store_vector(v_pixels, worker * BLOCKS * v_pixels.shape[1] + k, splat(0.0))
+    for y in range(min(TILE, height - top)):
+        for x in range(min(TILE, width - left)):
+            block = worker * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
+            lane = y % BLOCK * BLOCK + x % BLOCK
+            for channel in range(colours):
+                v_pixels[block, channel, lane] = v_features[top + y, left + x, channel]
+            if has_depth(layout):
+                v_pixels[block, colours, lane] = v_depth[top + y, left + x]
             for modality in range(modalities(layout)):
-                value = _ZERO
-                if inside:
-                    value = v_alpha[modality, top + y, left + x]
-                v_pixels[block, channels(layout) + modality, lane] = value
+                v_pixels[block, channels(layout) + modality, lane] = v_alpha[modality, top + y, left + x]
 
 
 @part
-def _start_remainders(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
-    """Fills a worker's state with transmittance one and the whole of v . image - v_alpha T_final."""
+def _start(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
+    """Sets a worker's pixels to what they are before the first Gaussian; adds to the background's gradient."""
     size = channels(layout) + modalities(layout)
     for block in range(BLOCKS):
-        pixels = (worker * BLOCKS + block) * size
-        final = (tile * BLOCKS + block) * modalities(layout)
+        final, here = tile * BLOCKS + block, worker * BLOCKS + block
         for modality in range(modalities(layout)):
-            rest = -load(v_pixels, (pixels + channels(layout) + modality) * LANES)
-            rest = rest * load(transmittances, (final + modality) * LANES)
+            left = load_vector(transmittances, final * modalities(layout) + modality)
+            rest = -left * load_vector(v_pixels, here * size + channels(layout) + modality)
             for channel in range(channels(layout)):
                 if modality_of(layout, channel) == modality:
-                    composited = load(image, ((tile * BLOCKS + block) * channels(layout) + channel) * LANES)
-                    rest = rest + composited * load(v_pixels, (pixels + channel) * LANES)
-            place = ((worker * BLOCKS + block) * modalities(layout) + modality) * 2 * LANES
-            store(state, place, splat(_ONE))
-            store(state, place + LANES, rest)
+                    composited = load_vector(image, final * channels(layout) + channel)
+                    rest = rest + composited * load_vector(v_pixels, here * size + channel)
+            store_vector(state, (here * modalities(layout) + modality) * 2, splat(1.0))
+            store_vector(state, (here * modalities(layout) + modality) * 2 + 1, rest)
         for channel in range(colours):
-            behind = load(transmittances, (final + modality_of(layout, channel)) * LANES)
-            v_background[tile, channel] += total(behind * load(v_pixels, (pixels + channel) * LANES))
+            left = load_vector(transmittances, final * modalities(layout) + modality_of(layout, channel))
+            v_background[tile, channel] += total(left * load_vector(v_pixels, here * size + channel))
 
 
 @part
-def _store_moments(layout, moments, slots, place):
-    """Writes the sums over lanes of the moments from ``place`` on, up to the end of the slot."""
-    if moment_count(layout) <= LANES:
-        store_first(slots, place, totals(moments), slots.shape[1])
+def _write_slot(layout, slots, slot, sums):
+    """Writes the sums over lanes of a slot's columns."""
+    if slot_columns(layout) <= LANES:
+        store_first(slots, slot * slots.shape[1], totals(sums), slots.shape[1])
     else:
-        for k in range(moment_count(layout)):
-            store_scalar(slots, place + k, total(moments[k]))
+        for column in range(slot_columns(layout)):
+            slots[slot, column] = total(sums[column])
 
 
 @part
-def _store_zeros(layout, slots, place):
-    for k in range(0, moment_count(layout), LANES):
-        store_first(slots, place + k, splat(_ZERO), slots.shape[1] - k)
+def _clear_slot(slots, slot):
+    for column in range(0, slots.shape[1], LANES):
+        store_first(slots, slot * slots.shape[1] + column, splat(0.0), slots.shape[1] - column)
 
 
 @part
 def _composite_tile_backward(
-    layout, tile, tiles_x, records, instances, begin, end, pixels, v_pixels, worker, state, slots
-):
-    """Leaves the moments of instances ``begin`` to ``end`` of a tile in their gradient slots."""
-    tile_x, tile_y = np.float32(tile % tiles_x * TILE), np.float32(tile // tiles_x * TILE)
+    layout, tile, tiles_x, records, instances, begin, end, centres, v_pixels, worker, state, slots
+):  # fmt: skip
+    """Fills the gradient slots of instances ``begin`` to ``end`` of a tile."""
     size = channels(layout) + modalities(layout)
-    features = GEOMETRY + (modalities(layout) if modalities(layout) > 1 else 0)
-    moments = registers(moment_count(layout))
-    weights = registers(modalities(layout))
-    along = registers(modalities(layout))
+    sums = registers(slot_columns(layout))
+    weights, along = registers(modalities(layout)), registers(modalities(layout))
     for instance in range(begin, end):
-        prefetch(records, np.int64(instances[min(instance + AHEAD, end - 1), 0]) * records.shape[1])
-        blocks = np.int64(instances[instance, 2])
-        slot = np.int64(instances[instance, 1]) * slots.shape[1]
+        prefetch(records, (instances[min(instance + AHEAD, end - 1), 0] & 0xFFFFFFFF) * records.shape[1])
+        rank, slot = instances[instance, 0] & 0xFFFFFFFF, instances[instance, 0] >> 32
+        blocks = instances[instance, 1]
         if blocks == 0:
-            _store_zeros(layout, slots, slot)
+            _clear_slot(slots, slot)
             continue
-        record = np.int64(instances[instance, 0])
-        offset = _offset(records, record, tile_x, tile_y)
-        for k in range(moment_count(layout)):
-            moments[k] = splat(_ZERO)
+        corner = _corner(records, rank, tile, tiles_x)
+        for column in range(slot_columns(layout)):
+            sums[column] = splat(0.0)
         while blocks != 0:
             block = lowest_bit(blocks)
             blocks &= blocks - 1
-            v_block = (worker * BLOCKS + block) * size
-            u1, u2 = _whitened(records, record, offset, pixels, block)
-            exponent = records[record, 5] - u1 * u1 - u2 * u2
-            reached = exponent >= LOG2_ALPHA_MIN
-            density = exp2(exponent)
+            here = worker * BLOCKS + block
+            u1, u2 = _whitened(records, rank, corner, centres, block)
+            density, reached = _density(records, rank, u1, u2)
             for modality in range(modalities(layout)):
-                along[modality] = splat(_ZERO)
+                along[modality] = splat(0.0)
             for channel in range(channels(layout)):
                 modality = modality_of(layout, channel)
-                v_pixel = load(v_pixels, (v_block + channel) * LANES)
-                along[modality] = along[modality] + v_pixel * records[record, features + channel]
-            gradient = splat(_ZERO)
+                feature = records[rank, feature_column(layout) + channel]
+                along[modality] = along[modality] + feature * load_vector(v_pixels, here * size + channel)
+            g = splat(0.0)
             for modality in range(modalities(layout)):
-                alpha, passed = _alpha(layout, modality, density, reached, records, record)
-                free = passed & (alpha < ALPHA_MAX)
-                alpha = select(passed, minimum(alpha, ALPHA_MAX), _ZERO)
-                place = ((worker * BLOCKS + block) * modalities(layout) + modality) * 2 * LANES
-                before, rest = load(state, place), load(state, place + LANES)
-                after = before - alpha * before
-                taken = after > TRANSMITTANCE_MIN
-                weight = select(taken, alpha * before, _ZERO)
-                weights[modality] = weight
-                store(state, place, select(taken, after, -absolute(before)))
+                alpha, passed = _alpha(layout, modality, records, rank, density, reached)
+                unclamped = passed & (alpha < ALPHA_MAX)
+                place = (here * modalities(layout) + modality) * 2
+                alpha, weight, after, taken = _take(alpha, passed, load_vector(state, place))
                 gain = weight * along[modality]
-                rest = rest - gain
-                store(state, place + LANES, rest)
-                v_log_alpha = select(free & taken, gain - rest * (alpha / (_ONE - alpha)), _ZERO)
-                k = OPACITY_MOMENTS + modality
-                moments[k] = moments[k] + v_log_alpha
-                gradient = gradient + v_log_alpha
+                rest = load_vector(state, place + 1) - gain
+                store_vector(state, place, after)
+                store_vector(state, place + 1, rest)
+                weights[modality] = weight
+                v_log_alpha = select(unclamped & taken, gain - rest * (alpha / (1.0 - alpha)), 0.0)
+                column = OPACITY_GRADIENTS + modality
+                sums[column] = sums[column] + v_log_alpha
+                g = g + v_log_alpha
                 if has_absgrad(layout):
                     g1, g2 = v_log_alpha * u1, v_log_alpha * u2
-                    k = moment_count(layout) - 2
-                    moments[k] = moments[k] + absolute(g1 * records[record, 2])
-                    moments[k + 1] = moments[k + 1] + absolute(g1 * records[record, 3] + g2 * records[record, 4])
-            g1, g2 = gradient * u1, gradient * u2
-            moments[0] = moments[0] + g1
-            moments[1] = moments[1] + g2
-            moments[2] = moments[2] + g1 * u1
-            moments[3] = moments[3] + g1 * u2
-            moments[4] = moments[4] + g2 * u2
+                    by_x, by_y = g1 * records[rank, FIRST], g1 * records[rank, MIXED] + g2 * records[rank, SECOND]
+                    column = slot_columns(layout) - 2
+                    sums[column] = sums[column] + absolute(by_x)
+                    sums[column + 1] = sums[column + 1] + absolute(by_y)
+            g1, g2 = g * u1, g * u2
+            sums[0] = sums[0] + g1
+            sums[1] = sums[1] + g2
+            sums[2] = sums[2] + g1 * u1
+            sums[3] = sums[3] + g1 * u2
+            sums[4] = sums[4] + g2 * u2
             for channel in range(channels(layout)):
                 is_depth = has_depth(layout) and channel == channels(layout) - 1
-                k = DEPTH_MOMENT if is_depth else OPACITY_MOMENTS + modalities(layout) + channel
-                v_pixel = load(v_pixels, (v_block + channel) * LANES)
-                moments[k] = moments[k] + weights[modality_of(layout, channel)] * v_pixel
-        _store_moments(layout, moments, slots, slot)
+                column = DEPTH_GRADIENT if is_depth else OPACITY_GRADIENTS + modalities(layout) + channel
+                v_pixel = load_vector(v_pixels, here * size + channel)
+                sums[column] = sums[column] + weights[modality_of(layout, channel)] * v_pixel
+        _write_slot(layout, slots, slot, sums)
 
 
 @kernel
 def composite_backward(
-    layout, workers, width, height, records, instances, tile_starts, tile_ends, transmittances, image, pixels, ticket,
-    v_features, v_alpha, v_depth, v_pixels, state, slots, v_backgrounds,
+    layout, workers, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
+    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
 ):  # fmt: skip
-    """Leaves the moments of every instance in its gradient slot, and the background's gradient tile by tile.
+    """Fills the gradient slots of all instances.
 
     Args:
-        v_features, v_alpha, v_depth: gradients of the images, as in ``composite``.
-        v_pixels: scratch, flat: (channels + modalities) vectors per worker and block.
-        state: scratch, flat: transmittance and remainder per worker, block and modality.
-        slots: out, flat, ``slot_size(layout)`` numbers per instance.
-        v_backgrounds: out [tiles, C].
+        records ... image: as ``composite`` left them.
+        v_features, v_alpha, v_depth: [H, W, C], [M, H, W], and [H, W] where the layout has depth.
+        v_pixels, state: scratch [workers * BLOCKS, channels + modalities, LANES] and [.., 2 * modalities, LANES].
+        slots: out [instances, slot_size], columns as in ``constants``.
+        v_background: out [tiles, C], the gradient of the background tile by tile.
     """
-    tiles_x = (width + TILE - 1) // TILE
-    tiles = tile_ends.shape[0]
+    tiles_x = (v_features.shape[1] + TILE - 1) // TILE
     for worker in prange(workers):
         tile = take(ticket, 1)
-        while tile < tiles:
+        while tile < tile_ends.shape[0]:
             for channel in range(v_features.shape[2]):
-                v_backgrounds[tile, channel] = _ZERO
-            _read_gradients(layout, tile, tiles_x, width, height, v_features, v_alpha, v_depth, v_pixels, worker)
-            _start_remainders(
-                layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_backgrounds
-            )
+                v_background[tile, channel] = 0.0
+            _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
+            _start(
+                layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background
+            )  # fmt: skip
             _composite_tile_backward(
-                layout,
-                tile,
-                tiles_x,
-                records,
-                instances,
-                tile_starts[tile],
-                tile_ends[tile],
-                pixels,
-                v_pixels,
-                worker,
-                state,
-                slots,
-            )
+                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
+                worker, state, slots,
+            )  # fmt: skip
             for instance in range(tile_ends[tile], tile_starts[tile + 1]):
-                _store_zeros(layout, slots, np.int64(instances[instance, 1]) * slots.shape[1])
+                _clear_slot(slots, instances[instance, 0] >> 32)
             tile = take(ticket, 1)
+
+
+@kernel
+def sum_slots(
+    ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+    sums, v_opacities, v_features, absgrad,
+):  # fmt: skip
+    """Adds up the slots of each visible Gaussian and finishes the gradients that need no projection.
+
+    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the
+    image: not on threads, not on the run.
+
+    Args:
+        ids, slot_starts, screen, rows_are_ranks, first_ranks: see ``binning``.
+        slots: [slots, slot_size], the first slot of each Gaussian is overwritten with the sum.
+        sums: out [N, SUMS], for ``projection.project_backward``; rows of visible Gaussians only, as below.
+        v_opacities, v_features: out [M, N], and [N, C] or [n, C].
+        absgrad: out [N, 2], or [0, 0] where it is not wanted.
+    """
+    modalities, colours = opacities.shape[0], v_features.shape[1]
+    size = slots.shape[1]
+    for rank in prange(ids.shape[0]):
+        ahead = np.int64(ids[min(rank + RANKS_AHEAD, ids.shape[0] - 1)])
+        prefetch(sums, ahead * SUMS)
+        prefetch(opacities, ahead)
+        prefetch(v_opacities, ahead)
+        prefetch(v_features, ahead * colours)
+        gaussian = np.int64(ids[rank])
+        slot, end = slot_starts[rank], slot_starts[rank + 1]
+        if slot == end:
+            store_first(sums, gaussian * SUMS, splat(0.0), SUMS)
+            continue
+        for column in range(0, size, LANES):
+            added = load(slots, slot * size + column)
+            for other in range(slot + 1, end):
+                added = added + load(slots, other * size + column)
+            store_first(slots, slot * size + column, added, size - column)
+        store_first(sums, gaussian * SUMS, load(slots, slot * size), SUMS)
+        if not with_depth:
+            sums[gaussian, DEPTH_GRADIENT] = 0.0
+        sums[gaussian, LOG_OPACITY_GRADIENT] = 0.0
+        for modality in range(modalities):
+            v_log_opacity = slots[slot, OPACITY_GRADIENTS + modality]
+            opacity = opacities[modality, gaussian]
+            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else 0.0
+            sums[gaussian, LOG_OPACITY_GRADIENT] += v_log_opacity
+        column = OPACITY_GRADIENTS + modalities
+        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
+        for channel in range(colours):
+            v_features[row, channel] = slots[slot, column + channel]
+        for axis in range(absgrad.shape[1]):
+            absgrad[gaussian, axis] = slots[slot, column + colours + axis] * TWO_LN_2

@@ -1,4 +1,4 @@
-"""The channel layout of an image as a compile-time constant: Numba compiles the compositing kernels once per layout."""
+"""The channels of an image as a compile-time constant: compositing is compiled once per layout."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from llvmlite import ir
 from numba.core import types
 from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
+
+from heatsplat.kernels.constants import ELLIPSE, OPACITY_GRADIENTS
 
 _i64 = ir.IntType(64)
 
@@ -18,7 +20,7 @@ class Layout:
     Args:
         modality_of: one entry per channel, the modality whose opacity composites it.
         modalities: how many modalities there are; one without channels still has an alpha.
-        depth: whether the last channel is depth, which is composited without a background.
+        depth: whether the last channel is depth, which has no background.
         absgrad: whether the backward pass also gathers absolute screen gradients.
     """
 
@@ -32,23 +34,24 @@ class Layout:
         return len(self.modality_of)
 
     @property
-    def record(self) -> int:
-        """Numbers per projected Gaussian: geometry, opacity of each modality where there are several, features."""
-        ratios = self.modalities if self.modalities > 1 else 0
-        return -(-(GEOMETRY + ratios + self.channels) // 8) * 8
+    def feature_column(self) -> int:
+        """Where the channels begin in a record: after the ellipse, and the opacities where there are several."""
+        return ELLIPSE + (self.modalities if self.modalities > 1 else 0)
 
     @property
-    def moments(self) -> int:
-        """Numbers per gradient slot (heatsplat.kernels.projection has their order)."""
-        return 6 + self.modalities + self.channels - self.depth + 2 * self.absgrad
+    def record_size(self) -> int:
+        """Numbers per record, in whole half cache lines."""
+        return -(-(self.feature_column + self.channels) // 8) * 8
 
     @property
-    def slot(self) -> int:
-        """Distance of gradient slots: the moments, in whole quarters of a vector."""
-        return -(-self.moments // 4) * 4
+    def slot_columns(self) -> int:
+        """Numbers per gradient slot (heatsplat.kernels.constants has their order)."""
+        return OPACITY_GRADIENTS + self.modalities + self.channels - self.depth + 2 * self.absgrad
 
-
-GEOMETRY = 6  # mean x, mean y, three numbers of the whitening, log2 of the largest opacity
+    @property
+    def slot_size(self) -> int:
+        """Distance of gradient slots, at least the columns of ``sums``."""
+        return max(8, -(-self.slot_columns // 4) * 4)
 
 
 class LayoutType(types.Type):
@@ -74,28 +77,25 @@ def _unbox_layout(numba_type, value, c):
     return NativeValue(c.context.get_dummy_value())
 
 
-def _constant(read):
+def _constant(name: str):
     """An intrinsic that gives a property of a layout as a literal."""
 
     @intrinsic
     def function(typing_context, layout):
         if not isinstance(layout, LayoutType):
             return None
-        number = int(read(layout.layout))
-
-        def generate(context, builder, signature, values):
-            return ir.Constant(_i64, number)
-
-        return types.literal(number)(layout), generate
+        number = int(getattr(layout.layout, name))
+        return types.literal(number)(layout), lambda context, builder, signature, values: ir.Constant(_i64, number)
 
     return function
 
 
-channels = _constant(lambda layout: layout.channels)
-modalities = _constant(lambda layout: layout.modalities)
-moment_count = _constant(lambda layout: layout.moments)
-has_depth = _constant(lambda layout: layout.depth)
-has_absgrad = _constant(lambda layout: layout.absgrad)
+channels = _constant("channels")
+modalities = _constant("modalities")
+feature_column = _constant("feature_column")
+slot_columns = _constant("slot_columns")
+has_depth = _constant("depth")
+has_absgrad = _constant("absgrad")
 
 
 @intrinsic
@@ -105,8 +105,8 @@ def modality_of(typing_context, layout, channel):
         return None
 
     def generate(context, builder, signature, values):
-        result = ir.Constant(_i64, 0)
         channel = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
+        result = ir.Constant(_i64, 0)
         for position, modality in enumerate(layout.layout.modality_of):
             if modality:
                 same = builder.icmp_signed("==", channel, ir.Constant(_i64, position))

@@ -1,29 +1,49 @@
 """From Gaussians in the world to ellipses on the screen, sixteen at a time, and the gradients back.
 
-Plain twin: heatsplat.renderers.reference.
+Plain twin: heatsplat.geometry.projection, under autograd.
 
-Notation. W is the rotation of the camera, J the 2x3 Jacobian of the projection, R the rotation of a Gaussian, s its
-semi-axes. The rows of J W R diag(s) are U and V, so that the screen covariance with its blur is
+**Convention:** R is the rotation of a Gaussian, s its semi-axes, W the rotation of the camera and J the 2x3 Jacobian
+of the projection, whose x/z and y/z are clamped to the field of view and a margin. The rows of J W R diag(s) are U
+and V, so that the screen covariance with its blur is
 
-    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + BLUR I
-    det = |U x V|^2 + BLUR (U.U + V.V) + BLUR^2                (Cauchy-Binet: a sum of squares, never negative)
+    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + BLUR I,
+    det = |U x V|^2 + BLUR (U.U + V.V) + BLUR^2        (Cauchy-Binet: a sum of squares, which never cancels).
 
-Offsets d from the mean are whitened by the Cholesky factor of the inverse instead of multiplied by the inverse itself,
+Offsets (dx, dy) from the mean are whitened by the Cholesky factor of the inverse covariance instead of multiplied by
+the inverse itself,
 
-    u1 = sqrt(c / det) dx - b / sqrt(c det) dy,    u2 = dy / sqrt(c),    density = exp(-(u1^2 + u2^2) / 2),
+    u1 = first dx + mixed dy,  u2 = second dy,  density = exp(-(u1^2 + u2^2) / 2),
+    first = sqrt(c / det),  mixed = -b / sqrt(c det),  second = 1 / sqrt(c),
 
-whose exponent cannot become positive by rounding (measured on needles of axis ratio 5e4: gradient error 2e-3, against
-3e-2 of the inverse form). Records store it scaled by sqrt(log2(e) / 2), which makes the density exp2(-(u1^2 + u2^2)).
+so that rounding cannot make the exponent positive (measured on needles of axis ratio 5e4: relative error of the
+gradients 2e-3, against 3e-2 with the inverse). The gradients back are products with the same factors, never with an
+inverse.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel, part
+from heatsplat.kernels.constants import (
+    ALPHA_MIN,
+    BLOCK,
+    BLUR,
+    BOTTOM,
+    CHUNK,
+    DEPTH,
+    INVERSE_WHITENING,
+    LEFT,
+    LOG2_ALPHA_MIN,
+    RANK,
+    RIGHT,
+    SUMS,
+    TILE_BLOCKS,
+    TOP,
+    TWO_LN_2,
+    WHITENING,
+)
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -31,58 +51,30 @@ from heatsplat.kernels.simd import (
     ceil,
     first_lanes,
     floor,
-    load,
     load_columns,
     log2,
     lowest_bit,
     mask_of,
     maximum,
     minimum,
-    prefetch,
     select,
     splat,
     sqrt,
-    store,
     store_columns,
-    store_first,
+    store_vector,
     to_int,
     total,
 )
 
-BLUR = np.float32(0.3)
-ALPHA_MIN = np.float32(1.0 / 255.0)
-CHUNK = 1024  # Gaussians per parallel task: small enough to balance, large enough that its instances stay in the cache
-TILE = 16
-
-# A row of ``screen``, one cache line per Gaussian: the first six numbers describe its ellipse, see above.
-MEAN_X, MEAN_Y, FIRST, MIXED, SECOND, LOG_OPACITY = range(6)
-GEOMETRY = 6
-DEPTH, LEFT, RIGHT, TOP, BOTTOM, SLOPE_X, SLOPE_Y, RANK = range(6, 14)
-SCREEN = 16
-
-# A gradient slot: five moments of the density's gradient, the depth's gradient, the gradients of the logarithms of the
-# opacities, those of the features, two absolute ones where they are wanted.
-DEPTH_MOMENT = 5
-OPACITY_MOMENTS = 6
-# Its sum keeps the first six; the seventh is the gradient of the logarithm of all opacities at once.
-LOG_OPACITY_SUM = 6
-SUMS = 8
-AHEAD = 16
-
-WHITENING = np.float32(math.sqrt(math.log2(math.e) / 2.0))
-LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
-TWO_LN_2 = np.float32(2.0 * math.log(2.0))
-
-_ZERO, _ONE, _TWO, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
-
-
-# A camera is a float32 vector, so that kernels take one argument for it: rotation 0-8 row by row, translation 9-11,
-# fx fy cx cy 12-15, limits of x/z and y/z 16-19 (lowest x, highest x, lowest y, highest y), near, far 20-21.
+# A camera is one float32 vector: rotation row by row in 0-8, translation in 9-11, then
+FX, FY, CX, CY = range(12, 16)
+LOWEST_X, HIGHEST_X, LOWEST_Y, HIGHEST_Y = range(16, 20)  # limits of x/z and y/z in the Jacobian
+NEAR, FAR = 20, 21
+CAMERA = 22
 
 
 @inline
 def _to_camera(camera, x, y, z):
-    """Points in camera axes."""
     return (
         camera[0] * x + camera[1] * y + camera[2] * z + camera[9],
         camera[3] * x + camera[4] * y + camera[5] * z + camera[10],
@@ -92,56 +84,49 @@ def _to_camera(camera, x, y, z):
 
 @inline
 def _unit_quaternion(w, x, y, z):
-    """Quaternions of length one, and the length they had; scaled by the largest part, so that squares cannot underflow."""
+    """Quaternions of length one, and their lengths; scaled by the largest part first: squares do not underflow."""
     largest = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
-    scale = _ONE / largest
+    scale = 1.0 / largest
     w, x, y, z = w * scale, x * scale, y * scale, z * scale
     length = sqrt(w * w + x * x + y * y + z * z)
-    scale = _ONE / length
-    return w * scale, x * scale, y * scale, z * scale, largest * length
+    scale = 1.0 / length
+    return (w * scale, x * scale, y * scale, z * scale), largest * length
 
 
 @inline
-def _rotation(w, x, y, z):
+def _rotation(q):
     """Rotation matrices of unit quaternions, row by row."""
+    w, x, y, z = q
     return (
-        _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
-        _TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x),
-        _TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y),
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
     )  # fmt: skip
 
 
 @inline
-def _jacobian(camera, inverse_z, x, y):
-    """The two rows of J W; x/z and y/z are clamped to the field of view and its margin. Also returns the clamped two."""
-    x_over_z = maximum(minimum(x * inverse_z, camera[17]), camera[16])
-    y_over_z = maximum(minimum(y * inverse_z, camera[19]), camera[18])
-    jx, jy = camera[12] * inverse_z, camera[13] * inverse_z
-    return (
-        jx * (camera[0] - x_over_z * camera[6]),
-        jx * (camera[1] - x_over_z * camera[7]),
-        jx * (camera[2] - x_over_z * camera[8]),
-        jy * (camera[3] - y_over_z * camera[6]),
-        jy * (camera[4] - y_over_z * camera[7]),
-        jy * (camera[5] - y_over_z * camera[8]),
-        x_over_z,
-        y_over_z,
-    )
+def _rotation_backward(q, length, r):
+    """Gradient of quaternions of some length from that of their rotation matrices ``r``, nine vectors row by row."""
+    w, x, y, z = q
+    gw = 2.0 * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1]))
+    gx = 2.0 * (w * (r[7] - r[5]) + y * (r[1] + r[3]) + z * (r[2] + r[6]) - 2.0 * x * (r[4] + r[8]))
+    gy = 2.0 * (w * (r[2] - r[6]) + x * (r[1] + r[3]) + z * (r[5] + r[7]) - 2.0 * y * (r[0] + r[8]))
+    gz = 2.0 * (w * (r[3] - r[1]) + x * (r[2] + r[6]) + y * (r[5] + r[7]) - 2.0 * z * (r[0] + r[4]))
+    along = w * gw + x * gx + y * gy + z * gz
+    scale = 1.0 / length
+    return (gw - along * w) * scale, (gx - along * x) * scale, (gy - along * y) * scale, (gz - along * z) * scale
 
 
 @inline
-def _times_rotation(x, y, z, r):
-    """A row vector times a rotation."""
+def _jacobian(camera, x_over_z, y_over_z, inverse_z):
+    """The two rows of J W."""
+    jx, jy = camera[FX] * inverse_z, camera[FY] * inverse_z
     return (
-        x * r[0] + y * r[3] + z * r[6],
-        x * r[1] + y * r[4] + z * r[7],
-        x * r[2] + y * r[5] + z * r[8],
-    )
-
-
-@inline
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        (jx * (camera[0] - x_over_z * camera[6]), jx * (camera[1] - x_over_z * camera[7]),
+         jx * (camera[2] - x_over_z * camera[8])),
+        (jy * (camera[3] - y_over_z * camera[6]), jy * (camera[4] - y_over_z * camera[7]),
+         jy * (camera[5] - y_over_z * camera[8])),
+    )  # fmt: skip
 
 
 @inline
@@ -150,8 +135,34 @@ def _dot(a, b):
 
 
 @inline
-def _screen_covariance(u, v):
-    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, its determinant before the blur."""
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inline
+def _times(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@inline
+def _sum(a, x, b, y, c):
+    """x a + y b + c for vectors of three and numbers x, y."""
+    return x * a[0] + y * b[0] + c[0], x * a[1] + y * b[1] + c[1], x * a[2] + y * b[2] + c[2]
+
+
+@inline
+def _times_rotation(a, r):
+    """A row of three times a rotation."""
+    return (
+        a[0] * r[0] + a[1] * r[3] + a[2] * r[6],
+        a[0] * r[1] + a[1] * r[4] + a[2] * r[7],
+        a[0] * r[2] + a[1] * r[5] + a[2] * r[8],
+    )
+
+
+@inline
+def _covariance(u, v):
+    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the blur."""
     normal = _cross(u, v)
     uu, vv = _dot(u, u), _dot(v, v)
     sharp = _dot(normal, normal)
@@ -159,46 +170,59 @@ def _screen_covariance(u, v):
 
 
 @inline
-def _whitening(a, b, c, determinant):
-    """The whitening (u1 = first dx + mixed dy, u2 = second dy), in units of standard deviations."""
-    inverse_root_c = _ONE / sqrt(c)
-    inverse_root_det = _ONE / sqrt(determinant)
-    return c * inverse_root_c * inverse_root_det, -(b * inverse_root_c) * inverse_root_det, inverse_root_c
+def _whitening(b, c, determinant):
+    """first, mixed and second; products of roots, since c times the determinant may leave the range of floats."""
+    second = 1.0 / sqrt(c)
+    root = 1.0 / sqrt(determinant)
+    return c * second * root, -(b * second) * root, second
 
 
 @inline
-def _tile_range(center, reach, tiles):
-    """First tile and the tile after the last one that hold a pixel centre within ``reach`` of ``center``, as floats."""
-    reach = reach * np.float32(1.0001) + np.float32(0.01)  # more than the rounding of the bounds
-    low = floor((center - reach - _HALF) * np.float32(1.0 / TILE))
-    high = floor((center + reach - _HALF) * np.float32(1.0 / TILE)) + _ONE
-    tiles = np.float32(tiles)
-    return minimum(maximum(low, _ZERO), tiles), minimum(maximum(high, _ZERO), tiles)
+def _block_range(center, reach, blocks):
+    """First block, and block after the last, with a pixel centre within ``reach`` of ``center``; floats in range."""
+    reach = reach * 1.0001 + 0.01  # more than the rounding of the bounds
+    low = floor((center - reach - 0.5) * (1.0 / BLOCK))
+    high = floor((center + reach - 0.5) * (1.0 / BLOCK)) + 1.0
+    return minimum(maximum(low, 0.0), blocks), minimum(maximum(high, 0.0), blocks)
+
+
+@inline
+def box(gaussian, screen):
+    """The blocks of a visible Gaussian's bounding box: left, right, top, bottom; right and bottom are exclusive."""
+    left, right = np.int64(screen[gaussian, LEFT]), np.int64(screen[gaussian, RIGHT])
+    return left, right, np.int64(screen[gaussian, TOP]), np.int64(screen[gaussian, BOTTOM])
+
+
+@inline
+def box_tiles(gaussian, screen):
+    """How many tiles the bounding box of a visible Gaussian overlaps."""
+    left, right, top, bottom = box(gaussian, screen)
+    wide = (right + TILE_BLOCKS - 1) // TILE_BLOCKS - left // TILE_BLOCKS
+    return wide * ((bottom + TILE_BLOCKS - 1) // TILE_BLOCKS - top // TILE_BLOCKS)
 
 
 @part
 def _project_block(
     first, means, quats, scales, opacities, camera, width, height, antialiased,
-    screen, depths, means2d, radii, seen_lanes, ids, position, scratch, chunk,
+    screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
 ):  # fmt: skip
-    """Projects Gaussians ``first`` to ``first + 15``; returns how many tiles the visible ones may touch and where to go on
-    in ``ids``."""
+    """Projects Gaussians ``first`` to ``first + 15``; writes visible ids from ``place`` on, returns the place after."""
     rows = means.shape[0] - first
     x, y, z = load_columns(means, first, 3, rows)
     x, y, z = _to_camera(camera, x, y, z)
-    inverse_z = _ONE / z
+    inverse_z = 1.0 / z
+    x_over_z = maximum(minimum(x * inverse_z, camera[HIGHEST_X]), camera[LOWEST_X])
+    y_over_z = maximum(minimum(y * inverse_z, camera[HIGHEST_Y]), camera[LOWEST_Y])
     qw, qx, qy, qz = load_columns(quats, first, 4, rows)
-    qw, qx, qy, qz, length = _unit_quaternion(qw, qx, qy, qz)
-    rotation = _rotation(qw, qx, qy, qz)
-    sx, sy, sz = load_columns(scales, first, 3, rows)
+    q, length = _unit_quaternion(qw, qx, qy, qz)
+    rotation = _rotation(q)
+    axes = load_columns(scales, first, 3, rows)
 
-    jx0, jx1, jx2, jy0, jy1, jy2, _, _ = _jacobian(camera, inverse_z, x, y)
-    ux, uy, uz = _times_rotation(jx0, jx1, jx2, rotation)
-    vx, vy, vz = _times_rotation(jy0, jy1, jy2, rotation)
-    a, b, c, determinant, sharp = _screen_covariance((ux * sx, uy * sy, uz * sz), (vx * sx, vy * sy, vz * sz))
-    whitening_1, whitening_12, whitening_2 = _whitening(a, b, c, determinant)
+    row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
+    u, v = _times(_times_rotation(row_x, rotation), axes), _times(_times_rotation(row_y, rotation), axes)
+    a, b, c, determinant, sharp = _covariance(u, v)
 
-    opacity = splat(_ZERO)
+    opacity = splat(0.0)
     for modality in range(opacities.shape[0]):
         (candidate,) = load_columns(opacities[modality], first, 1, rows)
         opacity = maximum(candidate, opacity)
@@ -206,53 +230,53 @@ def _project_block(
         opacity = opacity * sqrt(sharp / determinant)
     log_opacity = log2(maximum(opacity, ALPHA_MIN))
 
-    mean_x = camera[12] * x * inverse_z + camera[14]
-    mean_y = camera[13] * y * inverse_z + camera[15]
-    extent = sqrt(maximum(TWO_LN_2 * (log_opacity - LOG2_ALPHA_MIN), _ZERO))
+    # alpha falls to ALPHA_MIN at this many standard deviations.
+    extent = sqrt(maximum(TWO_LN_2 * (log_opacity - LOG2_ALPHA_MIN), 0.0))
     reach_x, reach_y = extent * sqrt(a), extent * sqrt(c)
-    radius_x, radius_y = maximum(ceil(reach_x), _ONE), maximum(ceil(reach_y), _ONE)
+    radius_x, radius_y = maximum(ceil(reach_x), 1.0), maximum(ceil(reach_y), 1.0)
+    mean_x = camera[FX] * x * inverse_z + camera[CX]
+    mean_y = camera[FY] * y * inverse_z + camera[CY]
 
-    seen = first_lanes(rows) & (z > _ZERO) & (z >= camera[20]) & (z <= camera[21]) & (length > _ZERO)
-    seen = seen & (determinant > _ZERO) & (opacity >= ALPHA_MIN)
-    seen = seen & (mean_x + radius_x > _ZERO) & (mean_x - radius_x < np.float32(width))
-    seen = seen & (mean_y + radius_y > _ZERO) & (mean_y - radius_y < np.float32(height))
+    # Every test is true for what is kept, so that a Gaussian with a NaN anywhere is not seen.
+    visible = first_lanes(rows) & (z > 0.0) & (z >= camera[NEAR]) & (z <= camera[FAR]) & (length > 0.0)
+    visible = visible & (determinant > 0.0) & (opacity >= ALPHA_MIN)
+    visible = visible & (mean_x + radius_x > 0.0) & (mean_x - radius_x < width)
+    visible = visible & (mean_y + radius_y > 0.0) & (mean_y - radius_y < height)
 
-    store_columns(means2d, first, (select(seen, mean_x, _ZERO), select(seen, mean_y, _ZERO)), rows)
-    largest_radius = np.float32(2.0**30)
-    radius_x = to_int(select(seen, minimum(radius_x, largest_radius), _ZERO))
-    radius_y = to_int(select(seen, minimum(radius_y, largest_radius), _ZERO))
+    largest = 2.0**30  # fits an int32
+    store_columns(means2d, first, (select(visible, mean_x, 0.0), select(visible, mean_y, 0.0)), rows)
+    radius_x, radius_y = minimum(radius_x, largest), minimum(radius_y, largest)
+    radius_x, radius_y = to_int(select(visible, radius_x, 0.0)), to_int(select(visible, radius_y, 0.0))
     store_columns(radii, first, (radius_x, radius_y), rows)
 
-    lanes = bits(seen)
-    seen_lanes[first // LANES] = lanes
-    if lanes == 0:
-        return 0, position
-    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    left, right = _tile_range(mean_x, reach_x, tiles_x)
-    top, bottom = _tile_range(mean_y, reach_y, tiles_y)
-    first_u, mixed, second = whitening_1 * WHITENING, whitening_12 * WHITENING, whitening_2 * WHITENING
-    fields = (
-        mean_x, mean_y, first_u, mixed, second, log_opacity, z,
-        select(seen, left, _ZERO), select(seen, right, _ZERO), select(seen, top, _ZERO), select(seen, bottom, _ZERO),
-        -mixed / first_u, -first_u * mixed / (mixed * mixed + second * second),
-    )  # fmt: skip
-    for field in range(RANK):
-        store(scratch, (chunk * SCREEN + field) * LANES, fields[field])
-    tiles = 0
+    lanes = bits(visible)
+    seen[first // LANES] = lanes
+    if lanes != 0:
+        one, mixed, two = _whitening(b, c, determinant)
+        one, mixed, two = one * WHITENING, mixed * WHITENING, two * WHITENING
+        left, right = _block_range(mean_x, reach_x, (width + BLOCK - 1) // BLOCK)
+        top, bottom = _block_range(mean_y, reach_y, (height + BLOCK - 1) // BLOCK)
+        limit = (log_opacity - LOG2_ALPHA_MIN) * 1.001 + 1e-4  # more than the rounding of the exponent
+        peak = -mixed * sqrt(limit) / (two * sqrt(mixed * mixed + two * two))
+        columns = (
+            mean_x, mean_y, one, mixed, two, log_opacity, z,
+            select(visible, left, 0.0), select(visible, right, 0.0),
+            select(visible, top, 0.0), select(visible, bottom, 0.0),
+            limit, peak, -mixed / one, 1.0 / one,
+        )  # fmt: skip
+        for column in range(RANK):
+            store_vector(scratch, chunk * RANK + column, columns[column])
     while lanes != 0:
         lane = lowest_bit(lanes)
         lanes &= lanes - 1
         gaussian = first + lane
-        for field in range(RANK):
-            screen[gaussian, field] = scratch[chunk, field, lane]
-        screen[gaussian, RANK] = position - chunk * CHUNK
+        for column in range(RANK):
+            screen[gaussian, column] = scratch[chunk, column, lane]
+        screen[gaussian, RANK] = place - chunk * CHUNK
         depths[gaussian] = screen[gaussian, DEPTH]
-        tiles += np.int64(screen[gaussian, RIGHT] - screen[gaussian, LEFT]) * np.int64(
-            screen[gaussian, BOTTOM] - screen[gaussian, TOP]
-        )
-        ids[position] = gaussian
-        position += 1
-    return tiles, position
+        ids[place] = gaussian
+        place += 1
+    return place
 
 
 @kernel
@@ -264,127 +288,115 @@ def project(
 
     Args:
         means, quats, scales, opacities: [N, 3], [N, 4], [N, 3], [M, N].
-        camera: float32 vector, see above.
-        screen: out [N, SCREEN], rows of visible Gaussians only: the ellipse, camera z, the tiles of the bounding box (left,
-            right, top, bottom, the second and fourth exclusive), where u1^2 + u2^2 is smallest along a line (dx per dy,
-            dy per dx), and the place among the visible ones of its chunk.
+        camera: [CAMERA], see above.
+        screen: out [N, SCREEN], rows of visible Gaussians only.
         depths: out [N], camera z of the visible ones once more, side by side.
         means2d, radii: out [N, 2]; zero where a Gaussian is not seen.
-        seen: out [blocks of LANES Gaussians], bits of the visible ones.
+        seen: out [blocks of LANES Gaussians] int32, bits of the visible ones.
         ids: out [N] int64, begins with the visible ones, ascending.
-        first_ranks: out [chunks], how many visible ones there are before a chunk.
-        bounds: scratch [chunks].
-        scratch: scratch [chunks, SCREEN, LANES].
+        first_ranks: out [chunks] int64, how many visible ones there are before a chunk.
+        bounds, scratch: scratch [chunks] int64 and [chunks, RANK, LANES].
     """
-    count = means.shape[0]
     chunks = first_ranks.shape[0]
     for chunk in prange(chunks):
         begin = chunk * CHUNK
-        position = begin
-        tiles = 0
-        for block in range(begin, min(begin + CHUNK, count), LANES):
-            touched, position = _project_block(
+        place = begin
+        for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
+            place = _project_block(
                 block, means, quats, scales, opacities, camera, width, height, antialiased,
-                screen, depths, means2d, radii, seen, ids, position, scratch, chunk,
+                screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
             )  # fmt: skip
-            tiles += touched
-        first_ranks[chunk] = position - begin
-        bounds[chunk] = tiles
-    visible = np.int64(0)
-    bound = np.int64(0)
+        first_ranks[chunk] = place - begin
+        bounds[chunk] = 0
+        for k in range(begin, place):
+            bounds[chunk] += box_tiles(ids[k], screen)
+    visible, tiles = np.int64(0), np.int64(0)
     for chunk in range(chunks):
         here = first_ranks[chunk]
         first_ranks[chunk] = visible
         for k in range(here):
             ids[visible + k] = ids[chunk * CHUNK + k]
         visible += here
-        bound += bounds[chunk]
-    return visible, bound
-
-
-@inline
-def feature_row(gaussian, screen, rows_are_ranks, first_ranks):
-    """The row of a Gaussian in features that are given for all Gaussians, or for the visible ones only."""
-    return first_ranks[gaussian // CHUNK] + np.int64(screen[gaussian, RANK]) if rows_are_ranks else gaussian
-
-
-@inline
-def _quaternion_gradient(q, length, r):
-    """Gradient of unnormalised quaternions from that of their rotation matrices ``r`` (nine vectors, row by row)."""
-    w, x, y, z = q
-    gw = _TWO * (x * (r[7] - r[5]) + y * (r[2] - r[6]) + z * (r[3] - r[1]))
-    gx = _TWO * (w * (r[7] - r[5]) + y * (r[1] + r[3]) + z * (r[2] + r[6]) - _TWO * x * (r[4] + r[8]))
-    gy = _TWO * (w * (r[2] - r[6]) + x * (r[1] + r[3]) + z * (r[5] + r[7]) - _TWO * y * (r[0] + r[8]))
-    gz = _TWO * (w * (r[3] - r[1]) + x * (r[2] + r[6]) + y * (r[5] + r[7]) - _TWO * z * (r[0] + r[4]))
-    along = w * gw + x * gx + y * gy + z * gz
-    scale = _ONE / length
-    return (gw - along * w) * scale, (gx - along * x) * scale, (gy - along * y) * scale, (gz - along * z) * scale
+        tiles += bounds[chunk]
+    return visible, tiles
 
 
 @part
 def _project_block_backward(
-    first, seen, sums, means, quats, scales, camera, antialiased,
+    first, visible, sums, means, quats, scales, camera, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
-    """Gradients of Gaussians ``first`` to ``first + 15`` from the moments of their densities, see ``project_backward``."""
+    """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
     rows = means.shape[0] - first
-    world_x, world_y, world_z = load_columns(means, first, 3, rows)
-    x, y, z = _to_camera(camera, world_x, world_y, world_z)
-    inverse_z = _ONE / z
+    world = load_columns(means, first, 3, rows)
+    x, y, z = _to_camera(camera, world[0], world[1], world[2])
+    inverse_z = 1.0 / z
+    x_over_z = maximum(minimum(x * inverse_z, camera[HIGHEST_X]), camera[LOWEST_X])
+    y_over_z = maximum(minimum(y * inverse_z, camera[HIGHEST_Y]), camera[LOWEST_Y])
     qw, qx, qy, qz = load_columns(quats, first, 4, rows)
-    qw, qx, qy, qz, length = _unit_quaternion(qw, qx, qy, qz)
-    rotation = _rotation(qw, qx, qy, qz)
-    sx, sy, sz = load_columns(scales, first, 3, rows)
-    jx0, jx1, jx2, jy0, jy1, jy2, x_over_z, y_over_z = _jacobian(camera, inverse_z, x, y)
-    ux, uy, uz = _times_rotation(jx0, jx1, jx2, rotation)
-    vx, vy, vz = _times_rotation(jy0, jy1, jy2, rotation)
-    u, v = (ux * sx, uy * sy, uz * sz), (vx * sx, vy * sy, vz * sz)
-    a, b, c, determinant, sharp = _screen_covariance(u, v)
-    l1, l12, l2 = _whitening(a, b, c, determinant)
+    q, length = _unit_quaternion(qw, qx, qy, qz)
+    rotation = _rotation(q)
+    axes = load_columns(scales, first, 3, rows)
+    row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
+    rotated_x, rotated_y = _times_rotation(row_x, rotation), _times_rotation(row_y, rotation)
+    u, v = _times(rotated_x, axes), _times(rotated_y, axes)
+    a, b, c, determinant, sharp = _covariance(u, v)
+    one, mixed, two = _whitening(b, c, determinant)
 
-    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _ = load_columns(sums, first, SUMS, rows)
-    m1, m2 = m1 / WHITENING, m2 / WHITENING
+    # From moments of g: with the whitening as a matrix L, the mean's gradient is L (sum of g u), and that of the
+    # covariance is L (sum of g u u^T) L^T / 2, of which twice the products with U and V follow.
+    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
+    m1, m2 = m1 * INVERSE_WHITENING, m2 * INVERSE_WHITENING
     m11, m12, m22 = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
-
-    v_mean_x, v_mean_y = l1 * m1, l12 * m1 + l2 * m2
-    mixed = l12 * m11 + l2 * m12
-    p11, p12, p22 = l1 * l1 * m11, l1 * mixed, l12 * mixed + l2 * (l12 * m12 + l2 * m22)
-    shrink, spread = splat(_ZERO), splat(_ZERO)
+    v_mean_x, v_mean_y = one * m1, mixed * m1 + two * m2
+    left = mixed * m11 + two * m12
+    v_a, v_b, v_c = one * one * m11, one * left, mixed * left + two * (mixed * m12 + two * m22)
+    through_u, through_v = (splat(0.0), splat(0.0), splat(0.0)), (splat(0.0), splat(0.0), splat(0.0))
     if antialiased:
-        shrink = BLUR * v_log_opacity / determinant
-        spread = v_log_opacity / sharp - v_log_opacity / determinant
-    normal = _cross(u, v)
-    v_normal = (spread * normal[0], spread * normal[1], spread * normal[2])
-    by_u, by_v = _cross(v, v_normal), _cross(v_normal, u)
-    p11, p22 = p11 - shrink, p22 - shrink
-    v_u = (p11 * u[0] + p12 * v[0] + by_u[0], p11 * u[1] + p12 * v[1] + by_u[1], p11 * u[2] + p12 * v[2] + by_u[2])
-    v_v = (p12 * u[0] + p22 * v[0] + by_v[0], p12 * u[1] + p22 * v[1] + by_v[1], p12 * u[2] + p22 * v[2] + by_v[2])
+        # The opacity was multiplied by sqrt(|U x V|^2 / det); |U x V|^2 is far from 0, or nothing would have been seen.
+        normal = _cross(u, v)
+        spread, shrink = v_log_opacity / sharp - v_log_opacity / determinant, v_log_opacity * BLUR / determinant
+        v_normal = (spread * normal[0], spread * normal[1], spread * normal[2])
+        through_u, through_v = _cross(v, v_normal), _cross(v_normal, u)
+        v_a, v_c = v_a - shrink, v_c - shrink
+    v_u, v_v = _sum(u, v_a, v, v_b, through_u), _sum(u, v_b, v, v_c, through_v)
 
-    v_sx, v_sy, v_sz = v_u[0] * ux + v_v[0] * vx, v_u[1] * uy + v_v[1] * vy, v_u[2] * uz + v_v[2] * vz
-    bu = (v_u[0] * sx, v_u[1] * sy, v_u[2] * sz)
-    bv = (v_v[0] * sx, v_v[1] * sy, v_v[2] * sz)
+    v_sx, v_sy, v_sz = _sum(_times(v_u, rotated_x), 1.0, _times(v_v, rotated_y), 1.0, (0.0, 0.0, 0.0))
+    v_rotated_x, v_rotated_y = _times(v_u, axes), _times(v_v, axes)
     v_rotation = (
-        jx0 * bu[0] + jy0 * bv[0], jx0 * bu[1] + jy0 * bv[1], jx0 * bu[2] + jy0 * bv[2],
-        jx1 * bu[0] + jy1 * bv[0], jx1 * bu[1] + jy1 * bv[1], jx1 * bu[2] + jy1 * bv[2],
-        jx2 * bu[0] + jy2 * bv[0], jx2 * bu[1] + jy2 * bv[1], jx2 * bu[2] + jy2 * bv[2],
-    )  # fmt: skip
-    v_qw, v_qx, v_qy, v_qz = _quaternion_gradient((qw, qx, qy, qz), length, v_rotation)
-    v_jx = (_dot(bu, rotation[0:3]), _dot(bu, rotation[3:6]), _dot(bu, rotation[6:9]))
-    v_jy = (_dot(bv, rotation[0:3]), _dot(bv, rotation[3:6]), _dot(bv, rotation[6:9]))
+        row_x[0] * v_rotated_x[0] + row_y[0] * v_rotated_y[0],
+        row_x[0] * v_rotated_x[1] + row_y[0] * v_rotated_y[1],
+        row_x[0] * v_rotated_x[2] + row_y[0] * v_rotated_y[2],
+        row_x[1] * v_rotated_x[0] + row_y[1] * v_rotated_y[0],
+        row_x[1] * v_rotated_x[1] + row_y[1] * v_rotated_y[1],
+        row_x[1] * v_rotated_x[2] + row_y[1] * v_rotated_y[2],
+        row_x[2] * v_rotated_x[0] + row_y[2] * v_rotated_y[0],
+        row_x[2] * v_rotated_x[1] + row_y[2] * v_rotated_y[1],
+        row_x[2] * v_rotated_x[2] + row_y[2] * v_rotated_y[2],
+    )
+    v_qw, v_qx, v_qy, v_qz = _rotation_backward(q, length, v_rotation)
 
-    # The rows of J W are fx/z (W0 - x/z W2) and fy/z (W1 - y/z W2); clamped ratios pass no gradient.
-    jx, jy = camera[12] * inverse_z, camera[13] * inverse_z
-    v_inverse_z = z * (v_jx[0] * jx0 + v_jx[1] * jx1 + v_jx[2] * jx2 + v_jy[0] * jy0 + v_jy[1] * jy1 + v_jy[2] * jy2)
-    v_x_over_z = -jx * (v_jx[0] * camera[6] + v_jx[1] * camera[7] + v_jx[2] * camera[8])
-    v_y_over_z = -jy * (v_jy[0] * camera[6] + v_jy[1] * camera[7] + v_jy[2] * camera[8])
-    inside_x = (x * inverse_z >= camera[16]) & (x * inverse_z <= camera[17])
-    inside_y = (y * inverse_z >= camera[18]) & (y * inverse_z <= camera[19])
-    v_x_over_z = select(inside_x, v_x_over_z, _ZERO) + camera[12] * v_mean_x
-    v_y_over_z = select(inside_y, v_y_over_z, _ZERO) + camera[13] * v_mean_y
-    v_inverse_z = v_inverse_z + x * v_x_over_z + y * v_y_over_z
-    v_x, v_y = v_x_over_z * inverse_z, v_y_over_z * inverse_z
-    v_z = v_depth - v_inverse_z * inverse_z * inverse_z
-    v_x, v_y, v_z = select(seen, v_x, _ZERO), select(seen, v_y, _ZERO), select(seen, v_z, _ZERO)
+    # The rows of J W are fx/z (W_0 - x/z W_2) and fy/z (W_1 - y/z W_2); clamped ratios pass no gradient.
+    jx, jy = camera[FX] * inverse_z, camera[FY] * inverse_z
+    axis = (camera[6], camera[7], camera[8])
+    v_row_x = (
+        _dot(v_rotated_x, rotation[0:3]),
+        _dot(v_rotated_x, rotation[3:6]),
+        _dot(v_rotated_x, rotation[6:9]),
+    )
+    v_row_y = (
+        _dot(v_rotated_y, rotation[0:3]),
+        _dot(v_rotated_y, rotation[3:6]),
+        _dot(v_rotated_y, rotation[6:9]),
+    )
+    free_x = (x * inverse_z >= camera[LOWEST_X]) & (x * inverse_z <= camera[HIGHEST_X])
+    free_y = (y * inverse_z >= camera[LOWEST_Y]) & (y * inverse_z <= camera[HIGHEST_Y])
+    v_x_over_z = camera[FX] * v_mean_x - select(free_x, jx * _dot(v_row_x, axis), 0.0)
+    v_y_over_z = camera[FY] * v_mean_y - select(free_y, jy * _dot(v_row_y, axis), 0.0)
+    v_inverse_z = z * (_dot(v_row_x, row_x) + _dot(v_row_y, row_y)) + x * v_x_over_z + y * v_y_over_z
+    v_x = select(visible, v_x_over_z * inverse_z, 0.0)
+    v_y = select(visible, v_y_over_z * inverse_z, 0.0)
+    v_z = select(visible, v_depth - v_inverse_z * inverse_z * inverse_z, 0.0)
 
     v_world = (
         camera[0] * v_x + camera[3] * v_y + camera[6] * v_z,
@@ -392,88 +404,40 @@ def _project_block_backward(
         camera[2] * v_x + camera[5] * v_y + camera[8] * v_z,
     )
     store_columns(v_means, first, v_world, rows)
-    store_columns(
-        v_scales, first, (select(seen, v_sx, _ZERO), select(seen, v_sy, _ZERO), select(seen, v_sz, _ZERO)), rows
+    v_s = (select(visible, v_sx, 0.0), select(visible, v_sy, 0.0), select(visible, v_sz, 0.0))
+    store_columns(v_scales, first, v_s, rows)
+    v_q = (
+        select(visible, v_qw, 0.0),
+        select(visible, v_qx, 0.0),
+        select(visible, v_qy, 0.0),
+        select(visible, v_qz, 0.0),
     )
-    v_q = (select(seen, v_qw, _ZERO), select(seen, v_qx, _ZERO), select(seen, v_qy, _ZERO), select(seen, v_qz, _ZERO))
     store_columns(v_quats, first, v_q, rows)
-    store_columns(v_means2d, first, (select(seen, v_mean_x, _ZERO), select(seen, v_mean_y, _ZERO)), rows)
+    store_columns(v_means2d, first, (select(visible, v_mean_x, 0.0), select(visible, v_mean_y, 0.0)), rows)
+
     if v_cameras.shape[1] > 0:
-        world = (world_x, world_y, world_z)
         for k in range(3):
-            by_x, by_y = jx * v_jx[k], jy * v_jy[k]
+            by_x, by_y = jx * v_row_x[k], jy * v_row_y[k]
             by_z = -(x_over_z * by_x + y_over_z * by_y)
-            v_cameras[chunk, k] += np.float64(total(select(seen, by_x + v_x * world[k], _ZERO)))
-            v_cameras[chunk, 3 + k] += np.float64(total(select(seen, by_y + v_y * world[k], _ZERO)))
-            v_cameras[chunk, 6 + k] += np.float64(total(select(seen, by_z + v_z * world[k], _ZERO)))
+            v_cameras[chunk, k] += np.float64(total(select(visible, by_x + v_x * world[k], 0.0)))
+            v_cameras[chunk, 3 + k] += np.float64(total(select(visible, by_y + v_y * world[k], 0.0)))
+            v_cameras[chunk, 6 + k] += np.float64(total(select(visible, by_z + v_z * world[k], 0.0)))
         v_cameras[chunk, 9] += np.float64(total(v_x))
         v_cameras[chunk, 10] += np.float64(total(v_y))
         v_cameras[chunk, 11] += np.float64(total(v_z))
 
 
 @kernel
-def add_up_slots(
-    ids, slot_starts, slots, screen, opacities, has_depth, rows_are_ranks, first_ranks,
-    sums, v_opacities, v_features, absgrad,
-):  # fmt: skip
-    """Adds up the moments of each visible Gaussian and finishes the gradients that need no projection.
-
-    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the image:
-    not on threads, not on the run.
-
-    Args:
-        ids: [n] visible Gaussians front to back, the order of the slots.
-        slot_starts: [n + 1], the first slot of each of them.
-        slots: [slots, moments], see ``compositing.composite_backward``; the first of each Gaussian is overwritten.
-        rows_are_ranks, first_ranks: see ``binning.find_instances``.
-        sums: out [N, SUMS], for ``project_backward``; rows of visible Gaussians only, as in all that follow.
-        v_opacities, v_features: out [M, N] and [N or n, C].
-        absgrad: out [N, 2], or [0, 0] where it is not wanted.
-    """
-    modalities, colours = opacities.shape[0], v_features.shape[1]
-    moments = slots.shape[1]
-    for rank in prange(ids.shape[0]):
-        ahead = np.int64(ids[min(rank + AHEAD, ids.shape[0] - 1)])
-        prefetch(sums, ahead * SUMS)
-        prefetch(opacities, ahead)
-        prefetch(v_opacities, ahead)
-        prefetch(v_features, ahead * colours)
-        gaussian = np.int64(ids[rank])
-        begin, end = slot_starts[rank], slot_starts[rank + 1]
-        if begin == end:
-            store_first(sums, gaussian * SUMS, splat(_ZERO), SUMS)
-            continue
-        for field in range(0, moments, LANES):
-            summed = load(slots, begin * moments + field)
-            for slot in range(begin + 1, end):
-                summed = summed + load(slots, slot * moments + field)
-            store_first(slots, begin * moments + field, summed, moments - field)
-        store_first(sums, gaussian * SUMS, load(slots, begin * moments), SUMS)
-        sums[gaussian, LOG_OPACITY_SUM] = _ZERO
-        for modality in range(modalities):
-            v_log_opacity = slots[begin, OPACITY_MOMENTS + modality]
-            opacity = opacities[modality, gaussian]
-            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else _ZERO
-            sums[gaussian, LOG_OPACITY_SUM] += v_log_opacity
-        field = OPACITY_MOMENTS + modalities
-        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
-        for channel in range(colours):
-            v_features[row, channel] = slots[begin, field + channel]
-        for axis in range(absgrad.shape[1]):
-            absgrad[gaussian, axis] = slots[begin, field + colours + axis] * TWO_LN_2
-
-
-@kernel
 def project_backward(
     means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
 ):  # fmt: skip
-    """Gradients of the geometry from the summed moments of each Gaussian.
+    """Gradients of the geometry from the summed gradient slots of each Gaussian.
 
     Args:
-        seen: [blocks], see ``project``.
-        sums: [N, SUMS], see ``add_up_slots``.
-        v_means ... v_means2d: out, all rows are written.
-        v_cameras: out, added to: [chunks, 12], or [chunks, 0] where it is not wanted.
+        seen: see ``project``.
+        sums: [N, SUMS], see ``compositing.sum_slots``.
+        v_means, v_quats, v_scales, v_means2d: out, all rows are written.
+        v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
     for chunk in prange(v_cameras.shape[0]):
         for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):

@@ -223,6 +223,21 @@ def bits(typing_context, mask):
 
 
 @intrinsic
+def bytes_of(typing_context, x):
+    """The low bytes of integers as two int64: lanes 0-7 and lanes 8-15, the first lane lowest."""
+    if x != int32x16:
+        return None
+
+    def generate(context, builder, signature, values):
+        small = builder.trunc(values[0], _vector(LANES, ir.IntType(8)))
+        words = builder.bitcast(small, _vector(2, _i64))
+        halves = [builder.extract_element(words, ir.Constant(_i32, k)) for k in range(2)]
+        return context.make_tuple(builder, signature.return_type, halves)
+
+    return types.UniTuple(types.int64, 2)(x), generate
+
+
+@intrinsic
 def mask_of(typing_context, number):
     """The mask whose lane k is bit k of an integer."""
 
@@ -366,17 +381,16 @@ def store(typing_context, array, offset, value):
     return types.void(array, offset, value), generate
 
 
-@intrinsic
-def store_scalar(typing_context, array, offset, value):
-    """Writes one element of a contiguous float32 array, by its place in flat order."""
+@inline
+def load_vector(array, k):
+    """Vector ``k`` of a contiguous array whose last axis has sixteen elements."""
+    return load(array, k * LANES)
 
-    def generate(context, builder, signature, values):
-        data = context.make_array(array)(context, builder, values[0]).data
-        offset = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
-        builder.store(values[2], builder.gep(data, [offset]))
-        return context.get_dummy_value()
 
-    return types.void(array, offset, value), generate
+@inline
+def store_vector(array, k, value):
+    """Writes vector ``k`` of a contiguous array whose last axis has sixteen elements."""
+    store(array, k * LANES, value)
 
 
 @intrinsic
@@ -407,6 +421,7 @@ def load_scalar(typing_context, array, offset):
 
 
 def _rows_mask(builder, context, rows, rows_type, columns: int):
+    """A mask of the numbers of the first ``rows`` rows of sixteen."""
     limit = context.cast(builder, rows, types.unliteral(rows_type), types.int32)
     limit = builder.mul(limit, ir.Constant(_i32, columns))
     count = LANES * columns

@@ -156,10 +156,11 @@ def _evaluated_blocks(image: Tensor) -> int:
     while node is not None and not hasattr(node, "frame"):
         node = node.next_functions[0][0] if node.next_functions else None
     frame = node.frame
-    steps = np.zeros(len(frame.instances) + 1, np.int64)  # +1 where a tile begins, -1 behind the last that it looked at
-    np.add.at(steps, frame.tile_starts[: frame.tiles], 1)
-    np.add.at(steps, frame.tile_ends[: frame.tiles], -1)
-    masks = np.ascontiguousarray(frame.instances[steps[:-1].cumsum() > 0, -1]).astype(np.int64)
+    begins, ends = frame.tile_starts[:-1], frame.tile_ends
+    steps = np.zeros(frame.tile_starts[-1] + 1, np.int64)  # +1 where a tile begins, -1 behind the last it looked at
+    np.add.at(steps, begins, 1)
+    np.add.at(steps, ends, -1)
+    masks = frame.instances[: frame.tile_starts[-1], 1][steps[:-1].cumsum() > 0]
     return int(np.unpackbits(masks.view(np.uint8)).sum())
 
 
