@@ -13,7 +13,8 @@ from datamodules.base import SceneDataModule
 from datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
 from datamodules.synthetic_scene.presets import PRESETS
 from datamodules.synthetic_scene.scene import Scene
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, View, ViewSet
+from heatsplat.geometry.resampling import resampled
 
 
 class Synthetic(SceneDataModule):
@@ -61,7 +62,7 @@ class Synthetic(SceneDataModule):
         preset = recording.scene.preset
         with own_threads():
             probes, probe_names = probe_points(recording)
-        return self.finish(
+        scene = self.finish(
             self.scene_name,
             [
                 RawFrame(
@@ -91,6 +92,26 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
         )
+        return scene if recording.clean is None else _with_clean(scene, recording)
+
+
+def _with_clean(scene: SceneData, recording: Recording) -> SceneData:
+    """The scene whose views know what a flawless camera would have recorded."""
+
+    def known(views: ViewSet) -> ViewSet:
+        def decode(position: int) -> View:
+            view = views[position]
+            image = torch.from_numpy(recording.clean[view.frame.frame_id])[..., None]
+            unit = scene.thermal_range.to_unit(image).clamp(0.0, 1.0)
+            return replace(view, clean=resampled(unit, view.camera.height, view.camera.width, "area"))
+
+        return ViewSet(views.frames, decode)
+
+    notes = {
+        **scene.notes,
+        "camera": "fixed pattern, vignetting and gain steps; clean_* scores are against its clean record",
+    }
+    return replace(scene, train=known(scene.train), val=known(scene.val), test=known(scene.test), notes=notes)
 
 
 def probe_points(recording: Recording) -> tuple[np.ndarray, list[str]]:

@@ -55,11 +55,12 @@ class Recording:
         lens: intrinsics and distortion of every frame.
         viewmats: [F, 4, 4] float64 world-to-camera, OpenCV axes, metres.
         times_s: [F] float64, whole milliseconds, increasing from the start of the record.
-        celsius: [F, H, W] float32 temperatures with noise.
+        celsius: [F, H, W] float32 temperatures, with noise and the camera's flaws.
         rgb: [F, H, W, 3] uint8 visible images of the same camera.
         thermal_range: whole degrees that enclose all noise-free temperatures with at least half a degree to spare.
         points: [P, 3] float64 points seen in the frames, a few millimetres off their surfaces.
         point_colors: [P, 3] in [0, 1].
+        clean: [F, H, W] float32 temperatures without noise and flaws; None where the camera has no flaws.
     """
 
     scene: Scene
@@ -71,6 +72,7 @@ class Recording:
     thermal_range: ThermalRange
     points: np.ndarray
     point_colors: np.ndarray
+    clean: np.ndarray | None = None
 
     def shows(self, frame: int, surface: str) -> np.ndarray:
         """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
@@ -111,19 +113,27 @@ def film(
     celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
     lows, highs = np.empty(size.frames), np.empty(size.frames)
+    flaws = scene.preset.flaws
 
     def shoot(frame: int) -> None:
         temperature, color = expose(scene, lens, rays, viewmats[frame], float(times[frame]))
         lows[frame], highs[frame] = temperature.min().item(), temperature.max().item()
-        if noise_k:
-            generator = generator_for(seed, frame, "camera noise")
-            temperature = temperature + noise_k * torch.randn(temperature.shape, generator=generator)
+        if noise_k and not flaws:
+            temperature = temperature + _noise(noise_k, temperature, seed, frame)
         celsius[frame] = temperature.numpy()
         rgb[frame] = (color * 255.0).round().to(torch.uint8).numpy()
 
     with own_threads() as threads, ThreadPoolExecutor(threads) as pool:
         list(pool.map(shoot, range(size.frames)))
-        points, colors = sparse_points(scene, lens, viewmats, size.points, seed)
+        count = max(round(size.points / scene.preset.sparseness), 16)
+        points, colors = sparse_points(scene, lens, viewmats, count, seed)
+    thermal_range, clean = ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5)), None
+    if flaws:
+        clean = celsius
+        recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(torch.from_numpy(clean).double()), seed))
+        if noise_k:
+            recorded = recorded + torch.stack([_noise(noise_k, one, seed, i) for i, one in enumerate(recorded)])
+        celsius = recorded.float().numpy()
     return Recording(
         scene=scene,
         lens=lens,
@@ -131,10 +141,15 @@ def film(
         times_s=times,
         celsius=celsius,
         rgb=rgb,
-        thermal_range=ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5)),
+        thermal_range=thermal_range,
         points=points.numpy(),
         point_colors=colors.numpy(),
+        clean=clean,
     )
+
+
+def _noise(noise_k: float, image: Tensor, seed: int, frame: int) -> Tensor:
+    return noise_k * torch.randn(image.shape, generator=generator_for(seed, frame, "camera noise"))
 
 
 @contextmanager
@@ -246,12 +261,18 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         viewmat: [4, 4] world-to-camera.
         time_s: seconds from the start of the record.
     """
-    when = torch.tensor([time_s], dtype=torch.float64)
+    when, haze = torch.tensor([time_s], dtype=torch.float64), scene.preset.haze
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
         color = scene.visible(points, which, directions @ viewmat[:3, :3])
-        return scene.celsius(scene.heat_at(points, which), when)[:, 0], color, scene.transmits[which] > 0
+        celsius = scene.celsius(scene.heat_at(points, which), when)[:, 0]
+        if haze:
+            distance = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
+            ambient = scene.preset.ambient_c
+            share = haze.transmission(distance, time_s / scene.preset.duration_s)
+            celsius = ambient + (celsius - ambient) * share
+        return celsius, color, scene.transmits[which] > 0
 
     celsius, color, clear = look(rays)
     image = celsius.reshape(1, 1, lens.height, lens.width)

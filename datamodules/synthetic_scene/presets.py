@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from datamodules.synthetic_scene.flaws import CameraFlaws, Haze
 from datamodules.synthetic_scene.heat import Material, Waveform, periodic
 from datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
 
@@ -105,6 +106,9 @@ class Preset:
         surfaces: its objects.
         ambient_c: temperature of the surroundings in °C.
         duration_s: length of the record in seconds.
+        haze: what dims the path of the heat, or None for clear air.
+        flaws: what is wrong with the thermal camera, or None for nothing but noise.
+        sparseness: by what factor its sparse model has fewer points than that of other presets.
     """
 
     start_k: Mapping[str, Pattern] = field(default_factory=dict)
@@ -113,6 +117,9 @@ class Preset:
     surfaces: tuple[Surface, ...] = ()
     ambient_c: float = 22.0
     duration_s: float = 1800.0
+    haze: Haze | None = None
+    flaws: CameraFlaws | None = None
+    sparseness: float = 1.0
 
     def __post_init__(self) -> None:
         names = [surface.name for surface in self.surfaces]
@@ -208,4 +215,6 @@ PRESETS: dict[str, Preset] = {
     "cooling": Preset(start_k=_WARM, surfaces=TABLE_TOP),
     "heated": Preset(start_k=_LUKEWARM, lamp=_LAMP, surfaces=TABLE_TOP),
     "glass": Preset(start_k=_WARM | {"pane": Pattern(4.0, 2.0, 0.5)}, held=True, surfaces=(*TABLE_TOP, PANE)),
+    "noisy_sensor": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=CameraFlaws(step=0.02)),
+    "haze": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, haze=Haze(0.25, 0.9, 2.3), sparseness=8.0),
 }

@@ -124,16 +124,21 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A box of full ``size`` about ``center``, turned by ``yaw_deg`` about the vertical (z) axis."""
+    """A box of full ``size`` about ``center``, tilted about its own x axis, then turned about the vertical (z) axis."""
 
     center: Point
     size: Point
     yaw_deg: float = 0.0
+    tilt_deg: float = 0.0
 
     def _turn(self) -> Tensor:
         """Rotation [3, 3] from the box's axes to the world's."""
         c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
-        return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        yaw = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        if not self.tilt_deg:
+            return yaw
+        c, s = math.cos(math.radians(self.tilt_deg)), math.sin(math.radians(self.tilt_deg))
+        return yaw @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]], dtype=torch.float64)
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
         turn = self._turn()

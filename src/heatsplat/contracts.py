@@ -194,12 +194,15 @@ class View:
         thermal: [H, W, C] float32 in [0, 1], C = 1 (3 only for pseudo-colour data, which has no temperature); or None.
         rgb: [H, W, 3] float32 in [0, 1], or None.
         mask: [H, W] bool, True where a pixel counts; None means that all do.
+        clean: [H, W, C] what a camera without flaws and noise would have recorded, where that is known (synthetic
+            scenes); nothing trains on it.
     """
 
     frame: Frame
     thermal: Tensor | None = None
     rgb: Tensor | None = None
     mask: Tensor | None = None
+    clean: Tensor | None = None
 
     @property
     def camera(self) -> Camera:
@@ -210,8 +213,12 @@ class View:
         return self.frame.time_s
 
     def image(self, modality: str) -> Tensor:
-        """The image of a modality ("thermal" or "rgb"), [H, W, C]. Raises SceneError where the view has none."""
-        image = getattr(self, modality)
+        """The image of a modality ("thermal" or "rgb"), [H, W, C]; "clean" is the thermal image where none is known.
+
+        Raises:
+            SceneError: the view has none.
+        """
+        image = self.thermal if modality == "clean" and self.clean is None else getattr(self, modality)
         if image is None:
             raise SceneError(f"view {self.frame.name} has no {modality} image; choose a method or data set that fits")
         return image
@@ -220,7 +227,7 @@ class View:
         """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them)."""
         moved = {
             key: value.to(device, non_blocking=True)
-            for key in ("thermal", "rgb", "mask")
+            for key in ("thermal", "rgb", "mask", "clean")
             if (value := getattr(self, key)) is not None
         }
         return replace(self, **moved)

@@ -58,7 +58,7 @@ def panels(view: View, modality: str, prediction: Tensor, scene: SceneData) -> n
     """Ground truth, render and error of one image of a view, with its scores, uint8 RGB."""
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
-    thermal_range = scene.thermal_range if modality == "thermal" else None
+    thermal_range = scene.thermal_range if modality in ("thermal", "clean") else None
     title = [view.frame.name]
     if view.frame.time_s is not None:
         title.append(f"t = {view.frame.time_s:.4g} s")

@@ -36,7 +36,9 @@ class QualityMetrics(pl.Callback):
     test_per_image.csv, what the scores mean into ``module.results.definitions``.
 
     Images that a model explains besides (its companions) are scored as images, under names such as ``rgb_psnr``;
-    methods without companions have no such scores.
+    methods without companions have no such scores. Where the camera has flaws that a sensor chain explains or the scene
+    knows, the clean image has scores of its own, ``clean_psnr`` and the like: against the flawless record where it is
+    known, and else against the recorded one.
 
     Args:
         lpips_net: "alex" or "vgg"; values of one net say nothing about the other's. None leaves LPIPS out.
@@ -83,15 +85,16 @@ class QualityMetrics(pl.Callback):
         row |= self._scorer(prediction, view.image(module.modality), view.mask)
         companions = outputs.get("companions", {})
         for modality, image in companions.items():
-            scores = self._image_scorer(image, view.image(modality), view.mask)
-            row |= {f"{modality}_{name}": scores[name] for name in IMAGE_SCORES}
+            scorer = self._scorer if modality == "clean" else self._image_scorer
+            scores = scorer(image, view.image(modality), view.mask)
+            row |= {f"{modality}_{name}": scores[name] for name in _scores_of(modality)}
         self._companions = tuple(companions)
         self._rows.append(row)
 
     @property
     def _names(self) -> dict[str, str]:
         """Names of all scores of this pass, and under which each is defined."""
-        of_companions = {f"{modality}_{name}": name for modality in self._companions for name in IMAGE_SCORES}
+        of_companions = {f"{modality}_{name}": name for modality in self._companions for name in _scores_of(modality)}
         return {name: name for name in DEFINITIONS} | of_companions
 
     # Validation ------------------------------------------------------------------------------------------------------
@@ -187,6 +190,11 @@ class QualityMetrics(pl.Callback):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.curve = [dict(row) for row in state["curve"]]
+
+
+def _scores_of(companion: str) -> tuple[str, ...]:
+    """The scores that a further image has: the clean one is an image of temperature like the recorded one."""
+    return (*IMAGE_SCORES, "mae_c") if companion == "clean" else IMAGE_SCORES
 
 
 def write_table(path: Any, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:

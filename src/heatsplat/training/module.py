@@ -216,12 +216,14 @@ class SplatTraining(pl.LightningModule):
 
     @torch.no_grad()
     def predict_all(self, frame: Frame) -> dict[str, Tensor]:
-        """The image that the camera would record and the images of the model's companions, by modality."""
+        """The image that the camera would record and the images of the model's companions, by modality.
+
+        Last comes "clean", what a camera without the flaws of the sensor chain would record.
+        """
         image, *companions = self.render(frame).features.split(self.thermal.modality_channels, dim=-1)
-        images = (self.sensor(image, frame), *companions)
-        return {
-            name: seen.clamp(0, 1) for name, seen in zip((self.modality, *self.thermal.companions), images, strict=True)
-        }
+        images = (self.sensor(image, frame), *companions, image)
+        names = (self.modality, *self.thermal.companions, "clean")
+        return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
 
     @torch.no_grad()
     def attribute_maps(self, frame: Frame) -> dict[str, Tensor]:
@@ -242,6 +244,8 @@ class SplatTraining(pl.LightningModule):
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         start = time.perf_counter()
         images = self.predict_all(view.frame)
+        if view.clean is None and not self.sensor.parts:
+            del images["clean"]  # it is the recorded image, judged against the same target
         if images[self.modality].is_cuda:
             torch.cuda.synchronize()
         seconds = time.perf_counter() - start
