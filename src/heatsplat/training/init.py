@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,7 +11,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError
-from heatsplat.splats import Splats
+from heatsplat.io.ply import read_splats
+from heatsplat.splats import GEOMETRY, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.rng import generator_for
 
@@ -42,19 +44,16 @@ class Initialisation:
     def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
         means = self._means(scene, generator_for(seed, 0, "init"))
-        modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
-        values = torch.cat([image_values_at(scene, means, name, channels) for name, channels in modalities], dim=1)
-        declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
         squared = neighbour_distances(means).square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
         count = len(means)
         logit = torch.logit(torch.tensor(self.opacity))
-        tensors = {
+        geometry = {
             "means": means,
             "log_scales": (0.5 * squared.log() + np.log(self.scale))[:, None].repeat(1, 3),
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             "opacity_logits": logit.repeat(count, len(thermal.opacity_channels)),
         }
-        return Splats(tensors | {name: item.initial for name, item in declared.items()}), declared
+        return with_heat(geometry, scene, thermal, seed)
 
     def _means(self, scene: SceneData, generator: torch.Generator) -> Tensor:
         points = scene.points.float()
@@ -70,6 +69,61 @@ class Initialisation:
         if self.count is not None and len(points) > self.count:
             points = points[torch.randperm(len(points), generator=generator)[: self.count].sort().values]
         return points
+
+
+class Pretrained:
+    """Splats whose geometry and opacity are those of an earlier run or of a file; heat starts as it does elsewhere.
+
+    Args:
+        path: a point cloud .ply in the layout of 3DGS, or a checkpoint .ckpt of heatsplat, in the world of the scene. A
+            restored run reads it again.
+
+    Raises:
+        SceneError: there is no such file, or it holds no splats.
+    """
+
+    def __init__(self, path: str | None) -> None:
+        if path is None:
+            raise SceneError("init.path is not set; give a point cloud .ply or a checkpoint .ckpt of the same scene")
+        self.path = Path(path).expanduser()
+
+    def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
+        if not self.path.is_file():
+            raise SceneError(f"init.path={self.path}: there is no such file (a run that started from one needs it again)")
+        read = _splats_of_file if self.path.suffix == ".ply" else _splats_of_checkpoint
+        geometry, wanted = read(self.path), len(thermal.opacity_channels)
+        if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
+            geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
+        log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
+        return with_heat(geometry, scene, thermal, seed)
+
+
+def with_heat(
+    geometry: dict[str, Tensor], scene: SceneData, thermal: ThermalModel, seed: int
+) -> tuple[Splats, dict[str, PerGaussian]]:
+    """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared."""
+    means = geometry["means"]
+    modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
+    values = torch.cat([image_values_at(scene, means, name, channels) for name, channels in modalities], dim=1)
+    declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+    return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
+
+
+def _splats_of_file(path: Path) -> dict[str, Tensor]:
+    try:
+        found = read_splats(path)
+    except ValueError as error:
+        raise SceneError(f"init.path: {error}") from error
+    return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}
+
+
+def _splats_of_checkpoint(path: Path) -> dict[str, Tensor]:
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+        return {name: weights[f"splats.raw.{name}"] for name in GEOMETRY}
+    except Exception as error:
+        raise SceneError(f"init.path={path} is no checkpoint of heatsplat that can be read: {error!r}") from error
 
 
 def neighbour_distances(points: Tensor) -> Tensor:

@@ -1,0 +1,514 @@
+"""ThermoGS: a network of place, time and weather gives temperatures and materials, held to a balance of heat."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from heatsplat.contracts import KELVIN_AT_0_C, WEATHER_COLUMNS, SceneData, SceneError, Weather
+from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.physics.ellipsoids import (
+    PROJECTED_AREAS,
+    SMALLEST_AXIS_M,
+    SURFACE_AREAS,
+    convecting_area_ratio,
+    floored_axes,
+    projected_area_ratio,
+    radiating_area_ratio,
+)
+from heatsplat.physics.heat_flow import heating_rate, swinbank_sky_k
+from heatsplat.splats import Splats
+from heatsplat.thermal import heat_terms
+from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
+from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
+from heatsplat.thermal.residual_network import ResidualNetwork
+from heatsplat.thermal.weather_drive import columns_at, source_of_sunlight, sunlight_at
+
+log = logging.getLogger(__name__)
+
+TIMES = ("record", "day", "none")
+FEATURES = ("learned", "given", "labels", "none")
+BODIES = ("inferred", "table")
+SKIES = ("none", "swinbank")
+TERMS = ("smooth", "physical", "ode", "pinn")
+BALANCED = ("ode", "pinn")  # the terms that need the balance of heat
+LATENT = "latent_heat"
+# Least and greatest value of each attribute: no surface lies outside, and no head can leave them.
+LIMITS = {
+    "emissivity": (0.0, 1.0),
+    "absorptivity": (0.0, 1.0),
+    "convection": (0.0, 50.0),  # W/(m² K); wind over 15 m/s
+    "capacity": (0.5e6, 6.0e6),  # J/(m³ K); water has 4.2e6
+}
+DAY_S = 86400.0
+GOLDEN = 0.6180339887498949  # multiples of it, without their whole part, fill [0, 1) evenly however many are taken
+TRAVELS = ("bounds_k", "clock", "weather_mean", "weather_scale", "feature_mean", "feature_scale")  # with the network
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the last view with a gradient has evaluated: Gaussians, their share of the input, hidden values, T."""
+
+    ids: Tensor
+    base: Tensor
+    hidden: Tensor
+    units: Tensor
+    time_s: float
+
+
+class EnergyNetwork(ThermalModel):
+    """Temperature T_min + (T_max - T_min) sigmoid(...) of a residual network of time, place, feature and weather.
+
+    For ``first_steps`` every Gaussian emits one value, the same at every time, while geometry and opacity settle; from
+    there on (with ``stages=frozen_geometry``) the network emits and they stand still. Further heads give emissivity,
+    absorptivity, convection coefficient and volumetric heat capacity of every Gaussian at every time. Four penalties
+    (``heat_terms``) tie them together, for an interval that starts at the time of the view and ends 1 to 10 minutes
+    later (earlier, at the end of the weather record) and for at most ``sampled`` of the Gaussians in view. Interval and
+    sample are functions of the step. The head for latent heat is the paper's; as its balance has no such term, no loss
+    reaches it.
+
+    The weather is that of the scene's record at the time in question; a frame's own ``environment`` is not looked at.
+
+    **Convention:** kelvin, seconds and metres in the balance; emission in image units. Attributes in the units of
+    ``land_cover.ATTRIBUTES``.
+
+    Tensors: "first_value" [N]; "feature" [N, F] where features are learned or given; "label" [N] where labels are used.
+
+    Args:
+        width, blocks: of the network, two layers per block.
+        position_frequencies: octaves of the place; 0 leaves it out (places in one scene tell nothing of another).
+        time_frequencies: octaves of the time (paper: 10).
+        time: "record" encodes the share of the record that has passed (paper), "day" the share of 24 hours, "none" leaves
+            time to the weather.
+        features: "learned" per Gaussian, "given" by the scene's points, "labels" (one number per class), or "none".
+        feature_size: F of learned or given features.
+        attributes: "inferred" by the network, or those of the class "table" (Tab. 6).
+        weights: of smooth, physical, ode and pinn; 0 leaves a term out.
+        first_steps: steps of the first stage.
+        ramp_steps: steps after them over which the penalties grow to their weight.
+        interval_s: shortest and longest interval in seconds.
+        sampled: Gaussians in view that penalties are evaluated for, at most.
+        projected_area: "exact" or "printed" (Eq. 8), the area that sunlight falls on.
+        surface_area: "printed" (Eq. 6) or "consistent", the area that air cools.
+        sky: "none" lets bodies radiate into empty space (paper); "swinbank" gives them a clear sky of that temperature.
+        smallest_axis_m: axes of Gaussians count as at least this in the balance.
+        margin: T_min and T_max lie this share of the scene's range outside it, so that the sigmoid reaches the ends.
+        network: checkpoint of another run whose network is taken, held still unless ``fine_tune``.
+        fine_tune: trains that network on.
+        lr, lr_end: learning rate of the network and the factor on it at the end of the run.
+        lr_feature, lr_first: learning rates of learned features and of the first stage's value.
+
+    Raises:
+        ValueError: an option is unknown or out of its range.
+    """
+
+    def __init__(
+        self,
+        width: int = 64,
+        blocks: int = 2,
+        position_frequencies: int = 10,
+        time_frequencies: int = 10,
+        time: str = "record",
+        features: str = "learned",
+        feature_size: int = 8,
+        attributes: str = "inferred",
+        weights: Mapping[str, float] | None = None,
+        first_steps: int = 0,
+        ramp_steps: int = 0,
+        interval_s: tuple[float, float] = (60.0, 600.0),
+        sampled: int = 2048,
+        projected_area: str = "exact",
+        surface_area: str = "printed",
+        sky: str = "none",
+        smallest_axis_m: float = SMALLEST_AXIS_M,
+        margin: float = 0.1,
+        network: str | None = None,
+        fine_tune: bool = False,
+        lr: float = 1e-3,
+        lr_end: float = 0.01,
+        lr_feature: float = 2.5e-3,
+        lr_first: float = 2.5e-3,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (
+            ("time", time, TIMES),
+            ("features", features, FEATURES),
+            ("attributes", attributes, BODIES),
+            ("projected_area", projected_area, PROJECTED_AREAS),
+            ("surface_area", surface_area, SURFACE_AREAS),
+            ("sky", sky, SKIES),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
+            raise ValueError(
+                "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
+                f"ramp_steps at least 0, got {width}, {blocks}, {time_frequencies}, {sampled}, {position_frequencies}, "
+                f"{first_steps} and {ramp_steps}"
+            )
+        shortest, longest = interval_s
+        if not 0 < shortest <= longest or margin < 0:
+            raise ValueError(
+                f"interval_s must be two rising positive numbers and margin not negative, got {interval_s}"
+            )
+        if set(weights or {}) - set(TERMS):
+            raise ValueError(f"weights are those of {', '.join(TERMS)}, got {', '.join(weights)}")
+        sizes = {"learned": feature_size, "given": feature_size, "labels": len(CLASSES), "none": 0}
+        own = 6 * position_frequencies + sizes[features]
+        if own < 1:
+            raise ValueError("without place and features all Gaussians are alike: set position_frequencies or features")
+
+        self.weights = {name: weight for name, weight in (weights or {}).items() if weight > 0}
+        self.inferred = attributes == "inferred"
+        if not self.inferred:
+            self.weights.pop("physical", None)  # nothing is predicted that could be compared
+        self.features_from, self.feature_size = features, sizes[features]
+        self.position_frequencies, self.time_frequencies, self.time = position_frequencies, time_frequencies, time
+        self.first_steps, self.ramp_steps, self.interval_s = first_steps, ramp_steps, (shortest, longest)
+        self.sampled, self.sky, self.smallest_axis_m, self.margin = sampled, sky, smallest_axis_m, margin
+        self.projected_area, self.surface_area = projected_area, surface_area
+        self.path = None if network is None else Path(network).expanduser()
+        self.lr, self.lr_end = 0.0 if network is not None and not fine_tune else lr, lr_end
+        self.lr_feature, self.lr_first = lr_feature, lr_first
+        self.labelled = not self.inferred or features == "labels" or "physical" in self.weights
+        wanted = {"metres": self._balanced, "labels": self.labelled, "point_features": features == "given"}
+        self.needs = frozenset({"time", "thermal_range", "weather"} | {name for name, asked in wanted.items() if asked})
+
+        lowest, highest = torch.tensor(list(LIMITS.values())).T
+        self.register_buffer("lowest", lowest, persistent=False)
+        self.register_buffer("highest", highest, persistent=False)
+        start = torch.logit((typical() - lowest) / (highest - lowest))
+        heads = {"temperature": torch.zeros(1)}
+        if self.inferred:
+            heads |= {"attributes": start, LATENT: torch.zeros(1)}
+        timed = 2 * time_frequencies if time != "none" else 0
+        self.network = ResidualNetwork(own, timed + len(WEATHER_COLUMNS), width, blocks, heads)
+
+        self.register_buffer("emits", torch.tensor(True))  # the network, not the value of the first stage
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("edge", torch.ones(()))
+        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))  # origin and span of time
+        self.register_buffer("range_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # image value 0, and its span
+        self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # T_min, and T_max - T_min
+        self.register_buffer("weather_mean", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
+        self.register_buffer("weather_scale", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
+        self.register_buffer("feature_mean", torch.zeros(self.feature_size))
+        self.register_buffer("feature_scale", torch.ones(self.feature_size))
+        self.weather: Weather | None = None
+        self.metres_per_unit = 1.0
+        self._step = 0
+        self._seen: _Seen | None = None
+        self._points: dict[str, Tensor] = {}
+        self._stored: dict[str, Tensor] | None = None
+
+    # What the contract asks -----------------------------------------------------------------------------
+
+    def check(self, scene: SceneData) -> None:
+        """Raises SceneError, with the way out, where the scene lacks what the balance or the table needs."""
+        without = {
+            "metres": "areas and volumes of Gaussians need metres: give the data set metres_per_unit, or leave the "
+            "balance out with thermal.weights.ode=0 thermal.weights.pinn=0",
+            "labels": "the table of materials needs the land-cover class of every point: give the data set labels, or do "
+            "without with thermal.weights.physical=0, thermal.attributes=inferred and thermal.features=learned",
+            "point_features": "features are to be given by the data set, which has none: thermal.features=learned",
+            "weather": "the network sees the weather and the balance is driven by it: give the data set a weather record",
+        }
+        for name in sorted(self.needs - scene.metadata):
+            if name in without:
+                raise SceneError(f"scene '{scene.name}' lacks '{name}': {without[name]}")
+        super().check(scene)
+        if self.labelled:
+            check_labels(scene.labels, len(scene.points), scene.name)
+            if not self.inferred and bool((scene.labels < 0).any()):
+                raise SceneError(
+                    f"scene '{scene.name}' has points without a class, for which the table has no attributes: label them, "
+                    "or set thermal.attributes=inferred"
+                )
+        if self.features_from == "given" and scene.point_features.shape != (len(scene.points), self.feature_size):
+            raise SceneError(
+                f"scene '{scene.name}' gives features {list(scene.point_features.shape)} for {len(scene.points)} points; "
+                f"set thermal.feature_size={scene.point_features.shape[-1]} and give one row per point"
+            )
+        if self._balanced and scene.weather.air_c is None:
+            raise SceneError(
+                f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
+                "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
+            )
+
+    def prepare(self, scene: SceneData) -> None:
+        self.check(scene)
+        self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
+        times = torch.tensor(scene.train.times_s, dtype=torch.float64)
+        span = times.max() - times.min()
+        self.clock.copy_(torch.stack([times.min(), span if span > 0 else torch.ones_like(span)]))
+        for frame in (*scene.test.frames, *scene.val.frames):
+            scene.weather.at(frame.time_s)  # refuses now what would fail after training
+        columns = torch.stack([columns_at(scene.weather, time) for time in times.tolist()])
+        spread = columns.std(0, unbiased=False)
+        there = ~columns[0].isnan()
+        self.weather_mean.copy_(torch.where(there, columns.mean(0), 0.0))
+        # A column that never changes tells nothing; a missing one counts as absent: both are multiplied by zero.
+        self.weather_scale.copy_(torch.where(there & (spread > 1e-9), 1.0 / spread.clamp(min=1e-9), 0.0))
+        if missing := self._missing_columns:
+            log.warning("the weather of scene '%s' has no %s: the network does without", scene.name, ", ".join(missing))
+        low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
+        self.center.copy_((low + high) / 2)
+        self.edge.copy_((high - low).max().clamp(min=1e-12))
+        lower, width = scene.thermal_range.min_c + KELVIN_AT_0_C, scene.thermal_range.span_k
+        self.range_k.copy_(torch.tensor([lower, width]))
+        self.bounds_k.copy_(torch.tensor([lower - self.margin * width, (1 + 2 * self.margin) * width]))
+        self._points = {"means": scene.points.float()}
+        if self.labelled:
+            self._points["label"] = scene.labels.float()
+        if self.features_from == "given":
+            given = scene.point_features.float()
+            self.feature_mean.copy_(given.mean(0))
+            self.feature_scale.copy_(given.std(0).clamp(min=1e-6))
+            self._points["feature"] = given
+        if self.path is not None:
+            self._stored = self._network_of_another_run()
+
+    @torch.no_grad()
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        value = seeds.values[:, 0]
+        tensors = {"first_value": PerGaussian(value.clone(), self.lr_first)}
+        _, nearest = cKDTree(self._points["means"].numpy()).query(seeds.means.numpy(), workers=1)
+        nearest = torch.from_numpy(nearest)
+        if self.labelled:
+            tensors["label"] = PerGaussian(self._points["label"][nearest], 0.0)
+        if self.features_from == "given":
+            tensors["feature"] = PerGaussian(self._points["feature"][nearest], 0.0)
+        self.network.draw(seeds.generator)
+        if self.features_from == "learned":
+            feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
+            feature[:, 0] = (value - value.mean()) / value.std().clamp(min=1e-3)  # warm and cold differ from the start
+            tensors["feature"] = PerGaussian(feature, self.lr_feature)
+        self.network.heads["temperature"].bias.fill_(self._raw_of(value.mean()))
+        if self._stored is not None:
+            own = self.state_dict()
+            for name, stored in self._stored.items():
+                own[name].copy_(stored)
+        return tensors
+
+    def on_step(self, step: int) -> None:
+        self._step = step
+        self.emits.fill_(step >= self.first_steps)
+
+    def features(self, splats: Splats, query: Query) -> Emission:
+        if not self._network_emits:
+            return Emission(query.rows(splats["first_value"]).clamp(min=0.0)[:, None])
+        base = self._base(splats, query.ids)
+        hidden = self.network(base, self._moment(query.time_s))
+        units = self._units(hidden)
+        if torch.is_grad_enabled() and self.training:
+            ids = torch.arange(len(splats), device=units.device) if query.ids is None else query.ids
+            self._seen = _Seen(ids, base, hidden, units, query.time_s)
+        return Emission(self._image_values(units)[:, None])
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        """Those of "smooth", "physical", "ode" and "pinn" that are on, of the Gaussians last seen with a gradient."""
+        seen, self._seen = self._seen, None
+        weights = {name: self._ramp * weight for name, weight in self.weights.items()}
+        if seen is None or not len(seen.ids) or self._ramp == 0 or not weights:
+            return {}
+        stride = -(-len(seen.ids) // self.sampled)
+        rows = torch.arange(self._step % stride, len(seen.ids), stride, device=seen.ids.device)
+        ids, base, now = seen.ids[rows], seen.base[rows], seen.units[rows]
+        terms = {}
+        if "physical" in weights:
+            body = self._body(splats, ids, seen.hidden[rows])
+            terms["physical"] = heat_terms.to_reference(body, reference(splats["label"].detach()[ids].long()))
+        interval = self._interval(seen.time_s)
+        if interval == 0 or not set(weights) - {"physical"}:
+            return {name: weights[name] * term for name, term in terms.items()}
+        ends = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
+        last_s = min(max(seen.time_s + interval, ends[0]), ends[1])  # the sum may round to a hair outside
+        middle_s = 0.5 * (seen.time_s + last_s)
+        last = self.network(base, self._moment(last_s))
+        later = self._units(last)
+        if "smooth" in weights:
+            terms["smooth"] = heat_terms.change(now, later)
+        if self._balanced:
+            areas = self._areas(splats, ids)
+            first_rate = self._rate(now, self._body(splats, ids, seen.hidden[rows]), areas, seen.time_s)
+            if "ode" in weights:
+                middle = self._body(splats, ids, self.network(base, self._moment(middle_s)))
+                rate = self._rate(now + interval / 2 * first_rate, middle, areas, middle_s)
+                terms["ode"] = heat_terms.integration(now, later, rate, interval)
+            if "pinn" in weights:
+                rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, last), areas, last_s))
+                terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.interval_s[1])
+        return {name: weights[name] * term for name, term in terms.items()}
+
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        lower, width = self.range_k.tolist()
+        return lower + width * self.features(splats, Query(time_s=time_s)).features[:, 0]
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Emissivity, absorptivity, convection and capacity at the time of the query; nothing in the first stage."""
+        if not self._network_emits:
+            return {}
+        with torch.no_grad():
+            hidden = self.network(self._base(splats, query.ids), self._moment(query.time_s))
+            return self._body(splats, query.ids, hidden)
+
+    def prior(self, splats: Splats) -> dict[str, Tensor]:
+        """Attributes of the classes, each [N]; NaN where there is no class. Empty for models that use no labels."""
+        if not self.labelled:
+            return {}
+        return dict(zip(ATTRIBUTES, reference(splats["label"].detach().long()).unbind(1), strict=True))
+
+    def effects(self) -> dict[str, dict]:
+        missing = self._missing_columns
+        used = [name for name in WEATHER_COLUMNS if name not in missing]
+        effects = {"weather": {"network_sees": used, "left_out": missing, "time": self.time}}
+        if self._balanced:
+            radiation = {"sky": self.sky, "materials": "inferred" if self.inferred else "table"}
+            effects |= {"radiation": radiation, "convection": {"surface_area": self.surface_area}}
+            if self.weather is not None:
+                light = source_of_sunlight(self.weather)
+                effects["sunlight"] = {"projected_area": self.projected_area, "irradiance": light}
+        return effects
+
+    @property
+    def cost(self) -> int:
+        code = 6 * self.position_frequencies  # sines
+        return self.network.cost + self.network.heads["temperature"].weight.numel() + code
+
+    # The network ----------------------------------------------------------------------------------------
+
+    @property
+    def _network_emits(self) -> bool:
+        taken_over = self.path is not None and not self.training
+        return taken_over or bool(self.emits)
+
+    @property
+    def _balanced(self) -> bool:
+        return any(name in self.weights for name in BALANCED)
+
+    @property
+    def _missing_columns(self) -> list[str]:
+        if self.weather is None:
+            return []
+        return [name for name in WEATHER_COLUMNS if getattr(self.weather, name) is None]
+
+    @property
+    def _ramp(self) -> float:
+        return min(1.0, (self._step - self.first_steps + 1) / (self.ramp_steps + 1))
+
+    def _interval(self, time_s: float) -> float:
+        """Seconds from the view to the other end of the interval: forward, or back where the record ends."""
+        shortest, longest = self.interval_s
+        wanted = shortest + (longest - shortest) * math.fmod(self._step * GOLDEN, 1.0)
+        first, last = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
+        if time_s + wanted <= last:
+            return wanted
+        return max(-wanted, first - time_s)
+
+    def _base(self, splats: Splats, ids: Tensor | None) -> Tensor:
+        """What the network's first layer makes of all that belongs to the Gaussians, [n, width]."""
+        rows = Query(ids).rows
+        parts = []
+        if self.position_frequencies:
+            places = ((rows(splats.means.detach()) - self.center) / self.edge).clamp(-BOX_EDGE, BOX_EDGE)
+            parts.append(octaves(places, self.position_frequencies))
+        if self.features_from == "labels":
+            labels = rows(splats["label"].detach())[:, None]
+            parts.append((labels == torch.arange(len(CLASSES), device=labels.device)).float())
+        elif self.feature_size:
+            parts.append((rows(splats["feature"]) - self.feature_mean) / self.feature_scale)
+        return self.network.own(torch.cat(parts, 1))
+
+    def _moment(self, time_s: float) -> Tensor:
+        """Encoded time and weather of a moment, as the network sees them."""
+        if time_s is None:
+            raise ValueError("ThermoGS needs the time at which a scene is seen: give time_s")
+        mean, scale = self.weather_mean.cpu(), self.weather_scale.cpu()
+        weather = torch.where(scale > 0, (columns_at(self.weather, time_s).nan_to_num() - mean) * scale, 0.0)
+        parts = [weather]
+        if self.time != "none":
+            origin, span = self.clock.tolist()
+            share = (time_s - origin) / span if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
+            parts.append(octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0])
+        return torch.cat(parts).to(self.network.own.weight)
+
+    def _units(self, hidden: Tensor) -> Tensor:
+        """Temperatures between T_min (0) and T_max (1), [n]."""
+        return self.network.heads["temperature"](hidden)[:, 0].sigmoid()
+
+    def _image_values(self, units: Tensor) -> Tensor:
+        (lower, width), (coldest, span) = self.range_k.tolist(), self.bounds_k.tolist()
+        return (coldest - lower) / width + (span / width) * units
+
+    def _raw_of(self, value: Tensor) -> Tensor:
+        """What the head must give for an image value."""
+        (lower, width), (coldest, span) = self.range_k.tolist(), self.bounds_k.tolist()
+        return torch.logit(((lower + width * value - coldest) / span).clamp(0.05, 0.95))
+
+    # The balance ----------------------------------------------------------------------------------------
+
+    def _body(self, splats: Splats, ids: Tensor | None, hidden: Tensor) -> dict[str, Tensor]:
+        """The four attributes, each [n], from hidden values [n, width] or from the table."""
+        if self.inferred:
+            values = self.lowest + (self.highest - self.lowest) * self.network.heads["attributes"](hidden).sigmoid()
+        else:
+            values = reference(Query(ids).rows(splats["label"].detach()).long())
+        return dict(zip(ATTRIBUTES, values.unbind(1), strict=True))
+
+    @torch.no_grad()
+    def _areas(self, splats: Splats, ids: Tensor) -> dict[str, Tensor]:
+        """Areas over volumes in 1/m, the axes themselves [n, 3] and their directions [n, 3, 3]."""
+        axes = floored_axes(splats.scales[ids], self.metres_per_unit, self.smallest_axis_m)
+        return {
+            "axes": axes,
+            "rotations": quats_to_matrices(splats.quats[ids]),
+            "radiating": radiating_area_ratio(axes),
+            "convecting": convecting_area_ratio(axes, self.surface_area),
+        }
+
+    def _rate(self, units: Tensor, body: dict[str, Tensor], areas: dict[str, Tensor], time_s: float) -> Tensor:
+        """dT/dt of the balance at temperatures ``units``, in ranges per second, [n]."""
+        coldest, span = self.bounds_k.tolist()
+        lit = 0.0
+        for direction, power in sunlight_at(self.weather, time_s):
+            local = direction.to(areas["rotations"]) @ areas["rotations"]
+            lit = lit + power * projected_area_ratio(areas["axes"], local, self.projected_area)
+        air_k = self.weather.at(time_s).air_c + KELVIN_AT_0_C
+        rate = heating_rate(
+            coldest + span * units,
+            absorbed_w_m3=body["absorptivity"] * lit,
+            emissivity=body["emissivity"],
+            convection=body["convection"],
+            capacity=body["capacity"],
+            radiating_ratio=areas["radiating"],
+            convecting_ratio=areas["convecting"],
+            air_k=air_k,
+            sky_k=swinbank_sky_k(air_k) if self.sky == "swinbank" else 0.0,
+        )
+        return rate / span
+
+    # The network of another run --------------------------------------------------------------------------
+
+    def _network_of_another_run(self) -> dict[str, Tensor]:
+        """Weights of the network in a checkpoint, and what its inputs and outputs are measured in."""
+        if not self.path.is_file():
+            raise SceneError(f"thermal.network: there is no checkpoint at {self.path}")
+        weights = torch.load(self.path, map_location="cpu", weights_only=True).get("state_dict", {})
+        own = self.state_dict()
+        wanted = [name for name in own if name.startswith("network.") or name in TRAVELS]
+        stored = {name: weights[f"thermal.{name}"] for name in wanted if f"thermal.{name}" in weights}
+        differ = [name for name in wanted if name not in stored or stored[name].shape != own[name].shape]
+        if differ:
+            raise SceneError(
+                f"thermal.network: the network of {self.path} is another one ({', '.join(differ[:4])} differ or are "
+                "missing); give the width, blocks, frequencies and features of that run"
+            )
+        return stored

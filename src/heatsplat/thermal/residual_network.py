@@ -1,0 +1,70 @@
+"""A residual perceptron whose input is part per Gaussian and part the same for all of them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import silu
+
+
+class ResidualNetwork(nn.Module):
+    """Hidden values of ``blocks`` residual blocks (two layers each), and heads on them.
+
+    The first layer is linear, so its two parts are evaluated apart: what belongs to a Gaussian once for all moments,
+    what belongs to a moment once for all Gaussians.
+
+    Args:
+        own: inputs per Gaussian.
+        shared: inputs that all Gaussians share.
+        width, blocks: size of the hidden layers and number of blocks.
+        heads: name -> what the head gives before training, [k]; its weights start at zero.
+    """
+
+    def __init__(self, own: int, shared: int, width: int, blocks: int, heads: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.own = nn.Linear(own, width)
+        self.shared = nn.Linear(shared, width, bias=False)
+        self.blocks = nn.ModuleList(
+            nn.ModuleList((nn.Linear(width, width), nn.Linear(width, width))) for _ in range(blocks)
+        )
+        self.heads = nn.ModuleDict({name: nn.Linear(width, len(start)) for name, start in heads.items()})
+        with torch.no_grad():
+            for name, start in heads.items():
+                self.heads[name].weight.zero_()
+                self.heads[name].bias.copy_(start)
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator) -> None:
+        """Gives all layers but the heads random weights; the second layer of a block starts small (Zhang et al. 2019)."""
+        count = own = self.own.in_features + self.shared.in_features
+        for layer in (self.own, self.shared):
+            _uniform(layer, 1 / math.sqrt(own), generator)
+        for first, second in self.blocks:
+            count = first.in_features
+            _uniform(first, 1 / math.sqrt(count), generator)
+            _uniform(second, 1 / math.sqrt(count * len(self.blocks)), generator)
+
+    def forward(self, base: Tensor, moment: Tensor) -> Tensor:
+        """Hidden values [n, width].
+
+        Args:
+            base: [n, width], ``self.own`` of what belongs to the Gaussians.
+            moment: [shared].
+        """
+        hidden = base + self.shared(moment)
+        for first, second in self.blocks:
+            hidden = hidden + second(silu(first(silu(hidden))))
+        return silu(hidden)
+
+    @property
+    def cost(self) -> int:
+        """Multiply-adds per Gaussian up to the hidden values, the shared inputs left out."""
+        inner = sum(layer.weight.numel() for block in self.blocks for layer in block)
+        return self.own.weight.numel() + inner
+
+
+def _uniform(layer: nn.Linear, bound: float, generator: torch.Generator) -> None:
+    for parameter in layer.parameters():
+        nn.init.uniform_(parameter, -bound, bound, generator=generator)

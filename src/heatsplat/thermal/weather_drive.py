@@ -1,0 +1,62 @@
+"""The weather at a moment, as a network sees it and as it drives a balance of heat."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import WEATHER_COLUMNS, Weather
+
+
+def columns_at(weather: Weather, time_s: float) -> Tensor:
+    """The five weather values at a moment, [5] float64 in the order of ``WEATHER_COLUMNS``; NaN where one is missing.
+
+    **Convention:** wind as log(1 + wind in m/s), since most of it is weak; the others in their units.
+
+    Raises:
+        SceneError: the record does not reach the moment.
+    """
+    now = weather.at(time_s)
+    values = {name: getattr(now, name) for name in WEATHER_COLUMNS}
+    if values["wind_m_s"] is not None:
+        values["wind_m_s"] = math.log1p(max(values["wind_m_s"], 0.0))
+    return torch.tensor([math.nan if value is None else value for value in values.values()], dtype=torch.float64)
+
+
+def sunlight_at(weather: Weather, time_s: float) -> list[tuple[Tensor, float]]:
+    """Beams of sunlight at a moment: direction towards the source [3] in the world, and W/m² on a surface facing it.
+
+    With the sun's direction and direct irradiance known: the sun, and the sky's light from straight above where the
+    record has it. Otherwise all light comes from straight above, as strong as on a horizontal surface. At night, and
+    without any irradiance, there is none.
+    """
+    beams = []
+    if weather.sun is not None and weather.direct_w_m2 is not None:
+        towards = _at(weather, weather.sun, time_s)
+        length = float(towards.norm())  # of the chord between two directions; zero only where they are opposite
+        if length > 0:
+            beams.append((towards / length, float(_at(weather, weather.direct_w_m2, time_s))))
+        if weather.diffuse_w_m2 is not None:
+            beams.append((weather.up, float(_at(weather, weather.diffuse_w_m2, time_s))))
+    elif weather.irradiance_w_m2 is not None:
+        beams.append((weather.up, float(_at(weather, weather.irradiance_w_m2, time_s))))
+    return [(direction, power) for direction, power in beams if power > 0]
+
+
+def source_of_sunlight(weather: Weather) -> str:
+    """Which irradiance ``sunlight_at`` uses, in words for reports."""
+    if weather.sun is not None and weather.direct_w_m2 is not None:
+        return "direct, from the sun" + (", and diffuse, from above" if weather.diffuse_w_m2 is not None else "")
+    if weather.irradiance_w_m2 is not None:
+        return "horizontal, from above: the record has no direction of the sun or no direct irradiance"
+    return "none: the record has no irradiance"
+
+
+def _at(weather: Weather, series: Tensor, time_s: float) -> Tensor:
+    """A series at a moment within the record, linear between samples."""
+    times = weather.times_s
+    above = int(torch.searchsorted(times, time_s).clamp(1, len(times) - 1))
+    share = (time_s - float(times[above - 1])) / float(times[above] - times[above - 1])
+    return series[above - 1] * (1 - share) + series[above] * share
