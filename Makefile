@@ -13,7 +13,7 @@ EXTRAS      := dev$(if $(CUDA),$(comma)gsplat)
 comma       := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench tensorboard clean
+.PHONY: help install demo test test-slow lint format bench stability tensorboard clean
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -46,6 +46,9 @@ format: $(READY)  ## mend style and formatting
 
 bench: $(READY)  ## time the renderer against its peers and its floor
 	@$(RUN) src/study.py study=renderer $(ARGS)
+
+stability: $(READY)  ## measure the hard cases of arithmetic and write docs/stability.md
+	@$(RUN) src/study.py study=stability $(ARGS)
 
 tensorboard: $(READY)  ## look at all runs in TensorBoard
 	@$(VENV)/bin/tensorboard --logdir outputs

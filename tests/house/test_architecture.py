@@ -24,7 +24,8 @@ ALLOWED = {
     "effects": {"contracts", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
-    "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"},
+    "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}
+    | {"sensors", "thermal", "training"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "io", "training", "shots", "studies"},

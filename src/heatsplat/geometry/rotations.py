@@ -59,16 +59,15 @@ def matrices_to_quats(matrices: Tensor) -> Tensor:
 def slerp(start: Tensor, end: Tensor, fraction: Tensor | float) -> Tensor:
     """Unit quaternions [..., 4] on the shorter great arc from ``start`` (fraction 0) to ``end`` (fraction 1).
 
-    **Convention:** constant angular speed in ``fraction`` [...], which broadcasts over the leading dimensions. Below an
-    angle of 1e-4 the chord replaces the arc: they differ by less than 1e-12 there, and sin(angle) does not divide.
+    **Convention:** constant angular speed in ``fraction`` [...], which broadcasts over the leading dimensions.
     """
     start, end = normalised(start), normalised(end)
     end = torch.where((start * end).sum(-1, keepdim=True) < 0, -end, end)
     fraction = torch.as_tensor(fraction, dtype=start.dtype, device=start.device)[..., None]
     # atan2 of the chord's halves is accurate at every angle; acos of the dot product is not near 0.
     angle = 2 * torch.atan2((end - start).norm(dim=-1, keepdim=True), (end + start).norm(dim=-1, keepdim=True))
-    near = angle < 1e-4
-    safe = torch.where(near, 1.0, angle)
-    first = torch.where(near, 1 - fraction, torch.sin((1 - fraction) * safe) / torch.sin(safe))
-    second = torch.where(near, fraction, torch.sin(fraction * safe) / torch.sin(safe))
+    same = angle == 0  # any other angle, however small, is divided by without loss
+    safe = torch.where(same, 1.0, angle)
+    first = torch.where(same, 1 - fraction, torch.sin((1 - fraction) * safe) / torch.sin(safe))
+    second = torch.where(same, fraction, torch.sin(fraction * safe) / torch.sin(safe))
     return normalised(first * start + second * end)
