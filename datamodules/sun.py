@@ -49,7 +49,9 @@ class Site:
         up = up / np.linalg.norm(up)
         level = north - (north @ up) * up
         if not np.linalg.norm(level) > 1e-6 * np.linalg.norm(north) > 0:
-            raise SceneError(f"data.north={list(self.north)} points up (data.up={list(self.up)}); give a level direction")
+            raise SceneError(
+                f"data.north={list(self.north)} points up (data.up={list(self.up)}); give a level direction"
+            )
         north = level / np.linalg.norm(level)
         return np.stack([np.cross(north, up), north, up])
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ class Recording:
         times_s: [F] float64, whole milliseconds, increasing from the start of the record.
         celsius: [F, H, W] float32 temperatures, with noise and the camera's flaws.
         rgb: [F, H, W, 3] uint8 visible images of the same camera.
-        thermal_range: whole degrees that enclose all noise-free temperatures with at least half a degree to spare.
+        thermal_range: the scene's own, or whole degrees that enclose all noise-free temperatures with half a degree to spare.
         points: [P, 3] float64 points seen in the frames, a few millimetres off their surfaces.
         point_colors: [P, 3] in [0, 1].
         clean: [F, H, W] float32 temperatures without noise and flaws; None where the camera has no flaws.
@@ -107,8 +108,7 @@ def film(
         pixel_aspect: fy / fx.
     """
     lens = _lens(size, distortion, pixel_aspect)
-    times = frame_times(size.frames, scene.preset.duration_s, seed)
-    viewmats = camera_path(times, scene.preset.duration_s, seed)
+    times, viewmats = (scene.route or partial(_by_hand, scene.preset.duration_s))(size.frames, seed)
     rays = pixel_rays(lens, _pixel_centres(lens))
     celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
@@ -127,7 +127,8 @@ def film(
         list(pool.map(shoot, range(size.frames)))
         count = max(round(size.points / scene.preset.sparseness), 16)
         points, colors = sparse_points(scene, lens, viewmats, count, seed)
-    thermal_range, clean = ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5)), None
+    enclosing = ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5))
+    thermal_range, clean = scene.thermal_range or enclosing, None
     if flaws:
         clean = celsius
         recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(torch.from_numpy(clean).double()), seed))
@@ -178,6 +179,11 @@ def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
         distortion=tuple(distortion),
         model="OPENCV" if distortion else "PINHOLE",
     )
+
+
+def _by_hand(duration_s: float, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
+    times = frame_times(frames, duration_s, seed)
+    return times, camera_path(times, duration_s, seed)
 
 
 def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
@@ -293,7 +299,7 @@ def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Ten
 
 
 def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, 3 mm off their surface.
+    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, millimetres off their surface.
 
     Where light passes a surface, every other point is one that thermal images show and the next lies behind it.
     """
@@ -311,5 +317,5 @@ def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: 
             points[passing], which[passing] = scene.beyond(points[passing], rays[passing] @ viewmats[frame][:3, :3])
     found = which >= 0
     colors = scene.color(points, which)[found]
-    noise = 0.003 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    noise = scene.point_noise_m * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     return (points + noise)[found], colors

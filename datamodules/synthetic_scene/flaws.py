@@ -66,9 +66,9 @@ class CameraFlaws:
         nodes = torch.randn(2, self.nodes, self.nodes, generator=generator, dtype=torch.float64)
         gain, bias = resampled(nodes.permute(1, 2, 0), height, width, "bicubic").unbind(-1)
         stripes = self.columns * torch.randn(width, generator=generator, dtype=torch.float64)
-        y = (torch.arange(height, dtype=torch.float64) + 0.5) * (2.0 / height) - 1.0
-        x = (torch.arange(width, dtype=torch.float64) + 0.5) * (2.0 / width) - 1.0
-        r2 = 0.5 * (y[:, None] ** 2 + x**2)
+        y = torch.arange(height, dtype=torch.float64) + 0.5 - 0.5 * height
+        x = torch.arange(width, dtype=torch.float64) + 0.5 - 0.5 * width
+        r2 = (y[:, None] ** 2 + x**2) * (4.0 / (height**2 + width**2))
         falloff = torch.exp(self.falloff[0] * r2 + self.falloff[1] * r2 * r2)
         return self.gain * gain, self.bias * bias + stripes, falloff
 

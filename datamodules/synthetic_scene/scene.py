@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from datamodules.synthetic_scene import heat
-from datamodules.synthetic_scene.presets import Preset
+from datamodules.synthetic_scene.presets import Preset, Surface
 from datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
+from heatsplat.contracts import ThermalRange
 
 # Where the visible light comes from (unit length), and its share that comes from everywhere.
 _SUN = (-0.398, -0.597, 0.697)
@@ -44,7 +47,18 @@ class Scene:
     """Geometry, materials and solved temperatures of a preset; float64 on the CPU.
 
     **Convention:** times are seconds from the start of the preset's record, 0 to ``preset.duration_s``.
+
+    Attributes:
+        route: how the camera moves: (frames, seed) -> (times [F], viewmats [F, 4, 4]); None for a hand that sweeps.
+        thermal_range: bounds of the camera's images; None for those that its frames need.
+        point_noise_m: how far a sparse point lies off its surface, standard deviation of each coordinate.
+        probe_reach_m: how far about a probe its surface should be of one temperature.
     """
+
+    route: Callable[[int, int], tuple[np.ndarray, Tensor]] | None = None
+    thermal_range: ThermalRange | None = None
+    point_noise_m: float = 0.003
+    probe_reach_m: float = 0.04
 
     def __init__(self, preset: Preset) -> None:
         self.preset = preset
@@ -116,6 +130,11 @@ class Scene:
         of_point = response[:, surface.material.clamp_min(0)]
         rise = of_point[..., 0] * surface.start_k + of_point[..., 1] * surface.flux_w_m2
         return self.preset.ambient_c + rise.T
+
+    def warmth(self, points: Tensor, which: Tensor, surface: Surface) -> Tensor:
+        """What tells points [n, 3] of ``surface`` apart that warm differently: start and flux, in kelvin [n]."""
+        heat = self.heat_at(points, which)
+        return heat.start_k + heat.flux_w_m2 / surface.material.exchange
 
     def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The surface nearest to each point: the point on it [n, 3] and its number [n]."""

@@ -1,0 +1,403 @@
+"""A yard over two days: a house, a shed, a car, a tank and a terrace under sun, wind and sky, seen by a drone.
+
+Metres; x is east, y north, z up. Every face of an object is of one temperature per shade of its paint: no surface casts
+a shadow on another, only its own orientation decides how the sun meets it, and a face that leans sees as much of its
+surroundings (at air temperature) as it sees less of the sky. The sky's long waves follow air temperature and humidity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from datamodules.synthetic_scene.outdoor_heat import (
+    STEFAN_BOLTZMANN,
+    Forcing,
+    History,
+    OutdoorMaterial,
+    Slab,
+    march,
+    solve,
+)
+from datamodules.synthetic_scene.presets import Pattern, Preset, Surface
+from datamodules.synthetic_scene.scene import Scene
+from datamodules.synthetic_scene.shapes import Box, Plane
+from heatsplat.contracts import KELVIN_AT_0_C, SceneError, ThermalRange, Weather
+from heatsplat.training.rng import generator_for
+
+SITE = Site(latitude=47.0, longitude=9.0, altitude_m=500.0)
+START_UTC = "2024-07-11T00:00:00+00:00"
+START_UTC_S = 1720656000.0
+DAY_S = 86400.0
+DURATION_S = 2.0 * DAY_S
+SAMPLE_S = 600.0
+# Weather before the record, so that its start finds the surfaces in the middle of things and not at one temperature.
+_BEFORE_S = 0.5 * DAY_S
+
+# Names of the classes, in the order of ThermoGS's table 8.
+CLASSES = (
+    "building",
+    "road",
+    "vehicle",
+    "grassland",
+    "high vegetation",
+    "sports field",
+    "water",
+    "farmland",
+    "construction",
+    "bare ground",
+)
+
+# From a sheet that follows every cloud to ground that takes a day: ρc·depth / (h + 4 ε σ T³) is 4 minutes for the roof
+# and the better part of a day for the tank, and h·depth/k is 0.0003 for the roof and about 1 for the wooden shed.
+METAL_ROOF = OutdoorMaterial(50.0, 3.6e6, 0.0015, 0.80, 7.0, 3.5)
+BRICK = OutdoorMaterial(0.8, 1.5e6, 0.06, 0.92, 5.0, 2.5)
+WOOD = OutdoorMaterial(0.16, 0.9e6, 0.015, 0.88, 6.0, 3.0)
+ASPHALT = OutdoorMaterial(1.2, 2.0e6, 0.08, 0.94, 6.0, 3.0)
+WET_GROUND = OutdoorMaterial(1.6, 2.9e6, 0.12, 0.96, 8.0, 3.5)
+CAR_BODY = OutdoorMaterial(45.0, 3.6e6, 0.004, 0.86, 7.0, 4.0)
+WATER_TANK = OutdoorMaterial(20.0, 4.1e6, 0.15, 0.90, 6.0, 3.0)  # water stirs itself
+CONCRETE = OutdoorMaterial(1.5, 2.1e6, 0.10, 0.90, 5.5, 2.5)
+
+
+@dataclass(frozen=True)
+class OutdoorSurface(Surface):
+    """An object with flat faces under the sky; ``absorbs`` is the absorbed share of sunlight over it.
+
+    Args:
+        material: an ``OutdoorMaterial``.
+        label: one of ``CLASSES``.
+    """
+
+    material: OutdoorMaterial = WET_GROUND  # type: ignore[assignment]
+    label: str = "building"
+
+
+def _surface(name: str, shape: Box | Plane, material: OutdoorMaterial, absorbs: Pattern, color, label: str):
+    return OutdoorSurface(name, shape, material, absorbs, color, label=label)
+
+
+YARD = (
+    _surface(
+        "meadow", Plane((0, 0, 0), (0, 0, 1)), WET_GROUND, Pattern(0.72, 0.06, 6.0, 0.05, 3.1), (0.5, 0.75, 0.35), CLASSES[3]
+    ),
+    _surface(
+        "road", Box((0.0, -9.0, 0.03), (24.0, 4.0, 0.14), 4.0), ASPHALT, Pattern(0.86, 0.03, 3.0, 0.04, 1.7),
+        (0.55, 0.55, 0.6), CLASSES[1],
+    ),
+    _surface(
+        "terrace", Box((6.5, -3.5, 0.1), (4.0, 4.0, 0.3), 20.0), CONCRETE, Pattern(0.6, 0.05, 2.0, 0.07, 1.1),
+        (0.95, 0.9, 0.85), CLASSES[8],
+    ),
+    _surface(
+        "house", Box((0.0, 0.5, 2.0), (9.0, 6.0, 4.0), 20.0), BRICK, Pattern(0.65, 0.06, 3.0, 0.06, 1.3), (0.9, 0.5, 0.4),
+        CLASSES[0],
+    ),
+    _surface(
+        "roof",
+        Box((0.0, 0.5, 4.0), (8.98, 6.04 * 0.5**0.5, 6.04 * 0.5**0.5), 20.0, 45.0),
+        METAL_ROOF,
+        Pattern(0.5, 0.05, 2.5, 0.06, 1.4),
+        (0.75, 0.8, 0.9),
+        CLASSES[0],
+    ),
+    _surface(
+        "shed", Box((-7.5, -2.0, 1.25), (3.0, 2.5, 2.5), -30.0), WOOD, Pattern(0.6, 0.06, 1.5, 0.06, 0.8), (0.85, 0.65, 0.4),
+        CLASSES[8],
+    ),
+    _surface(
+        "car", Box((3.0, -9.0, 0.85), (4.2, 1.8, 1.4), 4.0), CAR_BODY, Pattern(0.7, 0.05, 1.5, 0.08, 1.1), (0.3, 0.4, 0.9),
+        CLASSES[2],
+    ),
+    _surface(
+        "tank", Box((-7.0, 5.5, 1.0), (2.5, 2.5, 2.0), 55.0), WATER_TANK, Pattern(0.55, 0.05, 1.5, 0.06, 1.0),
+        (0.9, 0.9, 0.9), CLASSES[6],
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sky:
+    """How the two days go.
+
+    Args:
+        warm_c, swing_k: mean and half the range of the day's air temperature.
+        dew_point_c: moisture of the air.
+        cloud: added to the share of the sky that clouds take; -1 clears it, 1 closes it.
+        wind_factor, wind_added: what becomes of the breeze, in m/s.
+    """
+
+    warm_c: float = 18.0
+    swing_k: float = 6.5
+    dew_point_c: float = 9.5
+    cloud: float = 0.0
+    wind_factor: float = 1.0
+    wind_added: float = 0.0
+
+
+# "fair" is the weather of the record; the others are asked for with data.weather, and start from the same midnight.
+SKIES: dict[str, Sky] = {
+    "fair": Sky(),
+    "calm": Sky(wind_factor=0.12),
+    "windy": Sky(wind_added=7.0),
+    "overcast": Sky(warm_c=15.5, swing_k=2.5, dew_point_c=11.5, cloud=1.0),
+}
+
+
+@dataclass(frozen=True)
+class OutdoorPreset(Preset):
+    """A scene under the sky.
+
+    Args:
+        weather: name of its weather in ``SKIES``.
+        bounds_c: temperatures of black and white, the same in every weather, so that one model serves them all.
+        labels: names of the classes.
+    """
+
+    surfaces: tuple[OutdoorSurface, ...] = YARD
+    duration_s: float = DURATION_S
+    ambient_c: float = 18.0
+    weather: str = "fair"
+    bounds_c: tuple[float, float] = (0.0, 80.0)
+    labels: tuple[str, ...] = CLASSES
+
+
+OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}
+
+
+def outdoor_weather(sky: Sky, start_s: float = 0.0, end_s: float = DURATION_S) -> Weather:
+    """The weather of a sky every ten minutes, on the clock of the record; the same bits on every call.
+
+    Breeze and clouds are sums of slow waves of random phase. Clouds of cover c let 1 - 0.75 c^3.4 of the clear sky's
+    light pass (Kasten and Czeplak 1980); what passes is split into sun and sky as a measured irradiance would be.
+    """
+    times = np.arange(start_s, end_s + 0.5 * SAMPLE_S, SAMPLE_S)
+    hours = times / 3600.0
+    solar_hours = hours + SITE.longitude / 15.0
+
+    def drift(purpose: str, periods_h: tuple[float, ...]) -> np.ndarray:
+        phases = torch.rand(len(periods_h), generator=generator_for(0, 0, f"outdoor {purpose}"), dtype=torch.float64)
+        waves = [
+            np.sin(2.0 * np.pi * (hours / period + phase))
+            for period, phase in zip(periods_h, phases.tolist(), strict=True)
+        ]
+        return np.mean(waves, axis=0)
+
+    day = np.cos(2.0 * np.pi * (solar_hours - 15.0) / 24.0)
+    second_harmonic = 0.15 * np.cos(4.0 * np.pi * (solar_hours - 14.0) / 24.0)
+    air = sky.warm_c + sky.swing_k * (day + second_harmonic) + 1.2 * drift("air", (31.0, 9.0, 3.7)) + hours / 24.0
+    dew_point = sky.dew_point_c + 1.5 * drift("moisture", (40.0, 11.0))
+    humidity = np.clip(100.0 * _vapour_hpa(dew_point) / _vapour_hpa(air), 5.0, 100.0)
+    breeze = 2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
+    wind = np.clip(breeze, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
+    cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
+    utc_s = START_UTC_S + times
+    irradiance = clear_sky(SITE, utc_s) * (1.0 - 0.75 * cover**3.4)
+    direct, diffuse = split_irradiance(SITE, utc_s, irradiance)
+    return Weather(
+        times_s=torch.from_numpy(times),
+        air_c=torch.from_numpy(air),
+        wind_m_s=torch.from_numpy(wind),
+        humidity_percent=torch.from_numpy(humidity),
+        irradiance_w_m2=torch.from_numpy(irradiance),
+        pressure_hpa=torch.from_numpy(955.0 + 4.0 * drift("pressure", (53.0, 23.0))),
+        direct_w_m2=torch.from_numpy(direct),
+        diffuse_w_m2=torch.from_numpy(diffuse),
+        sun=torch.from_numpy(sun_directions(SITE, utc_s)),
+    )
+
+
+def _vapour_hpa(celsius: np.ndarray) -> np.ndarray:
+    """Saturation pressure of water vapour (Magnus; Alduchov and Eskridge 1996)."""
+    return 6.1094 * np.exp(17.625 * celsius / (celsius + 243.04))
+
+
+def sky_long_waves(weather: Weather) -> np.ndarray:
+    """Long-wave irradiance [T] of a whole clear sky in W/m²: Brutsaert's emissivity 1.24 (e / T)^(1/7), e in hPa."""
+    air_k = weather.air_c.numpy() + KELVIN_AT_0_C
+    vapour = 0.01 * weather.humidity_percent.numpy() * _vapour_hpa(weather.air_c.numpy())
+    return 1.24 * (vapour / air_k) ** (1.0 / 7.0) * STEFAN_BOLTZMANN * air_k**4
+
+
+def forcing_of(weather: Weather, normals: np.ndarray) -> Forcing:
+    """What a weather does to faces with outward ``normals`` [F, 3]; sun and sky are as bright all over (isotropic)."""
+    air_k = weather.air_c.numpy() + KELVIN_AT_0_C
+    sky_share = 0.5 * (1.0 + normals @ weather.up.numpy())
+    beam = weather.direct_w_m2.numpy()[:, None] * np.clip(weather.sun.numpy() @ normals.T, 0.0, None)
+    around = STEFAN_BOLTZMANN * air_k**4
+    return Forcing(
+        times_s=weather.times_s.numpy(),
+        air_k=air_k,
+        wind_m_s=weather.wind_m_s.numpy(),
+        sunlight_w_m2=beam + weather.diffuse_w_m2.numpy()[:, None] * sky_share,
+        long_waves_w_m2=sky_long_waves(weather)[:, None] * sky_share + around[:, None] * (1.0 - sky_share),
+    )
+
+
+@dataclass(frozen=True)
+class OutdoorHeat:
+    """What decides the temperature of n surface points over time.
+
+    Args:
+        face: [n] number of the flat face; -1 where there is no surface.
+        absorptivity: [n] absorbed share of sunlight.
+    """
+
+    face: Tensor
+    absorptivity: Tensor
+
+
+class OutdoorScene(Scene):
+    """A yard whose heat has been solved under a weather; see ``Scene``. Times are seconds from the start of the record."""
+
+    point_noise_m = 0.02
+    probe_reach_m = 0.25
+
+    def __init__(self, preset: OutdoorPreset) -> None:
+        if preset.weather not in SKIES:
+            raise SceneError(f"data.weather={preset.weather}: this scene knows {', '.join(SKIES)}")
+        self.preset = preset
+        self.shapes = [surface.shape for surface in preset.surfaces]
+        self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
+        self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
+        self.thermal_range = ThermalRange(*preset.bounds_c)
+        self.weather = outdoor_weather(SKIES[preset.weather])
+        # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
+        faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
+        self.face_surface = torch.tensor([number for number, _ in faces])
+        self.face_normals = torch.tensor([normal for _, normal in faces], dtype=torch.float64)
+        self.shades = torch.stack([_shades(preset.surfaces[number].absorbs) for number, _ in faces])
+        self.history = _solved(preset.surfaces, preset.weather)
+
+    def heat_at(self, points: Tensor, which: Tensor) -> OutdoorHeat:  # type: ignore[override]
+        """Face and absorptivity at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
+        face = torch.full((len(points),), -1)
+        absorptivity = torch.zeros(len(points), dtype=torch.float64)
+        for number, surface in enumerate(self.preset.surfaces):
+            here = which == number
+            if not here.any():
+                continue
+            on = points[here]
+            own = (self.face_surface == number).nonzero()[:, 0]
+            face[here] = own[(surface.shape.normals(on) @ self.face_normals[own].T).argmax(1)]
+            absorptivity[here] = surface.absorbs(surface.shape.local(on)).clamp(0.0, 1.0)
+        return OutdoorHeat(face, absorptivity)
+
+    def celsius(self, heat: OutdoorHeat, times_s: Tensor) -> Tensor:  # type: ignore[override]
+        """Temperatures [n, F] of surface points at ``times_s`` [F], in °C; ambient where there is no surface."""
+        count = self.shades.shape[1]
+        solved = torch.from_numpy(self.history.at(times_s.numpy())).reshape(len(times_s), -1, count)
+        face = heat.face.clamp_min(0)
+        shades = self.shades[face]
+        kelvin = torch.zeros(len(face), len(times_s), dtype=torch.float64)
+        for k in range(count):  # Lagrange's polynomial through the solved shades
+            weight = torch.ones_like(heat.absorptivity)
+            for j in range(count):
+                if j != k:
+                    weight = weight * (heat.absorptivity - shades[:, j]) / (shades[:, k] - shades[:, j])
+            kelvin += weight[:, None] * solved[:, face, k].T
+        return torch.where((heat.face < 0)[:, None], self.preset.ambient_c, kelvin - KELVIN_AT_0_C)
+
+    def warmth(self, points: Tensor, which: Tensor, surface: Surface) -> Tensor:
+        """Temperature [n] at noon of the first day, which differs between faces and shades."""
+        return self.celsius(self.heat_at(points, which), torch.tensor([0.45 * DAY_S], dtype=torch.float64))[:, 0]
+
+    def attributes(self, points: Tensor) -> dict[str, Tensor]:
+        """True properties [n] of the surface nearest to each of ``points`` [n, 3], by name with unit."""
+        on_surface, which = self.nearest(points)
+        materials = [surface.material for surface in self.preset.surfaces]
+        wind = float(self.weather.wind_m_s.mean())
+
+        def by_surface(value) -> Tensor:
+            return torch.tensor([value(m) for m in materials], dtype=torch.float64)[which]
+
+        return {
+            "absorptivity": self.heat_at(on_surface, which).absorptivity,
+            "emissivity": by_surface(lambda m: m.emissivity),
+            "convection_w_m2_k": by_surface(lambda m: m.convection_still + m.convection_per_wind * wind),
+            "convection_still_w_m2_k": by_surface(lambda m: m.convection_still),
+            "convection_per_wind_w_s_m3_k": by_surface(lambda m: m.convection_per_wind),
+            "areal_heat_capacity_j_m2_k": by_surface(lambda m: m.areal_heat_capacity),
+            "heat_capacity_j_m3_k": by_surface(lambda m: m.heat_capacity),
+            "depth_m": by_surface(lambda m: m.depth_m),
+            "biot": by_surface(lambda m: m.biot(wind)),
+        }
+
+    def labels(self, points: Tensor) -> Tensor:
+        """Class [n] int64 of the surface nearest to each of ``points`` [n, 3], a position in ``CLASSES``."""
+        _, which = self.nearest(points)
+        return torch.tensor([self.preset.labels.index(surface.label) for surface in self.preset.surfaces])[which]
+
+    def route(self, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
+        """Times [F] and world-to-camera matrices [F, 4, 4] of a drone: two thirds of the frames on the first day.
+
+        Successive frames look from directions 137.5° apart, so that every part of a day sees every side.
+        """
+        first = training_frames(frames)
+        jitter = torch.rand(frames, generator=generator_for(seed, 0, "flight times"), dtype=torch.float64).numpy()
+        slot = np.concatenate([np.arange(first) / first, 1.0 + np.arange(frames - first) / (frames - first)])
+        width = np.where(np.arange(frames) < first, 1.0 / first, 1.0 / (frames - first))
+        times = np.round(DAY_S * (slot + width * (0.2 + 0.6 * jitter)), 3)
+
+        wobble = torch.rand(frames, 4, generator=generator_for(seed, 0, "flight path"), dtype=torch.float64)
+        number = torch.arange(frames, dtype=torch.float64)
+        azimuth = torch.deg2rad(number * 137.50776 + 25.0 * (wobble[:, 0] - 0.5))
+        elevation = torch.deg2rad(36.0 + 22.0 * torch.remainder(number * 0.6180339887 + 0.2 * wobble[:, 1], 1.0))
+        radius = 22.0 + 3.0 * (wobble[:, 2] - 0.5)
+        aim = torch.tensor([0.0, -1.5, 1.5], dtype=torch.float64).expand(frames, 3)
+        flat = radius * torch.cos(elevation)
+        center = aim + torch.stack([flat * azimuth.sin(), -flat * azimuth.cos(), radius * elevation.sin()], dim=1)
+        forward = torch.nn.functional.normalize(aim - center, dim=1)
+        right = torch.nn.functional.normalize(
+            torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)), dim=1
+        )
+        viewmats = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
+        viewmats[:, :3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+        viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ center[:, :, None])[:, :, 0]
+        return times, viewmats
+
+
+def training_frames(frames: int) -> int:
+    """How many of a record's frames are taken on the first day: two thirds, and at least one on the second."""
+    return min(frames - frames // 3, frames - 1)
+
+
+@cache
+def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
+    """Surface temperatures of all faces in all their shades; every weather starts from the same midnight."""
+    slabs, normals = [], []
+    for surface in surfaces:
+        for normal in _normals(surface.shape):
+            slabs += [Slab(surface.material, float(a), len(normals)) for a in _shades(surface.absorbs)]
+            normals.append(normal)
+    before = forcing_of(outdoor_weather(SKIES["fair"], -_BEFORE_S, 0.0), np.array(normals))
+    # How the surfaces got to their state at midnight need not be converged: it defines the start.
+    midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=3).states_k
+    return solve(slabs, forcing_of(outdoor_weather(SKIES[weather]), np.array(normals)), midnight)
+
+
+def _normals(shape: Box | Plane) -> list[tuple[float, float, float]]:
+    """Outward normals of the flat faces of a shape that do not look down; those that do touch the ground."""
+    if isinstance(shape, Plane):
+        return [shape.normal]
+    turn = shape._turn()
+    return [
+        tuple(side * turn[:, axis].numpy()) for axis in range(3) for side in (1.0, -1.0) if side * turn[2, axis] > -0.5
+    ]
+
+
+def _shades(absorbs: Pattern) -> Tensor:
+    """The absorptivities [3] between which a face's temperature is interpolated: those of Chebyshev over its range."""
+    reach = absorbs.swing + absorbs.step
+    return absorbs.level + reach * torch.cos(math.pi * (torch.arange(3, dtype=torch.float64) + 0.5) / 3)
+
+
+def in_weather(preset: OutdoorPreset, weather: str | None) -> OutdoorPreset:
+    """The preset under another of its skies; None leaves it as it is."""
+    return preset if weather is None else replace(preset, weather=weather)
