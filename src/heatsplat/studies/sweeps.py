@@ -1,0 +1,199 @@
+"""What the jobs of a sweep found: one table with means, spreads and costs, and one picture of quality against seconds."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from matplotlib.figure import Figure
+
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+
+TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
+FAILED = "FAILED"
+# Scores and costs in the table, where any job has them, with heading and digits.
+SCORES = {
+    "psnr": ("PSNR (dB)", 2),
+    "ssim": ("SSIM", 4),
+    "mae_c": ("MAE (°C)", 3),
+    "clean_psnr": ("clean PSNR (dB)", 2),
+    "clean_mae_c": ("clean MAE (°C)", 3),
+    "rgb_psnr": ("RGB PSNR (dB)", 2),
+}
+COSTS = {
+    "train_seconds": ("train (s)", 1),
+    "peak_memory_mb": ("memory (MB)", 0),
+    "gaussians": ("Gaussians", 0),
+    "render_fps": ("frames/s", 0),
+}
+# Overrides that tell repetitions and places apart and not rows.
+NOT_A_ROW = ("seed", "row", "data", "data.root", "data.scene", "method", "trainer", "launcher", "callbacks", "logger")
+
+
+@dataclass
+class Row:
+    """The jobs of one row on one scene.
+
+    Args:
+        name: of the row.
+        scene: on which they ran.
+        values: score or cost -> its values, one per job that has it.
+        jobs: how many have results.
+        failed: first lines of why the others have none.
+    """
+
+    name: str
+    scene: str
+    values: dict[str, list[float]] = field(default_factory=dict)
+    jobs: int = 0
+    failed: list[str] = field(default_factory=list)
+
+    def mean(self, name: str) -> float | None:
+        """Mean over the jobs, None where none has the value."""
+        return statistics.fmean(self.values[name]) if self.values.get(name) else None
+
+    def spread(self, name: str) -> float | None:
+        """Standard deviation over the jobs (n - 1), None for fewer than two."""
+        return statistics.stdev(self.values[name]) if len(self.values.get(name, ())) > 1 else None
+
+
+def write_sweep(folder: Path, order: Sequence[str] = (), paper: Mapping[str, str] | None = None) -> list[Path]:
+    """Writes table.md, table.csv and table.png into a sweep's folder, and returns their paths; none without jobs.
+
+    Args:
+        folder: the sweep's folder, in which every job has its own.
+        order: names of rows in the order of the table; others follow as they come.
+        paper: what a paper prints for a row, by name of row.
+    """
+    rows = collect(folder)
+    if not rows:
+        return []
+    place = {name: i for i, name in enumerate(order)}
+    rows.sort(key=lambda row: (row.scene, place.get(row.name, len(place))))
+    write_atomically(folder / TABLE_FILE, markdown(rows, paper or {}))
+    write_atomically(folder / CSV_FILE, table_csv(rows, paper or {}))
+    written = [folder / TABLE_FILE, folder / CSV_FILE]
+    figure = picture(rows)
+    if figure is not None:
+        write_png(folder / PICTURE_FILE, figure_picture(figure))
+        written.append(folder / PICTURE_FILE)
+    return written
+
+
+def collect(folder: Path) -> list[Row]:
+    """The rows of a sweep's folder, in the order of its jobs."""
+    rows: dict[tuple[str, str], Row] = {}
+    jobs = sorted(path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml"))
+    for job in sorted(jobs, key=_number):
+        overrides = dict(text.partition("=")[::2] for text in _yaml(job, "overrides"))
+        name = overrides.get("row", "").strip("'\"") or row_name(overrides)
+        file = job / METRICS_FILE
+        results = RunResults.read(file) if file.exists() else None
+        config = _yaml(job, "config")
+        scene = str(results.run["scene"] if results else ((config.get("data") or {}).get("scene") or "?"))
+        row = rows.setdefault((scene, name), Row(name, scene))
+        if results is None:
+            row.failed.append(_reason(job))
+            continue
+        row.jobs += 1
+        for key, value in (results.test | results.cost).items():
+            if value is not None and math.isfinite(value):
+                row.values.setdefault(key, []).append(value)
+    return list(rows.values())
+
+
+def row_name(overrides: Mapping[str, str]) -> str:
+    """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
+    method = [overrides["method"]] if "method" in overrides else []
+    return " ".join([*method, *(f"{key}={value}" for key, value in overrides.items() if key not in NOT_A_ROW)]) or "run"
+
+
+def _yaml(job: Path, name: str) -> Any:
+    """What Hydra wrote down of a job: its "overrides" or its "config"."""
+    return yaml.safe_load((job / ".hydra" / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+
+
+def _number(job: Path) -> tuple[int, str]:
+    """Hydra's number of a job, which is part of its folder's name."""
+    numbers = [int(part) for part in job.name.split("_") if part.isdigit()]
+    return (numbers[-1] if numbers else 0, job.name)
+
+
+def _reason(job: Path) -> str:
+    """Why a job has no result: the last line of its FAILED file."""
+    if not (job / FAILED).exists():
+        return "not finished"
+    lines = [line for line in (job / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
+    return lines[-1].strip() if lines else "failed"
+
+
+def _columns(rows: Iterable[Row]) -> dict[str, tuple[str, int]]:
+    return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in row.values for row in rows)}
+
+
+def markdown(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
+    """The table for people: mean ± standard deviation over the seeds."""
+    columns = _columns(rows)
+    several = len({row.scene for row in rows}) > 1
+    head = [*(["scene"] if several else []), "row", "runs", *(title for title, _ in columns.values())]
+    head += ["paper"] if paper else []
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        cells = [*([row.scene] if several else []), row.name, str(row.jobs)]
+        for name, (_, digits) in columns.items():
+            mean, spread = row.mean(name), row.spread(name)
+            text = "–" if mean is None else f"{mean:,.{digits}f}"
+            cells.append(text if spread is None else f"{text} ± {spread:,.{digits}f}")
+        cells += [paper.get(row.name, "–")] if paper else []
+        lines.append("| " + " | ".join(cells) + " |")
+    failed = [f"- {row.name} on {row.scene}: {reason}" for row in rows for reason in row.failed]
+    if failed:
+        lines += ["", f"Jobs without a result: {len(failed)}", "", *failed]
+    scenes = ", ".join(sorted({row.scene for row in rows}))
+    return "\n".join([f"# Sweep on {scenes}", "", "Mean ± standard deviation over seeds.", "", *lines, ""])
+
+
+def table_csv(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
+    """The table for programs: full precision, mean and standard deviation in columns of their own."""
+    columns = _columns(rows)
+    spread = [f"{name}_std" for name in columns]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, ["scene", "row", "runs", "failed", *columns, *spread, "paper"], lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        numbers = {name: row.mean(name) for name in columns} | {f"{name}_std": row.spread(name) for name in columns}
+        counts = {"scene": row.scene, "row": row.name, "runs": row.jobs, "failed": len(row.failed)}
+        writer.writerow(counts | numbers | {"paper": paper.get(row.name)})
+    return text.getvalue()
+
+
+def picture(rows: Sequence[Row]) -> Figure | None:
+    """PSNR and MAE against seconds of training, a mark per row with its spread; None without such values."""
+    shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
+    if not shown or not any(row.mean("train_seconds") for row in rows):
+        return None
+    several = len({row.scene for row in rows}) > 1
+    figure = Figure(figsize=(5.2 * len(shown), 4.2), dpi=110, layout="constrained")
+    for i, name in enumerate(shown):
+        axes = figure.add_subplot(1, len(shown), i + 1)
+        for j, row in enumerate(rows):
+            x, y = row.mean("train_seconds"), row.mean(name)
+            if x is not None and y is not None:
+                label = f"{row.name}, {row.scene}" if several else row.name
+                axes.errorbar(
+                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, "os^Dv"[j // 10 % 5], color=f"C{j % 10}",
+                    capsize=2, markersize=6, label=label,
+                )  # fmt: skip
+        axes.set(xlabel="seconds of training", ylabel=f"{SCORES[name][0]}, test")
+        axes.grid(alpha=0.25)
+        if i == 0:
+            axes.legend(fontsize=7)
+    return figure

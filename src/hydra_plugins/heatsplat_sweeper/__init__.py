@@ -1,0 +1,1 @@
+"""Hydra looks for sweepers in this namespace."""
