@@ -10,7 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -30,7 +30,17 @@ from datamodules.formats.images import (
 )
 from datamodules.formats.lens import Lens
 from datamodules.splits import SplitRule
-from heatsplat.contracts import Camera, Environment, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.contracts import (
+    Camera,
+    Environment,
+    Frame,
+    SceneData,
+    SceneError,
+    ThermalRange,
+    View,
+    ViewSet,
+    Weather,
+)
 
 log = logging.getLogger(__name__)
 
@@ -118,12 +128,16 @@ def build_scene(
     counts: Counts | None = None,
     ambient_c: float | None = None,
     metres_per_unit: float | None = None,
+    weather: Weather | None = None,
+    labels: np.ndarray | None = None,
+    point_features: np.ndarray | None = None,
     downscale: float = 1.0,
     thermal_channels: int = 1,
     alpha_mask: bool = False,
     notes: Mapping[str, Any] | None = None,
     probes: np.ndarray | None = None,
     truth: Callable[[Tensor, Tensor], Tensor] | None = None,
+    true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None,
 ) -> SceneData:
     """The scene of raw frames and points, in heatsplat's conventions; every assumption stands in its notes.
 
@@ -140,12 +154,16 @@ def build_scene(
         counts: map from stored numbers to °C, for raw sensor data; None when integers span their type.
         ambient_c: temperature of the surroundings, or None.
         metres_per_unit: scale of the world, or None.
+        weather: the weather on the clock of ``frames``, or None; frames without an environment get theirs from it.
+        labels: [P] class of each point, or None.
+        point_features: [P, D] features of each point, or None.
         downscale: factor >= 1; images become round(W / d) x round(H / d) by area averages.
         thermal_channels: 1, or 3 to keep pseudo-colour (which has no temperature: the range is dropped).
         alpha_mask: True to leave out pixels whose alpha is below one half; otherwise alpha is ignored.
         notes: what the loader found, kept and added to.
         probes: [n, 3] in the same world as ``points``, or None.
         truth: function (points [n, 3], times [F]) -> °C [n, F] in the world and on the clock of ``frames``, or None.
+        true_attributes: function (points [n, 3]) -> properties by name, each [n], in the same world, or None.
 
     Raises:
         SceneError: something cannot be used as it is.
@@ -174,8 +192,16 @@ def build_scene(
     if left_out := len(frames) - len(set(train) | set(test)):
         notes["split_left_out"] = f"{left_out} frames are in neither list and are not used"
 
+    kept = np.isfinite(np.asarray(points, dtype=np.float64).reshape(-1, 3)).all(axis=1)
+    labels = _of_points("labels", labels, kept)
+    point_features = _of_points("point_features", point_features, kept)
     points, point_colors, point_notes = _checked_points(name, points, point_colors)
     notes |= point_notes
+    if weather is not None:
+        if times is None:
+            raise SceneError(f"scene {name} has weather, but its frames have no times: which weather belongs to which?")
+        weather = on_clock(weather, first_s)
+        notes |= {f"weather_{key}": value for key, value in weather.notes.items()}
     origin = _origin_of(frames, points)
     if origin.any():
         notes["origin"] = origin.tolist()
@@ -215,7 +241,10 @@ def build_scene(
         viewmat[:3, 3] += viewmat[:3, :3] @ origin
         camera = Camera(torch.from_numpy(viewmat), torch.from_numpy(p.lens.matrix()), p.lens.width, p.lens.height)
         time_s = None if times is None else times[i] - first_s
-        frame = Frame(name=raw.name, frame_id=i, camera=camera, time_s=time_s, environment=raw.environment)
+        environment = raw.environment
+        if weather is not None and environment is None:
+            environment = weather_of(raw.name, weather, time_s)
+        frame = Frame(name=raw.name, frame_id=i, camera=camera, time_s=time_s, environment=environment)
         zero, full = _scaling(p.thermal.dtype, counts, thermal_range)
         stored[i] = _Stored(frame, p.thermal, p.rgb, p.mask, zero, full, thermal_channels)
     if counts:
@@ -240,10 +269,42 @@ def build_scene(
         thermal_range=thermal_range,
         ambient_c=ambient_c,
         metres_per_unit=metres_per_unit,
+        weather=weather,
+        labels=None if labels is None else torch.from_numpy(labels.astype(np.int64)),
+        point_features=None if point_features is None else torch.from_numpy(point_features.astype(np.float32)),
         notes=notes,
         probes=None if probes is None else torch.from_numpy((probes - origin).astype(np.float32)),
         truth=truth and (lambda where, when: truth(where + shift.to(where), when + (first_s or 0.0))),
+        true_attributes=true_attributes and (lambda where: true_attributes(where + shift.to(where))),
     )
+
+
+def on_clock(weather: Weather, zero_s: float) -> Weather:
+    """The weather with ``zero_s`` of its clock as its new second 0."""
+    notes = dict(weather.notes)
+    if "utc_at_zero_s" in notes:
+        notes["utc_at_zero_s"] += zero_s
+    return replace(weather, times_s=weather.times_s - zero_s, notes=notes)
+
+
+def weather_of(name: str, weather: Weather, time_s: float) -> Environment:
+    """The weather at the time of a frame. Raises SceneError naming the frame where the record does not reach it."""
+    try:
+        return weather.at(time_s)
+    except SceneError as error:
+        raise SceneError(f"frame {name}: {error}") from error
+
+
+def _of_points(what: str, values: np.ndarray | None, kept: np.ndarray) -> np.ndarray | None:
+    """The rows of a table of points that belong to finite ones. Raises SceneError when it is of another length."""
+    if values is None:
+        return None
+    if len(values) != len(kept):
+        raise SceneError(
+            f"data.{what}: there are {len(values)} rows for {len(kept)} points; one for each point of the scene is "
+            "needed, in the order of the points"
+        )
+    return np.asarray(values)[kept]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ import torch
 from datamodules.assemble import RawFrame
 from datamodules.base import SceneDataModule
 from datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
+from datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
 from datamodules.synthetic_scene.presets import PRESETS
 from datamodules.synthetic_scene.scene import Scene
 from heatsplat.contracts import SceneData, SceneError, View, ViewSet
@@ -21,13 +23,15 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: name of a preset: static, cooling, heated, glass, ... (``datamodules.synthetic_scene.presets``).
+        scene: name of a preset: static, cooling, heated, glass, ... (``datamodules.synthetic_scene.presets``), or outdoor.
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
+        weather: of outdoor: fair (None), calm, windy or overcast; all start from the same midnight.
+        split: a rule, or None for the preset's own: day 1 against day 2 outdoors, every 8th frame elsewhere.
         root: not used; the name is there so that every data set takes the same keys.
-        **options: of ``SceneDataModule``: downscale, split, seed, ...
+        **options: of ``SceneDataModule``: downscale, seed, ...
     """
 
     def __init__(
@@ -38,14 +42,20 @@ class Synthetic(SceneDataModule):
         frames: int | None = None,
         noise_k: float = 0.05,
         scene_seed: int = 0,
+        weather: str | None = None,
+        split: str | None = None,
         root: str | None = None,
         **options,
     ) -> None:
-        super().__init__(root=root, scene=scene, **options)
-        if scene not in PRESETS:
-            raise SceneError(
-                f"data.scene={scene}: there is no such synthetic preset; choose one of {', '.join(PRESETS)}"
-            )
+        own_split = "json" if scene in OUTDOOR else "every_8th"
+        super().__init__(root=root, scene=scene, split=split or own_split, **options)
+        if scene not in PRESETS and scene not in OUTDOOR:
+            known = ", ".join((*PRESETS, *OUTDOOR))
+            raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
+        if weather is not None and scene not in OUTDOOR:
+            raise SceneError(f"data.weather={weather}: scene '{scene}' lies in a room without weather; leave it null")
+        if weather is not None and weather not in SKIES:
+            raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
         if size not in SIZES:
             raise SceneError(f"data.size={size}: choose one of {', '.join(SIZES)}")
         if frames is not None and frames < 2:
@@ -55,11 +65,14 @@ class Synthetic(SceneDataModule):
         self.size = SIZES[size] if frames is None else replace(SIZES[size], frames=frames)
         self.noise_k = noise_k
         self.scene_seed = scene_seed
+        self.weather = weather
 
     def load(self) -> SceneData:
         """The recording as a scene; its truth and probes come from the solver."""
-        recording = film(Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
-        preset = recording.scene.preset
+        outdoors = self.scene_name in OUTDOOR
+        world = OutdoorScene(in_weather(OUTDOOR[self.scene_name], self.weather)) if outdoors else None
+        recording = film(world or Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
+        preset, count = recording.scene.preset, len(recording.times_s)
         with own_threads():
             probes, probe_names = probe_points(recording)
         scene = self.finish(
@@ -72,6 +85,7 @@ class Synthetic(SceneDataModule):
                     read=partial(recording.grey, frame, np.uint16),
                     read_rgb=partial(recording.rgb.__getitem__, frame),
                     time_s=float(time_s),
+                    subset="train" if frame < training_frames(count) else "test",
                 )
                 for frame, time_s in enumerate(recording.times_s)
             ],
@@ -83,16 +97,24 @@ class Synthetic(SceneDataModule):
             notes={
                 "source": f"synthetic preset {self.scene_name}, scene_seed {self.scene_seed}",
                 "noise_k": self.noise_k,
-                "heat": (
-                    f"conduction into {len(recording.scene.materials)} materials by implicit finite volumes, converged "
-                    f"to {1e3 * recording.scene.responses.error:.2f} mK; linear exchange with the surroundings"
-                ),
+                "heat": recording.scene.how_solved(),
                 "probes": probe_names,
             },
             probes=probes,
             truth=recording.scene.truth,
+            **(_of_the_yard(world, recording) if outdoors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
+
+
+def _of_the_yard(world: OutdoorScene, recording: Recording) -> dict[str, Any]:
+    """What is known of an outdoor scene besides: its weather, the classes of its points, their true properties."""
+    on_surface, which = world.nearest(torch.from_numpy(recording.points))
+    return {
+        "weather": world.weather,
+        "labels": world.labels(on_surface).numpy(),
+        "true_attributes": world.attributes,
+    }
 
 
 def _with_clean(scene: SceneData, recording: Recording) -> SceneData:
@@ -119,19 +141,18 @@ def probe_points(recording: Recording) -> tuple[np.ndarray, list[str]]:
 
     A probe stands where its neighbourhood is as warm as itself, so that a model is not judged by which side of a border
     its nearest Gaussian lies on: of the sparse points of a surface, moved onto it, the fifth with the least change of
-    start and flux within 4 cm are taken, and of these the one nearest to the middle of the surface.
+    warmth within 4 cm (outdoors 25 cm) are taken, and of these the one nearest to the middle of the surface.
     """
     scene = recording.scene
     on_surface, which = scene.nearest(torch.from_numpy(recording.points))
-    around = 0.04 * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 3)
+    around = scene.probe_reach_m * torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * 3)
     probes, names = [], []
     for number, surface in enumerate(scene.preset.surfaces):
         own = on_surface[which == number]
         if not len(own):
             continue
         near, near_which = scene.nearest((own[:, None] + around).reshape(-1, 3))
-        heat = scene.heat_at(near, near_which)
-        warmth = heat.start_k + heat.flux_w_m2 / surface.material.exchange
+        warmth = scene.warmth(near, near_which, surface)
         change = warmth.reshape(len(own), -1).std(dim=1)
         elsewhere = (near_which.reshape(len(own), -1) != number).any(1)
         order = (change + elsewhere * change.max().clamp_min(1.0)).argsort()

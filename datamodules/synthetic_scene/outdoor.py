@@ -164,41 +164,29 @@ class OutdoorPreset(Preset):
     duration_s: float = DURATION_S
     ambient_c: float = 18.0
     weather: str = "fair"
-    bounds_c: tuple[float, float] = (0.0, 80.0)
+    bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES
 
 
 OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}
 
 
-def outdoor_weather(sky: Sky, start_s: float = 0.0, end_s: float = DURATION_S) -> Weather:
-    """The weather of a sky every ten minutes, on the clock of the record; the same bits on every call.
+def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) -> Weather:
+    """The weather of a sky in ``SKIES`` every ten minutes, on the clock of the record; the same bits on every call.
+
+    Another sky than "fair" takes over from it within the first hour of the record, so that all begin alike.
 
     Breeze and clouds are sums of slow waves of random phase. Clouds of cover c let 1 - 0.75 c^3.4 of the clear sky's
     light pass (Kasten and Czeplak 1980); what passes is split into sun and sky as a measured irradiance would be.
     """
     times = np.arange(start_s, end_s + 0.5 * SAMPLE_S, SAMPLE_S)
-    hours = times / 3600.0
-    solar_hours = hours + SITE.longitude / 15.0
-
-    def drift(purpose: str, periods_h: tuple[float, ...]) -> np.ndarray:
-        phases = torch.rand(len(periods_h), generator=generator_for(0, 0, f"outdoor {purpose}"), dtype=torch.float64)
-        waves = [
-            np.sin(2.0 * np.pi * (hours / period + phase))
-            for period, phase in zip(periods_h, phases.tolist(), strict=True)
-        ]
-        return np.mean(waves, axis=0)
-
-    day = np.cos(2.0 * np.pi * (solar_hours - 15.0) / 24.0)
-    second_harmonic = 0.15 * np.cos(4.0 * np.pi * (solar_hours - 14.0) / 24.0)
-    air = sky.warm_c + sky.swing_k * (day + second_harmonic) + 1.2 * drift("air", (31.0, 9.0, 3.7)) + hours / 24.0
-    dew_point = sky.dew_point_c + 1.5 * drift("moisture", (40.0, 11.0))
-    humidity = np.clip(100.0 * _vapour_hpa(dew_point) / _vapour_hpa(air), 5.0, 100.0)
-    breeze = 2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
-    wind = np.clip(breeze, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
-    cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
+    air, wind, humidity, passing = _series(SKIES["fair"], times)
+    if name != "fair":
+        share = np.clip(times / 3600.0, 0.0, 1.0)
+        pairs = zip((air, wind, humidity, passing), _series(SKIES[name], times), strict=True)
+        air, wind, humidity, passing = (fair + share * (other - fair) for fair, other in pairs)
     utc_s = START_UTC_S + times
-    irradiance = clear_sky(SITE, utc_s) * (1.0 - 0.75 * cover**3.4)
+    irradiance = clear_sky(SITE, utc_s) * passing
     direct, diffuse = split_irradiance(SITE, utc_s, irradiance)
     return Weather(
         times_s=torch.from_numpy(times),
@@ -206,11 +194,45 @@ def outdoor_weather(sky: Sky, start_s: float = 0.0, end_s: float = DURATION_S) -
         wind_m_s=torch.from_numpy(wind),
         humidity_percent=torch.from_numpy(humidity),
         irradiance_w_m2=torch.from_numpy(irradiance),
-        pressure_hpa=torch.from_numpy(955.0 + 4.0 * drift("pressure", (53.0, 23.0))),
+        pressure_hpa=torch.from_numpy(955.0 + 4.0 * _drift("pressure", times, (53.0, 23.0))),
         direct_w_m2=torch.from_numpy(direct),
         diffuse_w_m2=torch.from_numpy(diffuse),
         sun=torch.from_numpy(sun_directions(SITE, utc_s)),
+        notes={
+            "source": f"made up: {name}",
+            "latitude": SITE.latitude,
+            "longitude": SITE.longitude,
+            "altitude_m": SITE.altitude_m,
+            "up": list(SITE.up),
+            "north": list(SITE.north),
+            "utc_at_zero_s": START_UTC_S,
+        },
     )
+
+
+def _drift(purpose: str, times_s: np.ndarray, periods_h: tuple[float, ...]) -> np.ndarray:
+    """Slow waves [T] of random phase, their mean, in [-1, 1]."""
+    phases = torch.rand(len(periods_h), generator=generator_for(0, 0, f"outdoor {purpose}"), dtype=torch.float64)
+    periods = zip(periods_h, phases.tolist(), strict=True)
+    return np.mean([np.sin(2.0 * np.pi * (times_s / 3600.0 / period + phase)) for period, phase in periods], axis=0)
+
+
+def _series(sky: Sky, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Air in °C, wind in m/s, humidity in % and the share of light that clouds let pass, each [T]."""
+    solar_hours = times_s / 3600.0 + SITE.longitude / 15.0
+
+    def drift(purpose: str, periods_h: tuple[float, ...]) -> np.ndarray:
+        return _drift(purpose, times_s, periods_h)
+
+    day = np.cos(2.0 * np.pi * (solar_hours - 15.0) / 24.0)
+    second_harmonic = 0.15 * np.cos(4.0 * np.pi * (solar_hours - 14.0) / 24.0)
+    air = sky.warm_c + sky.swing_k * (day + second_harmonic) + 1.2 * drift("air", (31.0, 9.0, 3.7)) + times_s / DAY_S
+    dew_point = sky.dew_point_c + 1.5 * drift("moisture", (40.0, 11.0))
+    humidity = np.clip(100.0 * _vapour_hpa(dew_point) / _vapour_hpa(air), 5.0, 100.0)
+    breeze = 2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
+    wind = np.clip(breeze, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
+    cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
+    return air, wind, humidity, 1.0 - 0.75 * cover**3.4
 
 
 def _vapour_hpa(celsius: np.ndarray) -> np.ndarray:
@@ -267,7 +289,7 @@ class OutdoorScene(Scene):
         self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
-        self.weather = outdoor_weather(SKIES[preset.weather])
+        self.weather = outdoor_weather(preset.weather)
         # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
         faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
         self.face_surface = torch.tensor([number for number, _ in faces])
@@ -303,6 +325,13 @@ class OutdoorScene(Scene):
                     weight = weight * (heat.absorptivity - shades[:, j]) / (shades[:, k] - shades[:, j])
             kelvin += weight[:, None] * solved[:, face, k].T
         return torch.where((heat.face < 0)[:, None], self.preset.ambient_c, kelvin - KELVIN_AT_0_C)
+
+    def how_solved(self) -> str:
+        return (
+            f"conduction into {len(self.materials)} materials by implicit finite volumes (grids differ by "
+            f"{1e3 * self.history.error_k:.0f} mK before extrapolation), sun by orientation without cast shadows, wind, "
+            f"long waves of a clear sky; weather: {self.preset.weather}"
+        )
 
     def warmth(self, points: Tensor, which: Tensor, surface: Surface) -> Tensor:
         """Temperature [n] at noon of the first day, which differs between faces and shades."""
@@ -376,10 +405,10 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
         for normal in _normals(surface.shape):
             slabs += [Slab(surface.material, float(a), len(normals)) for a in _shades(surface.absorbs)]
             normals.append(normal)
-    before = forcing_of(outdoor_weather(SKIES["fair"], -_BEFORE_S, 0.0), np.array(normals))
+    before = forcing_of(outdoor_weather("fair", -_BEFORE_S, 0.0), np.array(normals))
     # How the surfaces got to their state at midnight need not be converged: it defines the start.
     midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=3).states_k
-    return solve(slabs, forcing_of(outdoor_weather(SKIES[weather]), np.array(normals)), midnight)
+    return solve(slabs, forcing_of(outdoor_weather(weather), np.array(normals)), midnight)
 
 
 def _normals(shape: Box | Plane) -> list[tuple[float, float, float]]:

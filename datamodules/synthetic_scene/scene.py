@@ -131,6 +131,13 @@ class Scene:
         rise = of_point[..., 0] * surface.start_k + of_point[..., 1] * surface.flux_w_m2
         return self.preset.ambient_c + rise.T
 
+    def how_solved(self) -> str:
+        """A sentence about the truth, for reports."""
+        return (
+            f"conduction into {len(self.materials)} materials by implicit finite volumes, converged to "
+            f"{1e3 * self.responses.error:.2f} mK; linear exchange with the surroundings"
+        )
+
     def warmth(self, points: Tensor, which: Tensor, surface: Surface) -> Tensor:
         """What tells points [n, 3] of ``surface`` apart that warm differently: start and flux, in kelvin [n]."""
         heat = self.heat_at(points, which)

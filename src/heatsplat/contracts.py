@@ -286,6 +286,8 @@ class SceneData:
         notes: what the loader found and assumed, for the report: name -> value or sentence.
         probes: scene points [n, 3] whose temperature over time is drawn, or None to let the training choose.
         truth: function (points [n, 3], times_s [F]) -> °C [n, F] on synthetic scenes, or None.
+        true_attributes: function (points [n, 3]) -> properties of the surface there by name with unit, each [n], on
+            synthetic scenes, or None.
     """
 
     name: str
@@ -303,6 +305,7 @@ class SceneData:
     notes: dict[str, Any] = field(default_factory=dict)
     probes: Tensor | None = None
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
+    true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
 
     @property
     def extent(self) -> float:
