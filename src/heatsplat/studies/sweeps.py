@@ -97,8 +97,7 @@ def collect(folder: Path) -> list[Row]:
         name = overrides.get("row", "").strip("'\"") or row_name(overrides)
         file = job / METRICS_FILE
         results = RunResults.read(file) if file.exists() else None
-        config = _yaml(job, "config")
-        scene = str(results.run["scene"] if results else ((config.get("data") or {}).get("scene") or "?"))
+        scene = str(results.run["scene"]) if results else _scene(_yaml(job, "config"))
         row = rows.setdefault((scene, name), Row(name, scene))
         if results is None:
             row.failed.append(_reason(job))
@@ -119,6 +118,12 @@ def row_name(overrides: Mapping[str, str]) -> str:
 def _yaml(job: Path, name: str) -> Any:
     """What Hydra wrote down of a job: its "overrides" or its "config"."""
     return yaml.safe_load((job / ".hydra" / f"{name}.yaml").read_text(encoding="utf-8")) or {}
+
+
+def _scene(config: Mapping[str, Any]) -> str:
+    """The scene that a job was told; a method's own synthetic preset is a reference to another key."""
+    scene = str((config.get("data") or {}).get("scene") or "?")
+    return str(config.get(scene[2:-1], scene)) if scene.startswith("${") else scene
 
 
 def _number(job: Path) -> tuple[int, str]:
