@@ -571,6 +571,15 @@ def test_needles_and_pancakes(backend, shape, scales, antialiased):
         assert relative(actual.gradients[name], expected.gradients[name]) < 1e-2, name
 
 
+@pytest.mark.parametrize("scales", [(50.0, 1e-3, 1e-3), (5.0, 4.0, 1e-4)], ids=["needles", "pancakes"])
+def test_all_gradients_of_axis_ratios_of_50_000(backend, scales):
+    generator = generator_for(3, 0, "needles")
+    quats = torch.randn(30, 4, generator=generator, dtype=torch.float64)
+    means = torch.rand(30, 3, generator=generator, dtype=torch.float64) * 2 - torch.tensor([1.0, 1.0, -2.0])
+    scene = facing(means.tolist(), scales, 0.7, quats)
+    assert_close(run(backend, scene), oracle(scene), 1e-4, 1e-2)
+
+
 def test_discs_seen_from_the_edge(backend):
     # Discs in planes through the camera: the projection is a line, its determinant is 0 without the blur.
     for antialiased in (False, True):

@@ -1,4 +1,4 @@
-"""What the processor can do at most: the rate of multiply-adds on sixteen lanes, against which kernels are judged."""
+"""What the processor can do at most: the rates of multiply-adds and of memory, against which kernels are judged."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from heatsplat.kernels.simd import LANES, load, store
 _CHAINS = 8  # independent sums, enough to hide the latency of one multiply-add
 
 
-def vector_rate(threads: int, repeats: int = 5) -> float:
+def vector_rate(threads: int, repeats: int = 100) -> float:
     """Multiply-adds on sixteen floats per second, measured over ``threads`` threads; the best of ``repeats``."""
     use_threads(threads)
-    rounds = 2_000_000
+    rounds = 200_000  # half a millisecond, which a busy machine grants to all threads at once now and then
     values = np.full((threads, (2 * _CHAINS + 1) * LANES), 0.5, np.float32)
     _multiply_add(values, 1)
     best = np.inf
@@ -39,3 +39,24 @@ def _multiply_add(values, rounds):
             a, b, c, d = a * factor + factor, b * factor + factor, c * factor + factor, d * factor + factor
             e, f, g, h = e * factor + factor, f * factor + factor, g * factor + factor, h * factor + factor
         store(own, 8 * LANES, a + b + c + d + e + f + g + h)
+
+
+def memory_rate(threads: int, repeats: int = 10) -> float:
+    """Bytes per second to and from memory, measured by doubling numbers in place; the best of ``repeats``."""
+    use_threads(threads)
+    numbers = np.zeros(32 * 2**20, np.float32)  # 128 MB, more than any cache it should not measure
+    _double(numbers)
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        _double(numbers)
+        best = min(best, time.perf_counter() - start)
+    return 2 * numbers.nbytes / best
+
+
+@kernel
+def _double(numbers):
+    share = 2**14
+    for block in numba.prange(numbers.shape[0] // share):
+        for k in range(block * share, (block + 1) * share, LANES):
+            store(numbers, k, load(numbers, k) * np.float32(2.0))

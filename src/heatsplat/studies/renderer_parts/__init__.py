@@ -1,0 +1,1 @@
+"""What the renderer study is made of: scenes, peers, floors, training steps, memory, tables and pictures."""

@@ -1,0 +1,149 @@
+"""The renderer study's results as CSV, Markdown and a picture."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+
+from heatsplat.studies.renderer_parts.floors import Machine
+
+log = logging.getLogger("heatsplat")
+
+Row = dict[str, Any]
+
+
+def write(tables: dict[str, list[Row]], output_dir: Path, machines: dict[int, Machine]) -> None:
+    """``renderer.md`` with all tables, a CSV file of each, and ``renderer.png``."""
+    for name, rows in tables.items():
+        if rows:
+            _write_csv(rows, output_dir / f"{name}.csv")
+    text = _markdown(tables, machines)
+    (output_dir / "renderer.md").write_text(text, encoding="utf-8")
+    log.info("%s", text)
+    _picture(tables["renderer"], output_dir / "renderer.png")
+
+
+def _write_csv(rows: list[Row], path: Path) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str:
+    rates = "; ".join(
+        f"{count} thread(s): {machine.vectors / 1e9:.1f} G multiply-adds on 16 lanes and {machine.bytes / 1e9:.0f} GB "
+        "a second"
+        for count, machine in machines.items()
+    )
+    lines = ["# The CPU renderer", "", f"Minima in ms, with gradients; floors by {rates}.", ""]
+    lines += _table(
+        ("case", "threads", "forward", "floor", "reached", "backward", "floor", "reached", "load"),
+        (
+            (
+                row["case"], row["threads"], _ms(row["forward_ms"]), _ms(row["floor_forward_ms"]),
+                f"{row['share_forward']:.0%}", _ms(row["backward_ms"]), _ms(row["floor_backward_ms"]),
+                f"{row['share_backward']:.0%}", f"{row['load']:.1f}",
+            )
+            for row in tables["renderer"]
+        ),
+    )  # fmt: skip
+    for name, title in (
+        ("modalities", "Several opacities in one pass"),
+        ("peers", "Peers, three channels"),
+        ("loss", "The loss"),
+        ("memory", "Memory above the parameters, in 10^6 bytes"),
+    ):
+        rows = tables.get(name)
+        if rows:
+            columns = list(dict.fromkeys(key for row in rows for key in row))
+            lines += [f"## {title}", "", *_table(columns, ([_any(row.get(key)) for key in columns] for row in rows))]
+    if tables.get("training"):
+        lines += ["## A training step, part by part", "", *_training_table(tables["training"])]
+    return "\n".join(lines)
+
+
+def _training_table(rows: list[Row]) -> list[str]:
+    """Parts down, runs across; floors in brackets."""
+    parts = [key.removesuffix("_ms") for key in rows[0] if key.endswith("_ms") and not key.startswith("floor_")]
+    columns = ["part", *(f"{row['case']}, {row['method']}" for row in rows)]
+    body = []
+    for part in parts:
+        floors = [row[f"floor_{part}_ms"] for row in rows]
+        cells = [
+            _ms(row[f"{part}_ms"]) + ("" if floor is None else f" ({_ms(floor)})")
+            for row, floor in zip(rows, floors, strict=True)
+        ]
+        body.append([part, *cells])
+    body.append(["ratio", *(f"{row['ratio']:.2f}" for row in rows)])
+    body.append(["load", *(f"{row['load']:.1f}" for row in rows)])
+    return _table(columns, body)
+
+
+def _table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[str]:
+    columns = list(columns)
+    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    return [*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows), ""]
+
+
+def _ms(value: float) -> str:
+    return f"{value:.2f}" if value < 10 else f"{value:.1f}"
+
+
+def _any(value: Any) -> str:
+    if value is None:
+        return ""
+    return (
+        f"{value:.3g}"
+        if isinstance(value, float) and value < 1000
+        else str(value)
+        if isinstance(value, str)
+        else f"{value:.0f}"
+    )
+
+
+def _picture(rows: list[Row], path: Path) -> None:
+    """Forward + backward time against N, pixels and channels; dashed is the floor."""
+    rows = [row for row in rows if row["points"] == "synthetic"]
+    most = max(row["threads"] for row in rows)
+    figure = matplotlib.figure.Figure(figsize=(13, 4.2), layout="constrained")
+    panels = (
+        ("gaussians", "pixels", "Gaussians", "{:,} pixels"),
+        ("pixels", "gaussians", "pixels", "{:,} Gaussians"),
+        ("channels", "threads", "channels", "{} thread(s)"),
+    )
+    for axis, (along, over, label, legend) in zip(figure.subplots(1, 3), panels, strict=True):
+        for k, value in enumerate(sorted({row[over] for row in rows})):
+            line = [row for row in rows if row[over] == value and _belongs(row, along, rows, most)]
+            line.sort(key=lambda row: row[along])
+            if len({row[along] for row in line}) < 2:
+                continue
+            x = [row[along] for row in line]
+            axis.plot(x, [_total(row) for row in line], "o-", color=f"C{k}", label=legend.format(value))
+            axis.plot(x, [_total(row, "floor_") for row in line], "--", color=f"C{k}", lw=1)
+        if along != "channels":
+            axis.set(xscale="log", yscale="log")
+        else:
+            axis.set(xticks=sorted({row["channels"] for row in rows}), ylim=(0, None))
+        axis.set(xlabel=label, ylabel="forward + backward, ms (dashed: floor)")
+        axis.grid(alpha=0.3, which="both")
+        if axis.lines:
+            axis.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+def _belongs(row: Row, along: str, rows: list[Row], most: int) -> bool:
+    """Whether a row is on a line along N or pixels (one channel, all threads), or along channels (the middle case)."""
+    if along != "channels":
+        return row["channels"] == 1 and row["threads"] == most
+    varied = next((other for other in rows if other["channels"] != 1), row)
+    return (row["gaussians"], row["pixels"]) == (varied["gaussians"], varied["pixels"])
+
+
+def _total(row: Row, prefix: str = "") -> float:
+    return row[f"{prefix}forward_ms"] + row[f"{prefix}backward_ms"]
