@@ -28,6 +28,7 @@ class Synthetic(SceneDataModule):
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
+        only: name of a surface; only its pixels count. None: all do.
         weather: of outdoor: fair (None), calm, windy or overcast; all start from the same midnight.
         split: a rule, or None for the preset's own: day 1 against day 2 outdoors, every 8th frame elsewhere.
         root: not used; the name is there so that every data set takes the same keys.
@@ -42,6 +43,7 @@ class Synthetic(SceneDataModule):
         frames: int | None = None,
         noise_k: float = 0.05,
         scene_seed: int = 0,
+        only: str | None = None,
         weather: str | None = None,
         split: str | None = None,
         root: str | None = None,
@@ -65,6 +67,7 @@ class Synthetic(SceneDataModule):
         self.size = SIZES[size] if frames is None else replace(SIZES[size], frames=frames)
         self.noise_k = noise_k
         self.scene_seed = scene_seed
+        self.only = only
         self.weather = weather
 
     def load(self) -> SceneData:
@@ -73,6 +76,9 @@ class Synthetic(SceneDataModule):
         world = OutdoorScene(in_weather(OUTDOOR[self.scene_name], self.weather)) if outdoors else None
         recording = film(world or Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
         preset, count = recording.scene.preset, len(recording.times_s)
+        names = [surface.name for surface in preset.surfaces]
+        if self.only is not None and self.only not in names:
+            raise SceneError(f"data.only={self.only}: scene '{self.scene_name}' has {', '.join(names)}")
         with own_threads():
             probes, probe_names = probe_points(recording)
         scene = self.finish(
@@ -84,6 +90,7 @@ class Synthetic(SceneDataModule):
                     lens=recording.lens,
                     read=partial(recording.grey, frame, np.uint16),
                     read_rgb=partial(recording.rgb.__getitem__, frame),
+                    read_mask=None if self.only is None else partial(recording.shows, frame, self.only),
                     time_s=float(time_s),
                     subset="train" if frame < training_frames(count) else "test",
                 )

@@ -10,10 +10,12 @@ import pytest
 import torch
 from running import TINY, run
 
+from datamodules.synthetic import Synthetic
 from datamodules.synthetic_scene.film import SIZES, Recording, film, pixel_rays
 from datamodules.synthetic_scene.presets import PANE, PRESETS, TABLE_TOP, Pattern, Preset
 from datamodules.synthetic_scene.scene import Scene
 from datamodules.synthetic_scene.shapes import Box
+from heatsplat.contracts import SceneError
 from heatsplat.metrics import psnr
 
 SMALL = replace(SIZES["tiny"], frames=4, points=800)
@@ -145,3 +147,14 @@ def test_the_pane_is_dense_to_heat_and_thin_to_light(scores):
     """Measured: medians of 0.27 and 0.018, which co-support leaves standing."""
     heat, light = scores["pane"]
     assert heat > 5 * light > 5 * 0.005
+
+
+def test_only_the_pixels_of_a_surface_count_when_it_is_named():
+    views, recording = (
+        Synthetic(scene="glass", size="tiny", only="pane").scene.test,
+        film(Scene(PRESETS["glass"]), SIZES["tiny"]),
+    )
+    for view in views:
+        assert torch.equal(view.mask, torch.from_numpy(recording.shows(view.frame.frame_id, "pane")))
+    with pytest.raises(SceneError, match="data.only=window: scene 'glass' has floor, wall, .*pane"):
+        Synthetic(scene="glass", size="tiny", only="window").load()
