@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -307,7 +308,7 @@ class SceneData:
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
     true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
 
-    @property
+    @cached_property
     def extent(self) -> float:
         """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""
         centers = torch.stack([frame.camera.center for frame in self.train.frames])

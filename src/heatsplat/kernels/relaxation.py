@@ -191,6 +191,25 @@ def forward(rate, initial, ambient, gains, scale, ids, time, limit, table, value
 
 
 @kernel
+def clear_others(ids, written, v_gains):
+    """Writes zeros into the rows of ``v_gains`` [N, 2, K] that are not among ``ids``, which ``backward`` leaves alone.
+
+    Args:
+        ids: [n] int64.
+        written: [N] bool, scratch.
+        v_gains: output.
+    """
+    count = v_gains.shape[0]
+    written[:] = False
+    for j in range(ids.shape[0]):
+        written[ids[j]] = True
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        for row in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+            if not written[row]:
+                v_gains[row] = _f(0.0)
+
+
+@kernel
 def backward(
     rate,
     initial,

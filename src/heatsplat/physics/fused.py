@@ -131,11 +131,11 @@ class _VisibleTemperature(torch.autograd.Function):
         rate, initial, gains, scale, ids = tensors
         v_rate, v_initial, v_scale = (torch.zeros(x.shape) for x in (rate, initial, scale))
         v_gains = _gain_gradients.take(gains.shape)
-        if ids.shape[0] < rate.shape[0]:  # otherwise every row is written
-            v_gains.zero_()
         v_ambient = torch.empty(-(-ids.shape[0] // kernels.BLOCK))
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
+            if ids.shape[0] < rate.shape[0]:  # clearing all of it would double the memory traffic
+                kernels.clear_others(ids.numpy(), np.empty(rate.shape[0], np.bool_), v_gains.numpy())
             gradient = v_values.contiguous().numpy()
             kernels.backward(*_kernel_arguments(ctx, tensors), gradient, *(x.numpy() for x in outputs))
         v_ambient = v_ambient.sum() if ctx.needs_input_grad[1] else None

@@ -32,7 +32,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "loss": [(ssim, "forward"), (ssim, "backward")],
     "backward": [(compositing, "composite_backward")],
     "gradients": [(compositing, "sum_slots"), (projection, "project_backward")],
-    "thermal": [(relaxation, "fill_table"), (relaxation, "forward"), (relaxation, "backward")],
+    "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
     "optimiser": [(torch, "_fused_adam_")],
 }
 # What the module does in a step, its kernels included; the rest of a step is Lightning's.
