@@ -146,7 +146,7 @@ SKIES: dict[str, Sky] = {
     "fair": Sky(),
     "calm": Sky(wind_factor=0.12),
     "windy": Sky(wind_added=7.0),
-    "overcast": Sky(warm_c=15.5, swing_k=2.5, dew_point_c=11.5, cloud=1.0),
+    "overcast": Sky(warm_c=15.5, swing_k=2.5, dew_point_c=11.5, cloud=2.2),
 }
 
 
@@ -407,7 +407,7 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
             normals.append(normal)
     before = forcing_of(outdoor_weather("fair", -_BEFORE_S, 0.0), np.array(normals))
     # How the surfaces got to their state at midnight need not be converged: it defines the start.
-    midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=3).states_k
+    midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
     return solve(slabs, forcing_of(outdoor_weather(weather), np.array(normals)), midnight)
 
 
