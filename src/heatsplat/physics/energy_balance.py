@@ -1,0 +1,233 @@
+"""Temperature of surfaces under the sky in closed form: sun, air, wind and the sky's long waves, for any weather record.
+
+Per unit area of a surface with heat capacity C (volumetric capacity times depth),
+
+    C dT/dt = α G(t) + h(t) (T_air(t) - T) + e σ (T_sky(t)⁴ - T⁴),    h(t) proportional to 1 - v + v wind(t) / mean wind.
+
+Multiplying α, h, e and C by one number changes nothing, so that only ratios can be known. With the reference temperature R
+and the total conductance H = h + 4 e σ R³ (at mean wind) they are, each with a meaning of its own,
+
+    r = H / C         rate in 1/s; the time constant is about 1/r          seen in how temperature lags and is damped
+    g = α / H         kelvin that sunlight of 1 kW/m² heats                 seen by day
+    p = 4 e σ R³ / H  share of the exchange that radiates, in (0, 1)        seen at night, in K below the air
+    v                 share of convection that wind causes, in (0, 1)       seen when wind changes by day
+
+and in kelvin above the reference, x = T - R, with w(x) = (T⁴ - R⁴) / (4 R³) and s the same of the sky,
+
+    dx/dt = r [g G + (1 - p)(1 + v b)(air - x) + p (s - w(x))],    b = wind / mean wind - 1.
+
+``linear_temperature`` replaces w by its tangent at the surface's own mean temperature and v b x by v b times that mean,
+which leaves one rate per surface and so the response tables (responses.py, sunlight.py): its cost does not depend on the
+record. ``marched_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
+
+**Convention:** kelvin above the reference, kW/m², seconds; every driver is linear between its samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from heatsplat.kernels import heat_balance as kernels
+from heatsplat.kernels.compilation import announced
+from heatsplat.physics.responses import ResponseTable, driver_means, grid_position, interpolate
+from heatsplat.physics.sunlight import SunlightTable
+
+STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
+COMPILING = "compiling the kernel of heat balances: some seconds, once"
+NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
+LEAST_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
+HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
+
+
+class Surface(NamedTuple):
+    """What decides the temperature of n surfaces, each [n]; see the module for the symbols.
+
+    Args:
+        start: x at the first sample of the record, in kelvin above the reference.
+        log_rate: log r, r in 1/s.
+        sun: g in K m²/kW, at least 0.
+        share: p, or None where nothing radiates.
+        wind: v, or None where wind is not known.
+        normals: [n, 3] unit vectors, or None for surfaces that lie level.
+    """
+
+    start: Tensor
+    log_rate: Tensor
+    sun: Tensor
+    share: Tensor | None = None
+    wind: Tensor | None = None
+    normals: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """A weather record as what drives surfaces, [T] float64 each, in kelvin above the reference and kW/m².
+
+    Args:
+        times_s: increasing.
+        reference_k: R.
+        air: temperature of the air.
+        sky: s of the sky, or None where nothing radiates.
+        around: s of what a tilted surface sees instead of sky, or None where all lie level.
+        light: sunlight on a level surface without that of ``beams``, or None.
+        beams: [T, 3] direction towards the sun times its strength, or None.
+        breeze: wind / mean wind - 1, or None.
+        up: [3], or None where all surfaces lie level.
+    """
+
+    times_s: Tensor
+    reference_k: float
+    air: Tensor
+    sky: Tensor | None = None
+    around: Tensor | None = None
+    light: Tensor | None = None
+    beams: Tensor | None = None
+    breeze: Tensor | None = None
+    up: Tensor | None = None
+
+
+def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
+    """w = (T⁴ - R⁴) / (4 R³) of T = R + x: what a body radiates more than at R, in kelvin; factored, so nothing cancels."""
+    z = excess_k / reference_k
+    return excess_k * (1 + z * (1.5 + z * (1 + 0.25 * z)))
+
+
+class Climate:
+    """A record of drivers with its tables: all that the temperature of a surface needs beside its own parameters."""
+
+    def __init__(self, drivers: Drivers) -> None:
+        self.drivers = drivers
+        zero = torch.zeros_like(drivers.air)
+        columns = {"air": drivers.air, "light": drivers.light, "sky": drivers.sky, "around": drivers.around}
+        self.breeze_mean = 0.0
+        if drivers.breeze is not None:
+            self.breeze_mean = float(driver_means(drivers.times_s, drivers.breeze))
+            gusts = drivers.breeze - self.breeze_mean
+            columns |= {"gusts": gusts, "gusts_air": gusts * drivers.air}
+        columns = {name: series for name, series in columns.items() if series is not None}
+        self.columns = {name: j for j, name in enumerate(columns)}
+        series = torch.stack(list(columns.values()), dim=1)
+        self.table = ResponseTable(drivers.times_s, series)
+        self.means = driver_means(drivers.times_s, series).float()
+        self.beam = None if drivers.beams is None else SunlightTable(drivers.times_s, drivers.beams)
+        rows = [columns.get(name, zero) for name in ("air", "sky", "around", "light")]
+        rows += [zero if drivers.breeze is None else drivers.breeze]
+        rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
+        self.rows = torch.stack(rows).contiguous()
+
+    def share_of_sky(self, normals: Tensor | None) -> Tensor | float:
+        """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2."""
+        return 1.0 if normals is None else 0.5 * (1 + normals @ self.drivers.up.to(normals))
+
+    def forcing(self, surface: Surface, values: Tensor, beam: Tensor | float, mean: Tensor | float) -> Tensor:
+        """What a surface would settle at, times a / r without radiation's constant: drivers with their weights, [n].
+
+        Args:
+            values: [n, J] or [J] of the drivers in ``columns``.
+            beam: of the sun's beam on the surface, [n].
+            mean: temperature at which wind acts, [n].
+        """
+        take = {name: values[..., j] for name, j in self.columns.items()}
+        sky = self.share_of_sky(surface.normals)
+        share = 0.0 if surface.share is None else surface.share
+        light = beam + sky * take["light"] if "light" in take else beam
+        total = surface.sun * light + (1 - share) * (1 + self._wind(surface)) * take["air"]
+        if surface.wind is not None:
+            total = total + (1 - share) * surface.wind * (take["gusts_air"] - mean * take["gusts"])
+        if surface.share is not None:
+            seen = sky * take["sky"] + (1 - sky) * take["around"] if "around" in take else take["sky"]
+            total = total + share * seen
+        return total
+
+    def _wind(self, surface: Surface) -> Tensor | float:
+        """v times the mean of b over this record."""
+        return 0.0 if surface.wind is None else surface.wind * self.breeze_mean
+
+    def mean_temperature(self, surface: Surface) -> Tensor:
+        """The temperature x at which the mean balance of the record is even, [n]; differentiable.
+
+        Newton's method on a function that rises with x; its last step carries the derivatives (implicit function).
+        """
+        beam = 0.0 if self.beam is None else self.beam.mean(surface.normals).to(surface.sun)
+        means = self.means.to(surface.sun)
+        if surface.share is None:
+            return self.forcing(surface, means, beam, 0.0) / (1 + self._wind(surface))
+
+        def step(x: Tensor, surface: Surface) -> Tensor:
+            stiffness = (1 - surface.share) * (1 + self._wind(surface))
+            slope = stiffness.detach() + surface.share.detach() * (1 + x.detach() / self.drivers.reference_k) ** 3
+            radiated = surface.share * power_excess(x, self.drivers.reference_k)
+            rest = self.forcing(surface, means, beam, 0.0) - stiffness * x - radiated
+            return (x + rest / slope.clamp(min=LEAST_STIFFNESS)).clamp(-HALF_RANGE_K, HALF_RANGE_K)
+
+        with torch.no_grad():
+            x = surface.sun * 0.0
+            for _ in range(NEWTON_STEPS):
+                x = step(x, surface)
+        return step(x, surface)
+
+    def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
+        """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
+        mean = self.mean_temperature(surface)
+        stiffness = 1 + self._wind(surface)
+        constant = 0.0
+        if surface.share is not None:
+            steep = (1 + mean / self.drivers.reference_k) ** 3
+            constant = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
+            stiffness = ((1 - surface.share) * stiffness + surface.share * steep).clamp(min=LEAST_STIFFNESS)
+        log_rate = surface.log_rate + (stiffness.log() if isinstance(stiffness, Tensor) else 0.0)
+        settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
+        beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
+        kept = torch.exp(-log_rate.exp() * (time_s - float(self.drivers.times_s[0])))
+        forced = self.forcing(surface, settled, beam, mean) + constant * (1 - kept)
+        return surface.start * kept + forced / stiffness
+
+    def marched_temperature(self, surface: Surface, time_s: float) -> Tensor:
+        """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers."""
+        zero = torch.zeros_like(surface.start)
+        filled = (zero if value is None else value for value in (surface.share, surface.wind))
+        columns = torch.stack([surface.start, surface.log_rate, *_after_sun(surface.sun, *filled)], dim=1)
+        normals = surface.normals if surface.normals is not None else columns.new_zeros(len(columns), 3)
+        return _March.apply(torch.cat((columns, normals), dim=1), self, time_s)
+
+
+def _after_sun(sun: Tensor, share: Tensor, wind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The kernel's order of these three."""
+    return share, sun, wind
+
+
+class _March(torch.autograd.Function):
+    """The kernel on the CPU, which gives derivatives along with values."""
+
+    @staticmethod
+    def forward(ctx, parameters: Tensor, climate: Climate, time_s: float) -> Tensor:
+        drivers = climate.drivers
+        rows = parameters.detach().cpu().contiguous()
+        values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
+        up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
+        with announced(COMPILING):
+            kernels.march(
+                rows.numpy(),
+                drivers.times_s.numpy(),
+                climate.rows.numpy(),
+                up.numpy(),
+                drivers.up is not None,
+                drivers.reference_k,
+                0.0 if drivers.sky is None else 1.0,
+                time_s,
+                values.numpy(),
+                slopes.numpy(),
+            )
+        ctx.save_for_backward(slopes.to(parameters.device))
+        return values.to(parameters.device)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor):
+        (slopes,) = ctx.saved_tensors
+        return gradient[:, None] * slopes, None, None

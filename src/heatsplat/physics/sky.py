@@ -1,0 +1,54 @@
+"""Temperature of the clear sky in the thermal band: how cold a surface finds it, from what a weather station measures.
+
+**Convention:** kelvin; the sky's long waves are those of a black body at this temperature, σ T_sky⁴.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from heatsplat.physics.units import celsius
+
+LAWS = ("brutsaert", "berdahl_martin", "brunt", "swinbank")
+
+
+def vapour_pressure_hpa(air_k: Tensor, humidity_percent: Tensor) -> Tensor:
+    """Pressure of water vapour in hPa, by Magnus' formula (Alduchov and Eskridge 1996, Eq. 21)."""
+    air_c = celsius(air_k)
+    return humidity_percent / 100 * 6.1094 * (17.625 * air_c / (air_c + 243.04)).exp()
+
+
+def dew_point_c(vapour_hpa: Tensor) -> Tensor:
+    """Dew point in °C of a vapour pressure: the inverse of Magnus' formula."""
+    log = (vapour_hpa.clamp(min=1e-6) / 6.1094).log()
+    return 243.04 * log / (17.625 - log)
+
+
+def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str) -> Tensor:
+    """Temperature of the clear sky in kelvin, of any shape.
+
+    Args:
+        air_k: near the ground.
+        humidity_percent: relative; needed by all laws but Swinbank's.
+        law: "brutsaert" (1975): emissivity 1.24 (e/T)^(1/7); "brunt" (1932, coefficients of Sellers 1965): 0.605 +
+            0.048 √e; "berdahl_martin" (1984, without the hour of the day): 0.711 + 0.0056 d + 0.000073 d² with the dew
+            point d in °C; "swinbank" (1963): T_sky = 0.0552 T^1.5, from air temperature alone.
+
+    Raises:
+        ValueError: the law is unknown, or lacks the humidity.
+    """
+    if law not in LAWS:
+        raise ValueError(f"law of the sky must be one of {', '.join(LAWS)}, got '{law}'")
+    if law == "swinbank":
+        return 0.0552 * air_k**1.5
+    if humidity_percent is None:
+        raise ValueError(f"law of the sky '{law}' needs the humidity; without it there is swinbank")
+    vapour = vapour_pressure_hpa(air_k, humidity_percent)
+    if law == "brutsaert":
+        emissivity = 1.24 * (vapour / air_k) ** (1 / 7)
+    elif law == "brunt":
+        emissivity = 0.605 + 0.048 * vapour.sqrt()
+    else:
+        dew = dew_point_c(vapour)
+        emissivity = 0.711 + 0.0056 * dew + 0.000073 * dew * dew
+    return air_k * emissivity.clamp(max=1.0) ** 0.25
