@@ -1,0 +1,124 @@
+"""NTR-Gaussian: the integral against closed forms and a fine rule, its stages, its penalties, its gradients."""
+
+import math
+
+import pytest
+import torch
+from weathered import CAMERA, HOUR_S, make_scene
+
+from heatsplat.contracts import KELVIN_AT_0_C, SceneError
+from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.ntr_gaussian import EXCHANGE, STORAGE, NtrGaussian
+
+
+def make(count=30, **options):
+    model, scene = NtrGaussian(**{"width": 16} | options), make_scene()
+    model.prepare(scene)
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator) * 4.0
+    declared = model.per_gaussian(Seeds(means, torch.rand(count, 1, generator=generator), generator))
+    geometry = {
+        "means": means,
+        "log_scales": torch.zeros(count, 3),
+        "quats": torch.randn(count, 4, generator=generator),
+    }
+    tensors = {name: item.initial for name, item in declared.items()} | geometry
+    return model, Splats(tensors | {"opacity_logits": torch.zeros(count, 1)}), scene
+
+
+def at(time_s, ids=None):
+    return Query(ids=ids, camera=CAMERA, time_s=time_s)
+
+
+def steady(model, units=None):
+    """Turns the networks into constants: T_net everywhere ``units``, materials with all raw outputs zero."""
+    with torch.no_grad():
+        model.attribute_heads.zero_()
+        for layer in (model.temperature_head, model.env[-1]):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        if units is not None:
+            model.temperature_head.bias.fill_(math.log(units / (1 - units)))
+
+
+def test_a_steady_balance_integrates_exactly():
+    """With constant networks T = T_net - window [e σ T⁴ + h (T - T_env)] / c, whatever the number of nodes."""
+    for nodes in (2, 6, 13):
+        model, splats, scene = make(nodes=nodes, window_s=1800.0)
+        steady(model, units=0.7)
+        model.eval()
+        low, span = scene.thermal_range.min_c + KELVIN_AT_0_C, scene.thermal_range.span_k
+        flux = 0.5 * STEFAN_BOLTZMANN * (low + 0.7 * span) ** 4 + EXCHANGE * math.log(2.0) * 0.2 * span
+        window = min(1800.0, 2 * HOUR_S)
+        expected = low + 0.7 * span - window * flux / (STORAGE * (math.log(2.0) + 0.05))
+        found = model._kelvin(model._units(splats, None, 2 * HOUR_S))
+        assert torch.allclose(found, torch.full_like(found, expected), atol=2e-3)
+
+
+def test_more_nodes_converge_at_second_order():
+    errors = []
+    model, splats, _ = make()
+    exact = None
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.mul_(0.5)
+        model.attribute_heads.normal_(0.0, 0.5, generator=torch.Generator().manual_seed(2))
+        model.time_frequencies, model.moment.weight[:, 2:] = model.time_frequencies, 0.0  # one smooth octave of time
+        model.env[0].weight[:, 2:] = 0.0
+        model.of_state.weight[:, 5:] = 0.0
+        for nodes in (1025, 9, 17, 33):
+            model.nodes = nodes
+            found = model._units(splats, None, 2 * HOUR_S).double()
+            exact = found if exact is None else exact
+            errors.append((found - exact).abs().max().item())
+    orders = [math.log2(errors[i] / errors[i + 1]) for i in (1, 2)]
+    assert all(1.6 < order < 2.4 for order in orders), (errors, orders)
+
+
+def test_the_first_stage_emits_a_value_per_gaussian_and_the_second_the_integral():
+    model, splats, _ = make(first_steps=5)
+    model.on_step(0)
+    first = model.features(splats, at(HOUR_S)).features[:, 0]
+    assert torch.equal(first, splats["first_value"].clamp(min=0)) and model.regularisers(splats) == {}
+    model.on_step(5)
+    assert not torch.equal(model.features(splats, at(HOUR_S)).features[:, 0], first)
+    assert "first_value" not in make()[1].names
+
+
+def test_only_the_asked_gaussians_are_evaluated():
+    model, splats, _ = make()
+    model.eval()
+    ids = torch.tensor([3, 17, 4])
+    every = model.features(splats, at(HOUR_S)).features
+    assert torch.allclose(model.features(splats, at(HOUR_S, ids)).features, every[ids], atol=1e-6)
+
+
+def test_penalties_are_there_with_gradients_and_absent_at_weight_zero():
+    model, splats, _ = make()
+    loss = model.features(splats, at(2 * HOUR_S)).features.sum()
+    terms = model.regularisers(splats)
+    assert set(terms) == {"ntr/consistency", "ntr/environment", "ntr/variation", "ntr/integral"}
+    (loss + sum(terms.values())).backward()
+    tensors = dict(model.named_parameters()) | {"feature": splats["feature"]}
+    gradients = {name: tensor.grad for name, tensor in tensors.items()}
+    idle = {name for name, grad in gradients.items() if grad is None or not grad.isfinite().all()}
+    assert not idle
+
+    assert model.regularisers(splats) == {}  # of the last evaluation only
+    silent, splats, _ = make(consistency=0.0, integral=0.0)
+    silent.features(splats, at(2 * HOUR_S))
+    assert set(silent.regularisers(splats)) == {"ntr/environment", "ntr/variation"}
+
+
+def test_cost_and_effects_are_told():
+    assert make()[0].cost < make(width=64)[0].cost
+    assert set(make()[0].effects()) == {"relaxation", "radiation", "convection"}
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="nodes must be at least 2"):
+        NtrGaussian(nodes=1)
+    with pytest.raises(SceneError, match="NtrGaussian needs time, which scene"):
+        NtrGaussian().check(make_scene(times=(None, None, None)))
