@@ -35,7 +35,8 @@ COSTS = {
     "render_fps": ("frames/s", 0),
 }
 # Overrides that tell repetitions and places apart and not rows.
-NOT_A_ROW = ("seed", "row", "data", "data.root", "data.scene", "method", "trainer", "launcher", "callbacks", "logger")
+NOT_A_ROW = {"seed", "row", "data", "data.root", "data.scene", "method", "threads", "ablation"}
+NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra"}  # groups
 
 
 @dataclass
@@ -112,7 +113,12 @@ def collect(folder: Path) -> list[Row]:
 def row_name(overrides: Mapping[str, str]) -> str:
     """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
     method = [overrides["method"]] if "method" in overrides else []
-    return " ".join([*method, *(f"{key}={value}" for key, value in overrides.items() if key not in NOT_A_ROW)]) or "run"
+    told = {
+        key: value
+        for key, value in overrides.items()
+        if key not in NOT_A_ROW and key.lstrip("+~").partition(".")[0] not in NOT_WHAT_WAS_LEARNED
+    }
+    return " ".join([*method, *(f"{key}={value}" for key, value in told.items())]) or "run"
 
 
 def _yaml(job: Path, name: str) -> Any:
