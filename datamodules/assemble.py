@@ -280,10 +280,10 @@ def build_scene(
 
 
 def on_clock(weather: Weather, zero_s: float) -> Weather:
-    """The weather with ``zero_s`` of its clock as its new second 0."""
+    """The weather with ``zero_s`` of its clock as its new second 0; its notes say which moment that is."""
     notes = dict(weather.notes)
-    if "utc_at_zero_s" in notes:
-        notes["utc_at_zero_s"] += zero_s
+    key = "utc_at_zero_s" if "utc_at_zero_s" in notes else "clock_at_zero_s"
+    notes[key] = notes.get(key, 0.0) + zero_s
     return replace(weather, times_s=weather.times_s - zero_s, notes=notes)
 
 

@@ -1,0 +1,464 @@
+"""Weather records: tables of air, wind, humidity, sunlight and pressure over time, checked, and with the sun added.
+
+A table has a column of times and any of the five quantities, each with its unit at the end of its name: ``air_c``,
+``air_k``, ``air_f``; ``wind_m_s``, ``wind_km_h``, ``wind_kn``; ``humidity_percent``; ``irradiance_w_m2``;
+``pressure_hpa``, ``pressure_pa``. Names as people write them are understood ("Air temperature [°C]", "GHI (W/m²)").
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from pathlib import Path
+from typing import Any
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+import torch
+
+from datamodules.assemble import on_clock, weather_of
+from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
+
+log = logging.getLogger(__name__)
+
+# Longest time without a value that is bridged by a straight line, unless the configuration says otherwise.
+MAX_GAP_S = 3 * 3600.0
+# The sun moves 2.5 degrees in this time; between samples all series are linear.
+SUN_STEP_S = 600.0
+# What an unlit pyranometer may read, in W/m²; below it the column is something else.
+PYRANOMETER_OFFSET = -5.0
+# Numbers from here on are seconds since 1970, below it seconds on the clock of the frames.
+FIRST_EPOCH_S = 1e8
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of the weather: how it may be called, its units as (scale, offset) to ours, and what can be true."""
+
+    aliases: tuple[str, ...]
+    units: Mapping[str, tuple[float, float]]
+    low: float
+    high: float
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "air_c": Quantity(
+        ("air", "air_temperature", "temperature", "temp", "t_air", "t2m", "temperature_2m"),
+        {"c": (1.0, 0.0), "k": (1.0, -273.15), "f": (5.0 / 9.0, -160.0 / 9.0)},
+        -90.0,
+        60.0,
+    ),
+    "wind_m_s": Quantity(
+        ("wind", "wind_speed", "windspeed", "wind_speed_10m"),
+        {"m_s": (1.0, 0.0), "km_h": (1 / 3.6, 0.0), "kmh": (1 / 3.6, 0.0), "kn": (0.514444, 0.0), "mph": (0.44704, 0.0)},
+        0.0,
+        110.0,
+    ),
+    "humidity_percent": Quantity(
+        ("humidity", "relative_humidity", "rh", "relative_humidity_2m"),
+        {"percent": (1.0, 0.0), "pct": (1.0, 0.0), "fraction": (100.0, 0.0)},
+        0.0,
+        100.0,
+    ),
+    "irradiance_w_m2": Quantity(
+        ("irradiance", "ghi", "global_horizontal", "global_irradiance", "solar", "solar_radiation", "shortwave_radiation"),
+        {"w_m2": (1.0, 0.0), "kw_m2": (1000.0, 0.0)},
+        PYRANOMETER_OFFSET,
+        1600.0,
+    ),
+    "pressure_hpa": Quantity(
+        ("pressure", "air_pressure", "surface_pressure"),
+        {"hpa": (1.0, 0.0), "mbar": (1.0, 0.0), "kpa": (10.0, 0.0), "pa": (0.01, 0.0)},
+        300.0,
+        1100.0,
+    ),
+}  # fmt: skip
+TIME_NAMES = ("time", "utc", "time_utc", "timestamp", "timestamp_utc", "datetime", "datetime_utc", "date", "date_time",
+              "time_s", "epoch_s", "unix_s", "seconds")  # fmt: skip
+
+
+def read_weather(
+    path: Path, *, zone: str | None = None, site: Site | None = None, max_gap_s: float = MAX_GAP_S
+) -> Weather:
+    """The weather of a table, on its own clock: seconds since 1970 UTC, or the seconds that it gives.
+
+    **Convention:** times are ISO 8601 with an offset (2024-07-11T06:00:00+02:00, ...Z), without one in ``zone``, or
+    seconds; a column whose name ends in _utc needs no zone. Columns are separated by comma, semicolon, tab or bar;
+    lines that begin with # are comments; empty cells, NaN and NA are missing.
+
+    Args:
+        path: the table.
+        zone: of times without an offset: "UTC", "+02:00" or a name such as "Europe/Berlin"; None refuses them.
+        site: where it was recorded; adds the sun's direction, direct and diffuse light, or None for neither.
+        max_gap_s: longest gap that is interpolated.
+
+    Raises:
+        SceneError: it cannot be read, a value cannot be true, or a gap is too long. The message names line or column.
+    """
+    times, columns, notes = _read_table(path, zone)
+    return make_weather(times, columns, site=site, max_gap_s=max_gap_s, source=str(path.name), notes=notes)
+
+
+def make_weather(
+    times_s: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    *,
+    site: Site | None = None,
+    max_gap_s: float = MAX_GAP_S,
+    source: str = "the scene",
+    notes: Mapping[str, Any] | None = None,
+) -> Weather:
+    """A checked record: sorted, without duplicates and gaps, with the sun where the place is known.
+
+    Args:
+        times_s: [T] seconds since 1970 UTC, or on the clock of the frames (below 1e8: then there is no sun).
+        columns: values [T] by name in ``WEATHER_COLUMNS``, NaN where missing.
+        site, max_gap_s: as in ``read_weather``.
+        source: what messages call it.
+        notes: for the report, added to.
+
+    Raises:
+        SceneError: fewer than two samples, a value that cannot be true, or a gap that is too long.
+    """
+    notes = {"source": source, **(notes or {})}
+    for name, values in columns.items():
+        _check_range(name, values, times_s, source)
+    times_s, columns, notes = _in_order(np.asarray(times_s, dtype=np.float64), columns, notes)
+    columns = {name: values for name, values in columns.items() if np.isfinite(values).sum() >= 2}
+    if len(times_s) < 2 or not columns:
+        raise SceneError(f"{source} holds no weather: two or more samples of at least one column are needed")
+    times_s, columns = _common_span(times_s, columns, notes)
+    columns = {name: _filled(name, times_s, values, max_gap_s, source, notes) for name, values in columns.items()}
+    if "irradiance_w_m2" in columns:
+        below = columns["irradiance_w_m2"] < 0
+        if below.any():
+            notes["irradiance_offset"] = f"{int(below.sum())} values between {PYRANOMETER_OFFSET:g} and 0 W/m² set to 0"
+            columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
+    missing = [name for name in WEATHER_COLUMNS if name not in columns]
+    if missing:
+        notes["missing"] = ", ".join(missing)
+
+    absolute = bool(times_s[0] >= FIRST_EPOCH_S)
+    if absolute:
+        notes["utc_at_zero_s"] = 0.0
+        notes["from_utc"], notes["to_utc"] = (_utc(t) for t in (times_s[0], times_s[-1]))
+    notes["span_h"] = round((times_s[-1] - times_s[0]) / 3600.0, 3)
+    notes["step_min"] = round(float(np.median(np.diff(times_s))) / 60.0, 3)
+    notes["ranges"] = {name: [round(float(v.min()), 2), round(float(v.max()), 2)] for name, v in columns.items()}
+    sunlight: dict[str, np.ndarray] = {}
+    if site is None or not absolute:
+        what = "latitude and longitude are" if site is None else "the UTC of its times is"
+        notes["sun"] = f"{what} not known: no direction of the sun, no direct and diffuse light"
+    else:
+        times_s, columns, sunlight = _with_sun(times_s, columns, site, source, notes)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in {**columns, **sunlight}.items()}
+    up = None if site is None else {"up": torch.from_numpy(site.axes()[2])}
+    return Weather(times_s=torch.from_numpy(times_s), notes=notes, **tensors, **(up or {}))
+
+
+def with_weather(scene: SceneData, path: Path, zone: str | None = None, max_gap_s: float = MAX_GAP_S) -> SceneData:
+    """The scene under the weather of another table, for the same place; its images stay those of the old weather.
+
+    Raises:
+        SceneError: the scene has no weather to replace, or the table does not cover the times of its frames.
+    """
+    if scene.weather is None:
+        raise SceneError(f"scene '{scene.name}' has no weather that weather={path} could replace")
+    known = scene.weather.notes
+    site = site_of(known)
+    weather = read_weather(path, zone=zone, site=site, max_gap_s=max_gap_s)
+    if ("utc_at_zero_s" in weather.notes) != ("utc_at_zero_s" in known):
+        raise SceneError(
+            f"weather={path} and scene '{scene.name}' do not share a clock: one has times of day, the other seconds; "
+            "give the table times as the scene's own record has them"
+        )
+    weather = on_clock(weather, known.get("utc_at_zero_s", known.get("clock_at_zero_s", 0.0)))
+
+    def under(views: ViewSet) -> ViewSet:
+        frames = [replace(f, environment=weather_of(f.name, weather, f.time_s)) for f in views.frames]
+
+        def decode(position: int) -> View:
+            return replace(views[position], frame=frames[position])
+
+        return ViewSet(frames, decode)
+
+    notes = {**scene.notes, "weather_replaced_by": str(path)}
+    return replace(
+        scene, weather=weather, train=under(scene.train), val=under(scene.val), test=under(scene.test), notes=notes
+    )
+
+
+def site_of(notes: Mapping[str, Any]) -> Site | None:
+    """The site that a record's notes name, or None."""
+    if notes.get("latitude") is None or notes.get("longitude") is None:
+        return None
+    axes = {key: tuple(map(float, notes[key])) for key in ("up", "north") if notes.get(key) is not None}
+    return Site(float(notes["latitude"]), float(notes["longitude"]), float(notes.get("altitude_m") or 0.0), **axes)
+
+
+def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
+    """Seconds since 1970 UTC of an ISO date-time, or a number as it is.
+
+    Raises:
+        SceneError: it is neither, or it has no offset and ``zone`` is None; ``where`` is named.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(str(text).strip())
+    except ValueError as error:
+        raise SceneError(
+            f"{where}: {text!r} is neither seconds nor a date-time such as 2024-07-11T06:00:00Z"
+        ) from error
+    if moment.tzinfo is None:
+        if zone is None:
+            raise SceneError(
+                f"{where}: {text!r} has no time zone. Write an offset (Z, +02:00) into the times, or say in which zone "
+                "they are: weather_zone=UTC, +02:00 or Europe/Berlin"
+            )
+        moment = moment.replace(tzinfo=_zone(zone))
+    return moment.timestamp()
+
+
+def _zone(name: str) -> tzinfo:
+    if offset := re.fullmatch(r"([+-])(\d{2}):?(\d{2})", name):
+        minutes = int(offset[2]) * 60 + int(offset[3])
+        return timezone(timedelta(minutes=minutes if offset[1] == "+" else -minutes))
+    try:
+        return UTC if name.upper() in ("UTC", "Z") else ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError) as error:
+        raise SceneError(
+            f"weather_zone={name} is no time zone; write UTC, +02:00 or a name such as Europe/Berlin"
+        ) from error
+
+
+def _plain(name: str) -> str:
+    """A column name as letters, digits and single underscores: "Wind (km/h)" is wind_km_h."""
+    text = (
+        name.strip()
+        .lower()
+        .replace("²", "2")
+        .replace("%", "percent")
+        .replace("°", "")
+        .replace("m-2", "m2")
+        .replace("s-1", "s")
+    )
+    return re.sub(r"[^a-z0-9]+", "_", text).strip("_")
+
+
+def _quantity(plain: str) -> tuple[str, tuple[float, float]] | None:
+    """Which column of the weather a name means, and its unit; None for something else. Raises ValueError without unit."""
+    for name, quantity in QUANTITIES.items():
+        for alias in quantity.aliases:
+            if plain == alias:
+                units = ", ".join(f"{alias}_{unit}" for unit in quantity.units)
+                raise ValueError(f"has no unit; name it one of {units}")
+            if plain.startswith(alias + "_") and (unit := plain[len(alias) + 1 :]) in quantity.units:
+                return name, quantity.units[unit]
+    return None
+
+
+def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
+    """Times [T] and columns [T] (NaN where missing) of a table in our units, unsorted, and notes."""
+    if not path.is_file():
+        raise SceneError(f"there is no weather table {path}")
+    lines = [
+        (number, line)
+        for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(lines) < 3:
+        raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
+    delimiter = max(",;\t|", key=lines[0][1].count)
+    header = next(csv.reader([lines[0][1]], delimiter=delimiter))
+    plain = [_plain(name) for name in header]
+    time_at = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
+    if time_at is None:
+        raise SceneError(
+            f"{path} has no column of times ({', '.join(TIME_NAMES[:4])}, time_s, ...); it has {', '.join(header)}"
+        )
+    wanted: dict[str, tuple[int, tuple[float, float]]] = {}
+    unused = []
+    for position, name in enumerate(plain):
+        if position == time_at:
+            continue
+        try:
+            found = _quantity(name)
+        except ValueError as error:
+            raise SceneError(f"{path}: column {header[position]!r} {error}") from error
+        if found is None:
+            unused.append(header[position])
+        elif found[0] in wanted:
+            raise SceneError(
+                f"{path}: {header[wanted[found[0]][0]]!r} and {header[position]!r} are both {found[0]}; keep one"
+            )
+        else:
+            wanted[found[0]] = (position, found[1])
+    if not wanted:
+        raise SceneError(f"{path} has none of the columns {', '.join(WEATHER_COLUMNS)}; it has {', '.join(header)}")
+    own_zone = "UTC" if plain[time_at].endswith("utc") else zone
+    times, values = [], {name: [] for name in wanted}
+    for number, line in lines[1:]:
+        cells = next(csv.reader([line], delimiter=delimiter))
+        if len(cells) < len(header):
+            raise SceneError(f"{path}, line {number}: {len(cells)} cells for {len(header)} columns")
+        times.append(utc_seconds(cells[time_at].strip(), own_zone, f"{path}, line {number}"))
+        for name, (position, (scale, offset)) in wanted.items():
+            cell = cells[position].strip()
+            if cell.lower() in MISSING:
+                values[name].append(np.nan)
+                continue
+            try:
+                values[name].append(scale * float(cell if delimiter == "," else cell.replace(",", ".")) + offset)
+            except ValueError as error:
+                raise SceneError(
+                    f"{path}, line {number}: {cell!r} in column {header[position]} is no number"
+                ) from error
+    seconds = np.array(times)
+    kinds = set((seconds >= FIRST_EPOCH_S).tolist())
+    if len(kinds) > 1:
+        raise SceneError(
+            f"{path}: some times are seconds since 1970 or dates, others count from elsewhere; use one clock"
+        )
+    notes: dict[str, Any] = {"unused_columns": ", ".join(unused)} if unused else {}
+    return seconds, {name: np.array(v) for name, v in values.items()}, notes
+
+
+def _check_range(name: str, values: np.ndarray, times_s: np.ndarray, source: str) -> None:
+    quantity = QUANTITIES[name]
+    wrong = (values < quantity.low) | (values > quantity.high)
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        low = max(quantity.low, 0.0) if name == "irradiance_w_m2" else quantity.low
+        raise SceneError(
+            f"{source}: {name} is {values[first]:.6g} at {_moment(times_s[first])} ({int(wrong.sum())} such values); it lies "
+            f"between {low:g} and {quantity.high:g}. Check the column and its unit."
+        )
+
+
+def _in_order(
+    times_s: np.ndarray, columns: Mapping[str, np.ndarray], notes: dict[str, Any]
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
+    """Samples by time, those of one moment averaged."""
+    if not np.isfinite(times_s).all():
+        raise SceneError(f"{notes['source']}: a time is not finite")
+    if (np.diff(times_s) < 0).any():
+        notes["unsorted"] = "its samples were not in order of time and have been sorted"
+    moments, group = np.unique(times_s, return_inverse=True)
+    if len(moments) == len(times_s):
+        order = np.argsort(times_s, kind="stable")
+        return times_s[order], {name: values[order] for name, values in columns.items()}, notes
+    notes["duplicates"] = (
+        f"{len(times_s) - len(moments)} samples repeat the time of another; those of one time are averaged"
+    )
+    merged = {}
+    for name, values in columns.items():
+        there = np.isfinite(values)
+        count = np.bincount(group[there], minlength=len(moments))
+        total = np.bincount(group[there], weights=values[there], minlength=len(moments))
+        merged[name] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return moments, merged, notes
+
+
+def _common_span(
+    times_s: np.ndarray, columns: dict[str, np.ndarray], notes: dict[str, Any]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The part of the record that all columns span, so that nothing is extrapolated."""
+    ends = [np.flatnonzero(np.isfinite(values))[[0, -1]] for values in columns.values()]
+    first, last = max(e[0] for e in ends), min(e[1] for e in ends)
+    if first >= last:
+        raise SceneError(f"{notes['source']}: its columns have no span of time in common; leave one of them out")
+    if cut := len(times_s) - (last - first + 1):
+        notes["cut"] = f"{cut} samples at the ends lack a column and are left out"
+    return times_s[first : last + 1], {name: values[first : last + 1] for name, values in columns.items()}
+
+
+def _filled(
+    name: str, times_s: np.ndarray, values: np.ndarray, max_gap_s: float, source: str, notes: dict[str, Any]
+) -> np.ndarray:
+    """A column without NaN. Raises SceneError where two of its samples lie further apart than ``max_gap_s``."""
+    there = np.isfinite(values)
+    gaps = np.diff(times_s[there])
+    longest = int(gaps.argmax())
+    if gaps[longest] > max_gap_s:
+        raise SceneError(
+            f"{source}: {name} has no value for {gaps[longest] / 3600:.3g} hours after "
+            f"{_moment(times_s[there][longest])}, longer than the {max_gap_s / 3600:.3g} hours that are interpolated. Fill "
+            "the gap, leave the column out, or allow it with weather_max_gap_h"
+        )
+    if not there.all():
+        notes["gaps"] = {**notes.get("gaps", {}), name: f"{int((~there).sum())} values interpolated"}
+    return np.interp(times_s, times_s[there], values[there])
+
+
+def _with_sun(
+    times_s: np.ndarray, columns: dict[str, np.ndarray], site: Site, source: str, notes: dict[str, Any]
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The record on times that follow the sun, with its direction, direct and diffuse light."""
+    pieces = np.maximum(np.ceil(np.diff(times_s) / SUN_STEP_S - 1e-9).astype(int), 1)
+    fine = np.concatenate(
+        [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(times_s, times_s[1:], pieces, strict=False)]
+        + [times_s[-1:]]
+    )
+    if len(fine) > len(times_s):
+        notes["resampled"] = (
+            f"{len(times_s)} samples to {len(fine)}, at most {SUN_STEP_S / 60:g} minutes apart for the sun"
+        )
+    columns = {name: np.interp(fine, times_s, values) for name, values in columns.items()}
+    sun = sun_directions(site, fine)
+    height = np.degrees(np.arcsin((sun @ site.axes()[2]).clip(-1.0, 1.0)))
+    if "irradiance_w_m2" in columns:
+        impossible = (height < -3.0) & (columns["irradiance_w_m2"] > 50.0)
+        if impossible.any():
+            first = int(np.argmax(impossible))
+            raise SceneError(
+                f"{source}: {columns['irradiance_w_m2'][first]:.0f} W/m² of sunlight at {_moment(fine[first])}, when the sun "
+                f"is {-height[first]:.0f} degrees below the horizon of {site.latitude:g}, {site.longitude:g}. Check the "
+                "time zone, latitude and longitude."
+            )
+        columns["irradiance_w_m2"] = np.where(height > 0, columns["irradiance_w_m2"], 0.0)
+        notes["irradiance"] = "measured; direct and diffuse by the clearness of the sky (Erbs, Driesse)"
+    else:
+        columns["irradiance_w_m2"] = clear_sky(site, fine)
+        notes["irradiance"] = "none in the record: that of a cloudless sky (Ineichen and Perez)"
+    direct, diffuse = split_irradiance(site, fine, columns["irradiance_w_m2"])
+    notes["night_share"] = round(float((height <= 0).mean()), 3)
+    if (height <= 0).all():
+        notes["night_only"] = "the sun never rises in this record: it says nothing about how surfaces absorb sunlight"
+        log.warning("%s: %s", source, notes["night_only"])
+    notes |= {
+        "latitude": site.latitude,
+        "longitude": site.longitude,
+        "altitude_m": site.altitude_m,
+        "up": list(site.up),
+        "north": list(site.north),
+    }
+    return fine, columns, {"direct_w_m2": direct, "diffuse_w_m2": diffuse, "sun": sun}
+
+
+def write_weather(path: Path, weather: Weather, names: Sequence[str] = WEATHER_COLUMNS) -> None:
+    """Writes a record as a table that ``read_weather`` reads: ISO times in UTC where it knows them, else seconds."""
+    zero = weather.notes.get("utc_at_zero_s")
+    there = [name for name in names if getattr(weather, name) is not None]
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["time_s" if zero is None else "utc", *there])
+        for i, time in enumerate(weather.times_s.tolist()):
+            moment = repr(time) if zero is None else _utc(zero + time)
+            rows.writerow([moment, *(f"{getattr(weather, name)[i].item():.10g}" for name in there)])
+
+
+def _utc(seconds: float) -> str:
+    return datetime.fromtimestamp(float(seconds), UTC).isoformat()
+
+
+def _moment(seconds: float) -> str:
+    return _utc(seconds) if seconds >= FIRST_EPOCH_S else f"second {seconds:.6g}"

@@ -1,0 +1,332 @@
+"""Weather records: reading tables, checking them, the sun, and the weather at a moment."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
+from heatsplat.contracts import SceneData, SceneError, Weather
+
+SITE = Site(47.0, 9.0, 500.0)
+# 11 July 2024, midnight UTC.
+MIDNIGHT_S = 1720656000.0
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Writes lines as a table and returns its path."""
+
+    def write(*lines: str):
+        path = tmp_path / "weather.csv"
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_columns_are_known_by_name_and_unit(table):
+    path = table(
+        "# from the station on the roof",
+        "Time;Air temperature [K];Wind (km/h);RH %;GHI (W/m²);Pressure Pa;Remark",
+        "2024-07-11T06:00:00Z;290,15;36,0;55;120;95500;fine",
+        "2024-07-11T09:00:00+02:00;291,15;18,0;50;200;95400;",
+    )
+    weather = read_weather(path)
+    assert weather.times_s.tolist() == [MIDNIGHT_S + 6 * 3600, MIDNIGHT_S + 7 * 3600]
+    assert weather.air_c.tolist() == pytest.approx([17.0, 18.0])
+    assert weather.wind_m_s.tolist() == pytest.approx([10.0, 5.0])
+    assert weather.humidity_percent.tolist() == [55.0, 50.0]
+    assert weather.irradiance_w_m2.tolist() == [120.0, 200.0]
+    assert weather.pressure_hpa.tolist() == pytest.approx([955.0, 954.0])
+    assert weather.notes["unused_columns"] == "Remark"
+    assert "latitude and longitude are not known" in weather.notes["sun"] and weather.sun is None
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "name", "expected"),
+    [
+        ("air_f", "50", "air_c", 10.0),
+        ("temperature_2m (°C)", "12.5", "air_c", 12.5),
+        ("wind_speed_kn", "10", "wind_m_s", 5.14444),
+        ("wind_mph", "10", "wind_m_s", 4.4704),
+        ("relative_humidity_fraction", "0.4", "humidity_percent", 40.0),
+        ("shortwave_radiation (W m-2)", "7", "irradiance_w_m2", 7.0),
+        ("solar_kw_m2", "0.5", "irradiance_w_m2", 500.0),
+        ("pressure_kpa", "101.3", "pressure_hpa", 1013.0),
+        ("wind m s-1", "3", "wind_m_s", 3.0),
+    ],
+)
+def test_units_become_ours(table, header, value, name, expected):
+    path = table(f"time_s,{header}", f"0,{value}", f"60,{value}")
+    assert getattr(read_weather(path), name).tolist() == pytest.approx([expected] * 2)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
+def test_columns_are_separated_in_four_ways(table, delimiter):
+    rows = (["utc", "air_c"], ["2024-07-11 00:00:00", "10.5"], ["2024-07-11 01:00:00", "11.5"])
+    weather = read_weather(table(*(delimiter.join(row) for row in rows)))
+    assert weather.times_s[0] == MIDNIGHT_S  # a column called utc needs no zone
+    assert weather.air_c.tolist() == [10.5, 11.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "zone", "hour"),
+    [
+        ("2024-07-11T02:00:00+02:00", None, 0.0),
+        ("2024-07-11T02:00", "Europe/Zurich", 0.0),
+        ("2024-07-11T02:00", "+02:00", 0.0),
+        ("2024-07-11 02:00:00", "UTC", 2.0),
+        ("2024-07-10T21:30-04:00", "Europe/Zurich", 1.5),
+        (str(MIDNIGHT_S), None, 0.0),
+    ],
+)
+def test_time_zones(text, zone, hour):
+    assert utc_seconds(text, zone, "here") == MIDNIGHT_S + 3600 * hour
+
+
+def test_a_change_to_winter_time_does_not_move_the_record():
+    """An hour apart by the clock of Zurich, two hours apart on the sun's."""
+    first, last = (utc_seconds(f"2024-10-27T0{h}:30", "Europe/Zurich", "here") for h in (1, 3))
+    assert last - first == 3 * 3600.0
+
+
+def test_samples_are_sorted_merged_and_gaps_are_bridged_and_told(table):
+    path = table(
+        "time_s,air_c,wind_m_s",
+        "1800,12,NaN",
+        "0,10,1",
+        "3600,14,3",
+        "1800,14,",
+        "600,,2",
+        "4200,,4",
+    )
+    weather = read_weather(path)
+    assert weather.times_s.tolist() == [0.0, 600.0, 1800.0, 3600.0]
+    assert weather.air_c.tolist() == pytest.approx([10.0, 11.0, 13.0, 14.0])
+    assert weather.wind_m_s.tolist() == pytest.approx([1.0, 2.0, 2.4, 3.0])
+    notes = weather.notes
+    assert (
+        "sorted" in notes["unsorted"] and "averaged" in notes["duplicates"] and "1 samples at the ends" in notes["cut"]
+    )
+    assert notes["gaps"] == {"air_c": "1 values interpolated", "wind_m_s": "1 values interpolated"}
+    assert notes["missing"] == "humidity_percent, irradiance_w_m2, pressure_hpa"
+    assert notes["ranges"]["air_c"] == [10.0, 14.0] and notes["span_h"] == 1.0
+
+
+def test_a_column_without_values_counts_as_missing(table):
+    weather = read_weather(table("time_s,air_c,wind_m_s", "0,10,", "60,11,NA"))
+    assert weather.wind_m_s is None and "wind_m_s" in weather.notes["missing"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["time_s,air_c"], "holds no weather"),
+        (["time_s,air_c", "0,1", "60,warm"], "line 3: 'warm' in column air_c is no number"),
+        (["time_s,air_c", "0,1", "60"], "line 3: 1 cells for 2 columns"),
+        (["hour,air_c", "0,1", "1,2"], "no column of times .* it has hour, air_c"),
+        (["time_s,snow_cm", "0,1", "1,2"], "none of the columns air_c, wind_m_s, .* it has time_s, snow_cm"),
+        (
+            ["time_s,temperature", "0,1", "1,2"],
+            "column 'temperature' has no unit; name it one of temperature_c, temp.*_k",
+        ),
+        (["time_s,air_c,temp_k", "0,1,2", "1,2,2"], "'air_c' and 'temp_k' are both air_c"),
+        (["time,air_c", "2024-07-11T06:00,1", "2024-07-11T07:00,1"], "line 2: .* has no time zone. .*weather_zone=UTC"),
+        (["time,air_c", "noon,1", "1,1"], "line 2: 'noon' is neither seconds nor a date-time"),
+        (["time_s,air_c", "0,1", "1720656000,1"], "use one clock"),
+        (["time_s,irradiance_w_m2", "0,10", "60,-40"], "irradiance_w_m2 is -40 at second 60 .* between 0 and 1600"),
+        (["time_s,humidity_percent", "0,50", "60,104"], "humidity_percent is 104 at second 60 .* between 0 and 100"),
+        (["time_s,wind_m_s", "0,-1", "60,1"], "wind_m_s is -1 at second 0"),
+        (
+            ["time_s,air_c", "0,290", "60,291"],
+            "air_c is 290 at second 0 .2 such values.; .* Check the column and its unit",
+        ),
+        (["time_s,air_c", "0,1", "36000,2"], "air_c has no value for 10 hours after second 0, longer than the 3 hours"),
+        (["time_s,air_c,wind_m_s", "0,1,", "60,1,", "120,,2", "180,,3"], "no span of time in common"),
+    ],
+)
+def test_bad_tables_are_refused_by_line_and_column(table, lines, message):
+    with pytest.raises(SceneError, match=message):
+        read_weather(table(*lines))
+
+
+def test_a_missing_table_and_a_bad_zone_are_named(tmp_path, table):
+    with pytest.raises(SceneError, match="there is no weather table"):
+        read_weather(tmp_path / "none.csv")
+    with pytest.raises(SceneError, match="weather_zone=Mars/Crater is no time zone"):
+        read_weather(table("time,air_c", "2024-07-11T06:00,1", "2024-07-11T07:00,1"), zone="Mars/Crater")
+
+
+def test_longer_gaps_may_be_allowed(table):
+    path = table("time_s,air_c", "0,1", "36000,2")
+    assert read_weather(path, max_gap_s=12 * 3600.0).air_c.tolist() == [1.0, 2.0]
+
+
+def test_an_unlit_pyranometer_may_read_a_little_less_than_nothing(table):
+    weather = read_weather(table("time_s,irradiance_w_m2", "0,-2.5", "60,10"))
+    assert weather.irradiance_w_m2.tolist() == [0.0, 10.0]
+    assert "1 values between -5 and 0" in weather.notes["irradiance_offset"]
+
+
+def hourly(hours=25, **columns):
+    times = MIDNIGHT_S + 3600.0 * np.arange(hours)
+    return times, {name: np.full(hours, value) for name, value in columns.items()}
+
+
+def test_the_sun_stands_where_astronomy_says():
+    """Equinox at the equator: rises in the east, passes overhead, sets in the west; and midsummer noon at 47° north."""
+    equinox = utc_seconds("2024-03-20T00:00:00Z", None, "")
+    site = Site(0.0, 0.0)
+    # True noon of that day is 12:07:30 at Greenwich.
+    morning, noon, evening = sun_directions(site, equinox + 3600 * np.array([7.125, 12.125, 17.125]))
+    assert morning == pytest.approx([math.cos(math.radians(15)), 0.0, math.sin(math.radians(15))], abs=0.01)
+    assert noon == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+    assert evening[0] == pytest.approx(-morning[0], abs=0.01)
+    solstice = utc_seconds("2024-06-20T12:00:00Z", None, "") + 120.0
+    direction = sun_directions(Site(47.0, 0.0), np.array([solstice]))[0]
+    assert direction == pytest.approx([0.0, -math.cos(math.radians(66.44)), math.sin(math.radians(66.44))], abs=0.005)
+    assert np.linalg.norm(direction) == pytest.approx(1.0)
+
+
+def test_world_axes_turn_the_sun():
+    when = MIDNIGHT_S + 3600.0 * np.array([6.0, 11.0, 23.0])
+    east, north, up = sun_directions(SITE, when).T
+    # y up, x north (so that z is east), as some reconstructions have it.
+    turned = sun_directions(Site(47.0, 9.0, 500.0, up=(0.0, 2.0, 0.0), north=(3.0, 0.5, 0.0)), when)
+    assert turned == pytest.approx(np.stack([north, up, east], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"latitude": 95.0}, "latitude 95.0 and longitude 9.0 are no place"),
+        ({"north": (0.0, 0.0, 2.0)}, "data.north=.* points up"),
+        ({"up": (0.0, 0.0, 0.0)}, "data.up and data.north are three numbers"),
+    ],
+)
+def test_impossible_sites_are_refused(options, message):
+    with pytest.raises(SceneError, match=message):
+        Site(**{"latitude": 47.0, "longitude": 9.0, **options})
+
+
+def test_light_is_split_so_that_it_adds_up_and_night_is_exactly_zero():
+    when = MIDNIGHT_S + 600.0 * np.arange(145)
+    bright = clear_sky(SITE, when)
+    height = sun_directions(SITE, when)[:, 2]
+    assert 800.0 < bright.max() < 1000.0
+    for share in (1.0, 0.3):
+        direct, diffuse = split_irradiance(SITE, when, share * bright)
+        assert (direct[height <= 0] == 0).all() and (diffuse[height <= 0] == 0).all()
+        day = height > 0.06
+        level = direct * height + diffuse
+        assert np.abs(level - share * bright)[day].max() < 1.0
+        assert (direct >= 0).all() and (diffuse >= 0).all()
+    assert (bright[height <= 0] == 0).all()
+    clear, _ = split_irradiance(SITE, when, bright)
+    assert clear.max() > 600.0 and direct.max() < 100.0  # of a cloudy sky little comes straight
+
+
+def test_records_are_resampled_for_the_sun_and_keep_their_samples():
+    times, columns = hourly(air_c=15.0, wind_m_s=2.0)
+    columns["air_c"] = 15.0 + np.sin(np.arange(25))
+    weather = make_weather(times, columns, site=SITE)
+    assert weather.times_s.diff().max() <= 600.0 and len(weather.times_s) == 24 * 6 + 1
+    assert weather.air_c[::6].tolist() == pytest.approx(columns["air_c"].tolist())
+    assert weather.sun.norm(dim=1).allclose(torch.ones(145, dtype=torch.float64))
+    assert "cloudless" in weather.notes["irradiance"] and "irradiance_w_m2" in weather.notes["missing"]
+    assert weather.irradiance_w_m2.max() > 800.0
+    assert 0.3 < weather.notes["night_share"] < 0.4
+    night = weather.sun[:, 2] <= 0
+    for name in ("direct_w_m2", "diffuse_w_m2", "irradiance_w_m2"):
+        assert (getattr(weather, name)[night] == 0).all()
+
+
+def test_a_night_without_sun_is_told(caplog):
+    times, columns = hourly(3, air_c=15.0)
+    with caplog.at_level(logging.WARNING):
+        weather = make_weather(times - 3 * 3600.0, columns, site=SITE)
+    assert "the sun never rises" in weather.notes["night_only"] and "the sun never rises" in caplog.text
+    assert weather.direct_w_m2.abs().max() == 0.0 and weather.notes["night_share"] == 1.0
+
+
+def test_sunlight_at_midnight_means_a_wrong_zone():
+    times, columns = hourly(irradiance_w_m2=0.0)
+    columns["irradiance_w_m2"][:4] = 400.0
+    with pytest.raises(SceneError, match="400 W/m² of sunlight at 2024-07-11T00:00:00.* Check the time zone"):
+        make_weather(times, columns, site=SITE)
+
+
+def test_seconds_without_a_date_have_no_sun():
+    weather = make_weather(np.array([0.0, 3600.0]), {"air_c": np.array([1.0, 2.0])}, site=SITE)
+    assert weather.sun is None and "UTC of its times is not known" in weather.notes["sun"]
+
+
+def test_a_written_record_is_read_back(tmp_path):
+    times, columns = hourly(air_c=15.0, wind_m_s=2.0, irradiance_w_m2=0.0)
+    columns["irradiance_w_m2"] = 0.8 * clear_sky(SITE, times)
+    weather = make_weather(times, columns, site=SITE)
+    write_weather(tmp_path / "weather.csv", weather)
+    again = read_weather(tmp_path / "weather.csv", site=SITE)
+    assert torch.equal(again.times_s, weather.times_s)
+    for name in ("air_c", "wind_m_s", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2", "sun"):
+        assert torch.allclose(getattr(again, name), getattr(weather, name), atol=1e-6)
+
+
+def test_the_weather_at_a_moment_is_linear_between_samples_and_nothing_is_extrapolated():
+    weather = Weather(torch.tensor([0.0, 100.0, 400.0]).double(), air_c=torch.tensor([10.0, 20.0, 14.0]).double())
+    assert [weather.at(t).air_c for t in (0.0, 50.0, 100.0, 250.0, 400.0)] == pytest.approx([10, 15, 20, 17, 14])
+    assert weather.at(50.0).wind_m_s is None
+    for time in (-1.0, 401.0):
+        with pytest.raises(SceneError, match="there is no weather for second .*: the record runs from 0 to 400 s"):
+            weather.at(time)
+
+
+@pytest.mark.parametrize(
+    ("times", "air", "message"),
+    [
+        ([0.0], [1.0], "two or more samples at strictly increasing times"),
+        ([0.0, 0.0], [1.0, 1.0], "strictly increasing"),
+        ([0.0, 1.0], [1.0, math.nan], "weather.air_c must hold 2 finite samples"),
+        ([0.0, 1.0], [1.0], "weather.air_c must hold 2 finite samples"),
+    ],
+)
+def test_a_record_that_cannot_be_interpolated_is_refused(times, air, message):
+    with pytest.raises(SceneError, match=message):
+        Weather(torch.tensor(times).double(), air_c=torch.tensor(air).double())
+
+
+@pytest.fixture(scope="module")
+def yard() -> SceneData:
+    from datamodules.synthetic import Synthetic
+
+    return Synthetic(scene="outdoor", size="tiny", frames=6).scene
+
+
+def test_another_table_replaces_the_weather_of_a_scene(yard, tmp_path):
+    path = tmp_path / "gale.csv"
+    times = MIDNIGHT_S + 3600.0 * np.arange(49)
+    path.write_text("utc,wind_m_s,air_c\n" + "".join(f"{t},{20.0},{8.0}\n" for t in times))
+    scene = with_weather(yard, path)
+    assert scene.weather.at(3600.0).wind_m_s == 20.0 and scene.weather.humidity_percent is None
+    assert torch.allclose(scene.weather.sun[6], yard.weather.sun[6], atol=1e-9)  # the same place and clock
+    for part in ("train", "val", "test"):
+        for view, old in zip(getattr(scene, part), getattr(yard, part), strict=True):
+            assert view.frame.environment == scene.weather.at(view.time_s) != old.frame.environment
+            assert torch.equal(view.thermal, old.thermal)
+    assert scene.notes["weather_replaced_by"] == str(path)
+
+
+def test_a_table_that_misses_frames_is_refused_by_name(yard, tmp_path):
+    path = tmp_path / "short.csv"
+    path.write_text(f"utc,air_c\n{MIDNIGHT_S},8\n{MIDNIGHT_S + 3600 * 3},8\n")
+    with pytest.raises(SceneError, match="frame frame_0000.*: there is no weather for second .* covers every frame"):
+        with_weather(yard, path)
+    path.write_text("time_s,air_c\n0,8\n5000,8\n")
+    with pytest.raises(SceneError, match="do not share a clock"):
+        with_weather(yard, path)
