@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -14,18 +15,31 @@ from heatsplat.kernels.simd import LANES, load, store
 _CHAINS = 8  # independent sums, enough to hide the latency of one multiply-add
 
 
-def vector_rate(threads: int, repeats: int = 100) -> float:
-    """Multiply-adds on sixteen floats per second, measured over ``threads`` threads; the best of ``repeats``."""
+def vector_rate(threads: int, seconds: float = 1.0) -> float:
+    """Multiply-adds on sixteen floats per second, measured over ``threads`` threads for some seconds."""
     use_threads(threads)
     rounds = 200_000  # half a millisecond, which a busy machine grants to all threads at once now and then
     values = np.full((threads, (2 * _CHAINS + 1) * LANES), 0.5, np.float32)
     _multiply_add(values, 1)
-    best = np.inf
-    for _ in range(repeats):
+    return threads * rounds * _CHAINS / _quickest(lambda: _multiply_add(values, rounds), seconds)
+
+
+def memory_rate(threads: int, seconds: float = 1.0) -> float:
+    """Bytes per second to and from memory, measured by doubling numbers in place for some seconds."""
+    use_threads(threads)
+    numbers = np.zeros(32 * 2**20, np.float32)  # 128 MB, more than any cache it should not measure
+    _double(numbers)
+    return 2 * numbers.nbytes / _quickest(lambda: _double(numbers), seconds)
+
+
+def _quickest(work: Callable[[], None], seconds: float) -> float:
+    """The least time that ``work`` took, of as many times as fit into ``seconds``."""
+    best, end = np.inf, time.perf_counter() + seconds
+    while time.perf_counter() < end:
         start = time.perf_counter()
-        _multiply_add(values, rounds)
+        work()
         best = min(best, time.perf_counter() - start)
-    return threads * rounds * _CHAINS / best
+    return best
 
 
 @kernel
@@ -39,19 +53,6 @@ def _multiply_add(values, rounds):
             a, b, c, d = a * factor + factor, b * factor + factor, c * factor + factor, d * factor + factor
             e, f, g, h = e * factor + factor, f * factor + factor, g * factor + factor, h * factor + factor
         store(own, 8 * LANES, a + b + c + d + e + f + g + h)
-
-
-def memory_rate(threads: int, repeats: int = 10) -> float:
-    """Bytes per second to and from memory, measured by doubling numbers in place; the best of ``repeats``."""
-    use_threads(threads)
-    numbers = np.zeros(32 * 2**20, np.float32)  # 128 MB, more than any cache it should not measure
-    _double(numbers)
-    best = np.inf
-    for _ in range(repeats):
-        start = time.perf_counter()
-        _double(numbers)
-        best = min(best, time.perf_counter() - start)
-    return 2 * numbers.nbytes / best
 
 
 @kernel

@@ -201,6 +201,56 @@ def box_tiles(gaussian, screen):
     return wide * ((bottom + TILE_BLOCKS - 1) // TILE_BLOCKS - top // TILE_BLOCKS)
 
 
+@inline
+def _seen_from(camera, means, quats, scales, first, rows):
+    """What both passes need of sixteen Gaussians, from the row ``first`` of their arrays on.
+
+    Returns:
+        world: centres in the world; here: centres in the camera; slopes: x/z and y/z, clamped, and 1/z; q: unit
+        quaternions and their lengths; rotation; rows: the two rows of J W; turned: the same times R; axes.
+    """
+    world = load_columns(means, first, 3, rows)
+    here = _to_camera(camera, world[0], world[1], world[2])
+    inverse_z = 1.0 / here[2]
+    x_over_z = maximum(minimum(here[0] * inverse_z, camera[HIGHEST_X]), camera[LOWEST_X])
+    y_over_z = maximum(minimum(here[1] * inverse_z, camera[HIGHEST_Y]), camera[LOWEST_Y])
+    qw, qx, qy, qz = load_columns(quats, first, 4, rows)
+    q, length = _unit_quaternion(qw, qx, qy, qz)
+    rotation = _rotation(q)
+    row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
+    turned = _times_rotation(row_x, rotation), _times_rotation(row_y, rotation)
+    axes = load_columns(scales, first, 3, rows)
+    return world, here, (x_over_z, y_over_z, inverse_z), (q, length), rotation, (row_x, row_y), turned, axes
+
+
+@inline
+def _largest_opacity(opacities, first, rows):
+    """The largest opacity over the modalities."""
+    opacity = splat(0.0)
+    for modality in range(opacities.shape[0]):
+        (candidate,) = load_columns(opacities[modality], first, 1, rows)
+        opacity = maximum(candidate, opacity)
+    return opacity
+
+
+@part
+def _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scratch):
+    """Writes the rows of visible Gaussians and their ids from ``place`` on; returns the place after."""
+    for column in range(RANK):
+        store_vector(scratch, chunk * RANK + column, columns[column])
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
+        gaussian = first + lane
+        for column in range(RANK):
+            screen[gaussian, column] = scratch[chunk, column, lane]
+        screen[gaussian, RANK] = place - chunk * CHUNK
+        depths[gaussian] = screen[gaussian, DEPTH]
+        ids[place] = gaussian
+        place += 1
+    return place
+
+
 @part
 def _project_block(
     first, means, quats, scales, opacities, camera, width, height, antialiased,
@@ -208,24 +258,11 @@ def _project_block(
 ):  # fmt: skip
     """Projects Gaussians ``first`` to ``first + 15``; writes visible ids from ``place`` on, returns the place after."""
     rows = means.shape[0] - first
-    x, y, z = load_columns(means, first, 3, rows)
-    x, y, z = _to_camera(camera, x, y, z)
-    inverse_z = 1.0 / z
-    x_over_z = maximum(minimum(x * inverse_z, camera[HIGHEST_X]), camera[LOWEST_X])
-    y_over_z = maximum(minimum(y * inverse_z, camera[HIGHEST_Y]), camera[LOWEST_Y])
-    qw, qx, qy, qz = load_columns(quats, first, 4, rows)
-    q, length = _unit_quaternion(qw, qx, qy, qz)
-    rotation = _rotation(q)
-    axes = load_columns(scales, first, 3, rows)
-
-    row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
-    u, v = _times(_times_rotation(row_x, rotation), axes), _times(_times_rotation(row_y, rotation), axes)
-    a, b, c, determinant, sharp = _covariance(u, v)
-
-    opacity = splat(0.0)
-    for modality in range(opacities.shape[0]):
-        (candidate,) = load_columns(opacities[modality], first, 1, rows)
-        opacity = maximum(candidate, opacity)
+    _, (x, y, z), (_, _, inverse_z), (_, length), _, _, turned, axes = _seen_from(
+        camera, means, quats, scales, first, rows
+    )
+    a, b, c, determinant, sharp = _covariance(_times(turned[0], axes), _times(turned[1], axes))
+    opacity = _largest_opacity(opacities, first, rows)
     if antialiased:
         opacity = opacity * sqrt(sharp / determinant)
     log_opacity = log2(maximum(opacity, ALPHA_MIN))
@@ -251,32 +288,21 @@ def _project_block(
 
     lanes = bits(visible)
     seen[first // LANES] = lanes
-    if lanes != 0:
-        one, mixed, two = _whitening(b, c, determinant)
-        one, mixed, two = one * WHITENING, mixed * WHITENING, two * WHITENING
-        left, right = _block_range(mean_x, reach_x, (width + BLOCK - 1) // BLOCK)
-        top, bottom = _block_range(mean_y, reach_y, (height + BLOCK - 1) // BLOCK)
-        limit = (log_opacity - LOG2_ALPHA_MIN) * 1.001 + 1e-4  # more than the rounding of the exponent
-        peak = -mixed * sqrt(limit) / (two * sqrt(mixed * mixed + two * two))
-        columns = (
-            mean_x, mean_y, one, mixed, two, log_opacity, z,
-            select(visible, left, 0.0), select(visible, right, 0.0),
-            select(visible, top, 0.0), select(visible, bottom, 0.0),
-            limit, peak, -mixed / one, 1.0 / one,
-        )  # fmt: skip
-        for column in range(RANK):
-            store_vector(scratch, chunk * RANK + column, columns[column])
-    while lanes != 0:
-        lane = lowest_bit(lanes)
-        lanes &= lanes - 1
-        gaussian = first + lane
-        for column in range(RANK):
-            screen[gaussian, column] = scratch[chunk, column, lane]
-        screen[gaussian, RANK] = place - chunk * CHUNK
-        depths[gaussian] = screen[gaussian, DEPTH]
-        ids[place] = gaussian
-        place += 1
-    return place
+    if lanes == 0:
+        return place
+    one, mixed, two = _whitening(b, c, determinant)
+    one, mixed, two = one * WHITENING, mixed * WHITENING, two * WHITENING
+    left, right = _block_range(mean_x, reach_x, (width + BLOCK - 1) // BLOCK)
+    top, bottom = _block_range(mean_y, reach_y, (height + BLOCK - 1) // BLOCK)
+    limit = (log_opacity - LOG2_ALPHA_MIN) * 1.001 + 1e-4  # more than the rounding of the exponent
+    peak = -mixed * sqrt(limit) / (two * sqrt(mixed * mixed + two * two))
+    columns = (
+        mean_x, mean_y, one, mixed, two, log_opacity, z,
+        select(visible, left, 0.0), select(visible, right, 0.0),
+        select(visible, top, 0.0), select(visible, bottom, 0.0),
+        limit, peak, -mixed / one, 1.0 / one,
+    )  # fmt: skip
+    return _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scratch)
 
 
 @kernel
@@ -321,34 +347,12 @@ def project(
     return visible, tiles
 
 
-@part
-def _project_block_backward(
-    first, visible, sums, means, quats, scales, camera, antialiased,
-    v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
-):  # fmt: skip
-    """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
-    rows = means.shape[0] - first
-    world = load_columns(means, first, 3, rows)
-    x, y, z = _to_camera(camera, world[0], world[1], world[2])
-    inverse_z = 1.0 / z
-    x_over_z = maximum(minimum(x * inverse_z, camera[HIGHEST_X]), camera[LOWEST_X])
-    y_over_z = maximum(minimum(y * inverse_z, camera[HIGHEST_Y]), camera[LOWEST_Y])
-    qw, qx, qy, qz = load_columns(quats, first, 4, rows)
-    q, length = _unit_quaternion(qw, qx, qy, qz)
-    rotation = _rotation(q)
-    axes = load_columns(scales, first, 3, rows)
-    row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
-    rotated_x, rotated_y = _times_rotation(row_x, rotation), _times_rotation(row_y, rotation)
-    u, v = _times(rotated_x, axes), _times(rotated_y, axes)
-    a, b, c, determinant, sharp = _covariance(u, v)
-    one, mixed, two = _whitening(b, c, determinant)
-
-    # From moments of g: with the whitening as a matrix L, the mean's gradient is L (sum of g u), and that of the
-    # covariance is L (sum of g u u^T) L^T / 2, of which twice the products with U and V follow.
-    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
-    m1, m2 = m1 * INVERSE_WHITENING, m2 * INVERSE_WHITENING
-    m11, m12, m22 = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
-    v_mean_x, v_mean_y = one * m1, mixed * m1 + two * m2
+@inline
+def _covariance_backward(u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased):
+    """Gradients of U and V, from the moments of g: with the whitening as a matrix L, the gradient of the covariance is
+    L (sum of g u u^T) L^T / 2, of which twice the products with U and V follow."""
+    one, mixed, two = whitening
+    m11, m12, m22 = moments
     left = mixed * m11 + two * m12
     v_a, v_b, v_c = one * one * m11, one * left, mixed * left + two * (mixed * m12 + two * m22)
     through_u, through_v = (splat(0.0), splat(0.0), splat(0.0)), (splat(0.0), splat(0.0), splat(0.0))
@@ -359,72 +363,104 @@ def _project_block_backward(
         v_normal = (spread * normal[0], spread * normal[1], spread * normal[2])
         through_u, through_v = _cross(v, v_normal), _cross(v_normal, u)
         v_a, v_c = v_a - shrink, v_c - shrink
-    v_u, v_v = _sum(u, v_a, v, v_b, through_u), _sum(u, v_b, v, v_c, through_v)
+    return _sum(u, v_a, v, v_b, through_u), _sum(u, v_b, v, v_c, through_v)
 
-    v_sx, v_sy, v_sz = _sum(_times(v_u, rotated_x), 1.0, _times(v_v, rotated_y), 1.0, (0.0, 0.0, 0.0))
-    v_rotated_x, v_rotated_y = _times(v_u, axes), _times(v_v, axes)
-    v_rotation = (
-        row_x[0] * v_rotated_x[0] + row_y[0] * v_rotated_y[0],
-        row_x[0] * v_rotated_x[1] + row_y[0] * v_rotated_y[1],
-        row_x[0] * v_rotated_x[2] + row_y[0] * v_rotated_y[2],
-        row_x[1] * v_rotated_x[0] + row_y[1] * v_rotated_y[0],
-        row_x[1] * v_rotated_x[1] + row_y[1] * v_rotated_y[1],
-        row_x[1] * v_rotated_x[2] + row_y[1] * v_rotated_y[2],
-        row_x[2] * v_rotated_x[0] + row_y[2] * v_rotated_y[0],
-        row_x[2] * v_rotated_x[1] + row_y[2] * v_rotated_y[1],
-        row_x[2] * v_rotated_x[2] + row_y[2] * v_rotated_y[2],
-    )
-    v_qw, v_qx, v_qy, v_qz = _rotation_backward(q, length, v_rotation)
 
-    # The rows of J W are fx/z (W_0 - x/z W_2) and fy/z (W_1 - y/z W_2); clamped ratios pass no gradient.
+@inline
+def _outer(a, b, c, d):
+    """The matrix a b^T + c d^T, row by row."""
+    return (
+        a[0] * b[0] + c[0] * d[0], a[0] * b[1] + c[0] * d[1], a[0] * b[2] + c[0] * d[2],
+        a[1] * b[0] + c[1] * d[0], a[1] * b[1] + c[1] * d[1], a[1] * b[2] + c[1] * d[2],
+        a[2] * b[0] + c[2] * d[0], a[2] * b[1] + c[2] * d[1], a[2] * b[2] + c[2] * d[2],
+    )  # fmt: skip
+
+
+@inline
+def _rotated(r, a):
+    """A rotation times a column of three."""
+    return _dot(a, r[0:3]), _dot(a, r[3:6]), _dot(a, r[6:9])
+
+
+@inline
+def _centre_backward(camera, here, slopes, jacobian, v_row_x, v_row_y, v_mean_x, v_mean_y, v_depth):
+    """Gradient of the centre in the camera, from those of the rows of J W, of the mean on the screen and of depth.
+
+    The rows are fx/z (W_0 - x/z W_2) and fy/z (W_1 - y/z W_2); clamped ratios pass no gradient.
+    """
+    x, y, z = here
+    inverse_z = slopes[2]
     jx, jy = camera[FX] * inverse_z, camera[FY] * inverse_z
     axis = (camera[6], camera[7], camera[8])
-    v_row_x = (
-        _dot(v_rotated_x, rotation[0:3]),
-        _dot(v_rotated_x, rotation[3:6]),
-        _dot(v_rotated_x, rotation[6:9]),
-    )
-    v_row_y = (
-        _dot(v_rotated_y, rotation[0:3]),
-        _dot(v_rotated_y, rotation[3:6]),
-        _dot(v_rotated_y, rotation[6:9]),
-    )
     free_x = (x * inverse_z >= camera[LOWEST_X]) & (x * inverse_z <= camera[HIGHEST_X])
     free_y = (y * inverse_z >= camera[LOWEST_Y]) & (y * inverse_z <= camera[HIGHEST_Y])
     v_x_over_z = camera[FX] * v_mean_x - select(free_x, jx * _dot(v_row_x, axis), 0.0)
     v_y_over_z = camera[FY] * v_mean_y - select(free_y, jy * _dot(v_row_y, axis), 0.0)
-    v_inverse_z = z * (_dot(v_row_x, row_x) + _dot(v_row_y, row_y)) + x * v_x_over_z + y * v_y_over_z
-    v_x = select(visible, v_x_over_z * inverse_z, 0.0)
-    v_y = select(visible, v_y_over_z * inverse_z, 0.0)
-    v_z = select(visible, v_depth - v_inverse_z * inverse_z * inverse_z, 0.0)
+    v_inverse_z = z * (_dot(v_row_x, jacobian[0]) + _dot(v_row_y, jacobian[1])) + x * v_x_over_z + y * v_y_over_z
+    return v_x_over_z * inverse_z, v_y_over_z * inverse_z, v_depth - v_inverse_z * inverse_z * inverse_z
 
+
+@inline
+def _only(visible, vectors):
+    """Three vectors where Gaussians are visible, else zero."""
+    return select(visible, vectors[0], 0.0), select(visible, vectors[1], 0.0), select(visible, vectors[2], 0.0)
+
+
+@part
+def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y):
+    """Adds what Gaussians tell about rotation (0-8) and translation (9-11) of the camera."""
+    jx, jy = camera[FX] * slopes[2], camera[FY] * slopes[2]
+    for k in range(3):
+        by_x, by_y = jx * v_row_x[k], jy * v_row_y[k]
+        by_z = -(slopes[0] * by_x + slopes[1] * by_y)
+        v_cameras[chunk, k] += np.float64(total(select(visible, by_x + v_here[0] * world[k], 0.0)))
+        v_cameras[chunk, 3 + k] += np.float64(total(select(visible, by_y + v_here[1] * world[k], 0.0)))
+        v_cameras[chunk, 6 + k] += np.float64(total(select(visible, by_z + v_here[2] * world[k], 0.0)))
+    for k in range(3):
+        v_cameras[chunk, 9 + k] += np.float64(total(v_here[k]))
+
+
+@part
+def _project_block_backward(
+    first, visible, sums, means, quats, scales, camera, antialiased,
+    v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
+):  # fmt: skip
+    """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
+    rows = means.shape[0] - first
+    world, here, slopes, (q, length), rotation, jacobian, turned, axes = _seen_from(
+        camera, means, quats, scales, first, rows
+    )
+    u, v = _times(turned[0], axes), _times(turned[1], axes)
+    a, b, c, determinant, sharp = _covariance(u, v)
+    whitening = _whitening(b, c, determinant)
+
+    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
+    m1, m2 = m1 * INVERSE_WHITENING, m2 * INVERSE_WHITENING
+    moments = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
+    v_mean_x, v_mean_y = whitening[0] * m1, whitening[1] * m1 + whitening[2] * m2
+    v_u, v_v = _covariance_backward(u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased)
+
+    v_axes = _sum(_times(v_u, turned[0]), 1.0, _times(v_v, turned[1]), 1.0, (0.0, 0.0, 0.0))
+    v_turned = _times(v_u, axes), _times(v_v, axes)
+    v_quat = _rotation_backward(q, length, _outer(jacobian[0], v_turned[0], jacobian[1], v_turned[1]))
+    v_row_x, v_row_y = _rotated(rotation, v_turned[0]), _rotated(rotation, v_turned[1])
+    v_here = _centre_backward(
+        camera, here, slopes, jacobian, v_row_x, v_row_y, v_mean_x, v_mean_y, v_depth
+    )  # fmt: skip
+    v_here = _only(visible, v_here)
     v_world = (
-        camera[0] * v_x + camera[3] * v_y + camera[6] * v_z,
-        camera[1] * v_x + camera[4] * v_y + camera[7] * v_z,
-        camera[2] * v_x + camera[5] * v_y + camera[8] * v_z,
+        camera[0] * v_here[0] + camera[3] * v_here[1] + camera[6] * v_here[2],
+        camera[1] * v_here[0] + camera[4] * v_here[1] + camera[7] * v_here[2],
+        camera[2] * v_here[0] + camera[5] * v_here[1] + camera[8] * v_here[2],
     )
-    store_columns(v_means, first, v_world, rows)
-    v_s = (select(visible, v_sx, 0.0), select(visible, v_sy, 0.0), select(visible, v_sz, 0.0))
-    store_columns(v_scales, first, v_s, rows)
-    v_q = (
-        select(visible, v_qw, 0.0),
-        select(visible, v_qx, 0.0),
-        select(visible, v_qy, 0.0),
-        select(visible, v_qz, 0.0),
-    )
-    store_columns(v_quats, first, v_q, rows)
-    store_columns(v_means2d, first, (select(visible, v_mean_x, 0.0), select(visible, v_mean_y, 0.0)), rows)
 
+    store_columns(v_means, first, v_world, rows)
+    store_columns(v_scales, first, _only(visible, v_axes), rows)
+    v_qx, v_qy, v_qz = _only(visible, v_quat[1:])
+    store_columns(v_quats, first, (select(visible, v_quat[0], 0.0), v_qx, v_qy, v_qz), rows)
+    store_columns(v_means2d, first, (select(visible, v_mean_x, 0.0), select(visible, v_mean_y, 0.0)), rows)
     if v_cameras.shape[1] > 0:
-        for k in range(3):
-            by_x, by_y = jx * v_row_x[k], jy * v_row_y[k]
-            by_z = -(x_over_z * by_x + y_over_z * by_y)
-            v_cameras[chunk, k] += np.float64(total(select(visible, by_x + v_x * world[k], 0.0)))
-            v_cameras[chunk, 3 + k] += np.float64(total(select(visible, by_y + v_y * world[k], 0.0)))
-            v_cameras[chunk, 6 + k] += np.float64(total(select(visible, by_z + v_z * world[k], 0.0)))
-        v_cameras[chunk, 9] += np.float64(total(v_x))
-        v_cameras[chunk, 10] += np.float64(total(v_y))
-        v_cameras[chunk, 11] += np.float64(total(v_z))
+        _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y)
 
 
 @kernel

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from heatsplat.studies.renderer_parts.floors import Machine
 
@@ -96,22 +97,16 @@ def _ms(value: float) -> str:
 
 
 def _any(value: Any) -> str:
-    if value is None:
-        return ""
-    return (
-        f"{value:.3g}"
-        if isinstance(value, float) and value < 1000
-        else str(value)
-        if isinstance(value, str)
-        else f"{value:.0f}"
-    )
+    if isinstance(value, float):
+        return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+    return "" if value is None else str(value)
 
 
 def _picture(rows: list[Row], path: Path) -> None:
     """Forward + backward time against N, pixels and channels; dashed is the floor."""
     rows = [row for row in rows if row["points"] == "synthetic"]
     most = max(row["threads"] for row in rows)
-    figure = matplotlib.figure.Figure(figsize=(13, 4.2), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(13, 4.4), layout="constrained")
     panels = (
         ("gaussians", "pixels", "Gaussians", "{:,} pixels"),
         ("pixels", "gaussians", "pixels", "{:,} Gaussians"),
@@ -121,17 +116,22 @@ def _picture(rows: list[Row], path: Path) -> None:
         for k, value in enumerate(sorted({row[over] for row in rows})):
             line = [row for row in rows if row[over] == value and _belongs(row, along, rows, most)]
             line.sort(key=lambda row: row[along])
-            if len({row[along] for row in line}) < 2:
-                continue
             x = [row[along] for row in line]
-            axis.plot(x, [_total(row) for row in line], "o-", color=f"C{k}", label=legend.format(value))
-            axis.plot(x, [_total(row, "floor_") for row in line], "--", color=f"C{k}", lw=1)
+            if len(set(x)) > 1:
+                axis.plot(x, [_total(row) for row in line], "o-", color=f"C{k}", label=legend.format(value))
+                axis.plot(x, [_total(row, "floor_") for row in line], "--", color=f"C{k}", lw=1)
         if along != "channels":
             axis.set(xscale="log", yscale="log")
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
+            axis.yaxis.set_minor_locator(NullLocator())
         else:
-            axis.set(xticks=sorted({row["channels"] for row in rows}), ylim=(0, None))
-        axis.set(xlabel=label, ylabel="forward + backward, ms (dashed: floor)")
-        axis.grid(alpha=0.3, which="both")
+            axis.set_ylim(bottom=0)
+        ticks = sorted({row[along] for row in rows})
+        axis.set_xticks(ticks, [f"{tick / 1000:.3g} k" if tick >= 1000 else str(tick) for tick in ticks], minor=False)
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.set(xlabel=label, ylabel="forward + backward, ms (dashed: floor)", title=f"time over {label}")
+        axis.grid(alpha=0.3)
         if axis.lines:
             axis.legend(fontsize=8)
     figure.savefig(path, dpi=120)
