@@ -10,6 +10,8 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import View
+
 
 class NotFinite(FloatingPointError):
     """A tensor of the training has NaN or infinite values. The message names it and the step."""
@@ -30,13 +32,17 @@ class FiniteGuard(pl.Callback):
         if every < 1:
             raise ValueError(f"FiniteGuard(every={every}): at least 1 step must lie between looks")
         self.every = every
+        self._seen: str | None = None
+
+    def on_train_batch_start(self, trainer: pl.Trainer, module: pl.LightningModule, view: View, *_: Any) -> None:
+        self._seen = view.frame.name
 
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
         if trainer.global_step % self.every == 0:
             gradients = ((f"gradient of {name}", p.grad) for name, p in module.named_parameters() if p.grad is not None)
-            demand_finite(gradients, trainer.global_step + 1)
+            demand_finite(gradients, trainer.global_step + 1, self._seen)
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: dict[str, Any], *_: Any
@@ -45,8 +51,9 @@ class FiniteGuard(pl.Callback):
         if module.device.type == "cpu" or step % self.every == 0:
             total = outputs["loss"]
             if not math.isfinite(total.item()):
-                demand_finite(((f"loss term '{name}'", term) for name, term in outputs.get("terms", {}).items()), step)
-                demand_finite([("loss", total)], step)
+                terms = outputs.get("terms", {}).items()
+                demand_finite(((f"loss term '{name}'", term) for name, term in terms), step, self._seen)
+                demand_finite([("loss", total)], step, self._seen)
         if step % self.every == 0:
             demand_finite(_parameters(module), step)
 
@@ -56,8 +63,10 @@ class FiniteGuard(pl.Callback):
             demand_finite(_moments(optimizer), trainer.global_step)
 
 
-def demand_finite(tensors: Iterable[tuple[str, Tensor]], step: int) -> None:
+def demand_finite(tensors: Iterable[tuple[str, Tensor]], step: int, view: str | None = None) -> None:
     """Raises NotFinite with the names of all ``tensors`` (pairs of name and tensor) that are not finite at ``step``.
+
+    ``view`` is the name of the training image that the step saw, where it is known.
 
     The sum of a tensor is finite if its values are and do not overflow together; only where it is not are the values
     looked at one by one, which takes several times as long.
@@ -74,7 +83,7 @@ def demand_finite(tensors: Iterable[tuple[str, Tensor]], step: int) -> None:
     if broken:
         raise NotFinite(
             f"step {step}: {'; '.join(broken)}. Nothing of it is in a checkpoint: continue from the last one with a "
-            "lower learning rate of that tensor, or look at the input that this step saw."
+            f"lower learning rate of that tensor, or look at the image that this step saw{f', {view}' if view else ''}."
         )
 
 
