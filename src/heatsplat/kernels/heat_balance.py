@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel

@@ -1,0 +1,315 @@
+"""Every Gaussian is a piece of surface under the sky, heated and cooled by the recorded weather in closed form."""
+
+from __future__ import annotations
+
+import logging
+import math
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, Weather
+from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.physics import sky
+from heatsplat.physics.energy_balance import STEFAN_BOLTZMANN, Climate, Drivers, Surface, power_excess
+from heatsplat.physics.responses import driver_means
+from heatsplat.physics.units import celsius, kelvin
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.clipping import CLIPS, clipped
+
+log = logging.getLogger(__name__)
+
+SOLUTIONS = ("linear", "corrected")
+NORMALS = ("splats", "level")
+SKIES = ("auto", *sky.LAWS)
+SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
+SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
+WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
+START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
+START_TIME_CONSTANT_S = 3600.0
+START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
+LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
+COSTS = {"linear": 400, "corrected": 30_000}
+
+
+class EnergyBalance(ThermalModel):
+    """Emission of C dT/dt = α G(t) + h(t) (T_air - T) + e σ (T_sky⁴ - T⁴) per unit area (ThermoGS, Eq. 2-5, with a sky).
+
+    Only ratios reach the image (heatsplat.physics.energy_balance): α, h, e and the capacity C times any number give the
+    same temperatures. Learned are the ratios themselves, in units in which an optimiser's steps are of order one; absolute
+    attributes follow with ``emissivity`` given, and are maps for people, not measurements. Effects that the scene does not
+    call for are absent: without a sky there is no share of radiation, without wind in the record no share of wind, without
+    the sun's direction no normal, without any irradiance no sunlight.
+
+    Identifiable: α/C and h/C, and e/C by night, with the state at the start of the record where it is still remembered
+    when images begin; the share of wind in h where the wind changes while surface and air differ. Not identifiable: the
+    common factor of α, h, e and C; α from C/h of surfaces that the sun never meets; the rate of surfaces that settle between
+    any two samples of the weather.
+
+    **Convention:** the record's first sample is the start. In another weather (a scene whose record is another) surfaces
+    start from the state that they had at the start of the trained record, whenever the other one starts.
+
+    Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW;
+    "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection.
+
+    Args:
+        solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
+            record; "corrected" solves the full balance and costs the samples that a surface remembers.
+        sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
+            humidity and the last without), or None: nothing radiates.
+        wind: whether wind, if recorded, moves convection.
+        sun: whether sunlight, if recorded, heats.
+        normals: "splats" meets the sun with the shortest axis of each Gaussian, on the side of the training cameras;
+            "level" has every surface lie level, under the global irradiance.
+        emissivity: assumed for ``attributes``, in (0, 1].
+        clip: how values outside the range are shown; see ``NewtonHarmonic``.
+        lr_initial, lr_rate, lr_sun, lr_share, lr_wind: learning rates.
+        lr_end: factor on them at the last step, log-linear in between.
+
+    Raises:
+        ValueError: an option is unknown or out of its range.
+    """
+
+    needs = frozenset({"time", "weather", "thermal_range"})
+
+    def __init__(
+        self,
+        solution: str = "linear",
+        sky: str | None = "auto",
+        wind: bool = True,
+        sun: bool = True,
+        normals: str = "splats",
+        emissivity: float = 0.95,
+        clip: str = "straight_through",
+        lr_initial: float = 2.5e-3,
+        lr_rate: float = 2e-2,
+        lr_sun: float = 2e-2,
+        lr_share: float = 1e-2,
+        lr_wind: float = 1e-2,
+        lr_end: float = 0.1,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (
+            ("solution", solution, SOLUTIONS),
+            ("normals", normals, NORMALS),
+            ("clip", clip, CLIPS),
+            ("sky", sky, (*SKIES, None)),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+        if not 0 < emissivity <= 1:
+            raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
+        self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
+        self._sky, self._wind, self._sun = sky, wind, sun
+        self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
+        self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
+        self.climate: Climate | None = None
+        self.simulated: dict[str, dict] = {}
+        # What trained parameters count from; another weather leaves it as it is.
+        self.register_buffer("range_c", torch.zeros(2, dtype=torch.float64))
+        self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("outside", torch.zeros(3))
+        self._weather: Weather | None = None
+        self.register_load_state_dict_post_hook(_live_on)
+
+    # What the contract asks -----------------------------------------------------------------------------
+
+    def prepare(self, scene: SceneData) -> None:
+        self.check(scene)
+        weather = scene.weather
+        if weather.air_c is None:
+            raise SceneError(f"the weather of scene '{scene.name}' has no air_c, the temperature of the air; add it")
+        if self.reference_k == 0:  # otherwise this is another weather for what was trained
+            self.range_c.copy_(torch.tensor([scene.thermal_range.min_c, scene.thermal_range.max_c]))
+            self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
+            if self._wind and weather.wind_m_s is not None:
+                self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
+            centers = torch.stack([frame.camera.center for frame in scene.train.frames])
+            self.outside.copy_(centers.mean(0))
+        self.under(weather)
+        for part in (scene.train, scene.val, scene.test):
+            for frame in part.frames:
+                if frame.time_s is not None:
+                    weather.at(frame.time_s)  # refuses a frame outside the record before anything is trained
+
+    def under(self, weather: Weather) -> None:
+        """Lives in another weather from here on; what was learned stays.
+
+        Raises:
+            SceneError: the record lacks a series that the model was trained with.
+        """
+        drivers, self.simulated = self._drivers(weather)
+        self._weather, self.climate = weather, Climate(drivers)
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        grey = seeds.values.mean(1)
+        tensor = partial(PerGaussian, lr_end=self.lr_end)
+        tensors = {
+            "initial_state": tensor(grey, self.lr_initial),
+            "log_rate": tensor(torch.full_like(grey, -math.log(START_TIME_CONSTANT_S)), self.lr_rate),
+        }
+        drivers = self.climate.drivers
+        if self._sunlit:
+            tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
+        if drivers.sky is not None:
+            start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
+            tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
+        if drivers.breeze is not None:
+            tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
+        return tensors
+
+    def features(self, splats: Splats, query: Query) -> Emission:
+        if query.time_s is None:
+            raise ValueError("a scene that changes needs the time at which it is seen: give time_s")
+        celsius_above = self._temperature(splats, query) + celsius(self.reference_k).item()
+        unit = self._range.to_unit(celsius_above)
+        return Emission(clipped(unit, self.clip)[:, None])
+
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        return self._temperature(splats, Query(time_s=time_s)) + self.reference_k.item()
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's; and with
+        the assumed emissivity absorptivity, convection at mean wind and heat capacity per area."""
+        surface = self._surface(splats, query)
+        values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
+        if self._sunlit:
+            values["sun_k_per_kw_m2"] = surface.sun
+        if surface.wind is not None:
+            values["wind_share"] = surface.wind
+        if surface.share is not None:
+            exchange = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
+            values["radiation_share"] = surface.share
+            values["convection_w_m2_k"] = exchange * (1 - surface.share)
+            values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
+            if self._sunlit:
+                values["absorptivity"] = exchange * surface.sun / 1000.0
+        return values
+
+    def effects(self) -> dict[str, dict]:
+        return self.simulated
+
+    @property
+    def cost(self) -> int:
+        # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 150 steps of some 200.
+        return COSTS[self.solution]
+
+    # The balance ----------------------------------------------------------------------------------------
+
+    @property
+    def _range(self) -> ThermalRange:
+        return ThermalRange(*self.range_c.tolist())
+
+    @property
+    def _sunlit(self) -> bool:
+        return self.climate.drivers.light is not None
+
+    def _temperature(self, splats: Splats, query: Query) -> Tensor:
+        """Temperature of the Gaussians in ``query.ids`` in kelvin above the reference, [n]."""
+        times = self.climate.drivers.times_s
+        first, last = float(times[0]), float(times[-1])
+        if not first <= query.time_s <= last:
+            raise SceneError(
+                f"there is no weather for second {query.time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s "
+                "after the first training frame. Give a record that covers every moment that is asked for."
+            )
+        surface = self._surface(splats, query)
+        if self.solution == "linear":
+            return self.climate.linear_temperature(surface, query.time_s)
+        return self.climate.marched_temperature(surface, query.time_s)
+
+    def _surface(self, splats: Splats, query: Query) -> Surface:
+        def bounded(name: str, low: float, high: float) -> Tensor:
+            return low + (high - low) * query.rows(splats[name]).sigmoid()
+
+        initial = query.rows(splats["initial_state"])
+        drivers = self.climate.drivers
+        return Surface(
+            start=self._range.to_celsius(initial) - celsius(self.reference_k).item(),
+            log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
+            sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else torch.zeros_like(initial),
+            share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
+            wind=bounded("raw_wind", *WIND_LIMITS) if drivers.breeze is not None else None,
+            normals=self._normals(splats, query) if drivers.up is not None else None,
+        )
+
+    @torch.no_grad()
+    def _normals(self, splats: Splats, query: Query) -> Tensor:
+        """Shortest axes of the Gaussians, on the side of the middle of the training cameras, [n, 3].
+
+        Images and not heat decide how a Gaussian lies, so that no gradient passes.
+        """
+        axes = quats_to_matrices(query.rows(splats.quats))
+        shortest = query.rows(splats["log_scales"]).argmin(1)
+        normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(2)
+        outwards = ((self.outside - query.rows(splats.means)) * normals).sum(1, keepdim=True)
+        return torch.where(outwards < 0, -normals, normals)
+
+    def _first_sun(self, grey: Tensor) -> Tensor:
+        """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
+        drivers, share = self.climate.drivers, START_SHARE if self.climate.drivers.sky is not None else 0.0
+        mean = partial(driver_means, drivers.times_s)
+        light = drivers.light if drivers.beams is None else drivers.light + (drivers.beams @ drivers.up).clamp(min=0.0)
+        excess = (self._range.to_celsius(grey) - celsius(self.reference_k).item()).double()
+        loss = (1 - share) * (excess - mean(drivers.air))
+        if share:
+            loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))
+        return (loss / mean(light).clamp(min=1e-6)).clamp(*START_SUN).to(grey)
+
+    def _drivers(self, weather: Weather) -> tuple[Drivers, dict[str, dict]]:
+        """What drives surfaces in a weather, and the effects that are simulated with what was left out of them."""
+        reference = self.reference_k.item()
+        air_k = kelvin(weather.air_c)
+        effects: dict[str, dict[str, Any]] = {"convection": {"air": "recorded"}}
+        parts: dict[str, Any] = {}
+        up, parts["light"], parts["beams"] = self._light(weather, effects)
+        if self._sky is not None:
+            humid = weather.humidity_percent is not None
+            law = ("brutsaert" if humid else "swinbank") if self._sky == "auto" else self._sky
+            if law != "swinbank" and not humid:
+                raise SceneError(
+                    f"sky={law} needs humidity_percent, which the weather does not have; use sky=swinbank or sky=auto"
+                )
+            sky_k = sky.sky_temperature_k(air_k, weather.humidity_percent, law)
+            parts["sky"] = power_excess(sky_k - reference, reference)
+            parts["around"] = None if up is None else power_excess(air_k - reference, reference)
+            effects["long_waves"] = {"sky": law, "power": "T⁴" if self.solution == "corrected" else "about each mean"}
+            if not humid:
+                effects["long_waves"]["left_out"] = "humidity, which the weather lacks"
+        if self._wind and self.mean_wind > 0:
+            if weather.wind_m_s is None:
+                raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
+            parts["breeze"] = weather.wind_m_s / self.mean_wind - 1
+            effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
+        elif self._wind:
+            effects["convection"]["left_out"] = "wind, which the weather lacks"
+        drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
+        return drivers, effects
+
+    def _light(self, weather: Weather, effects: dict[str, dict]) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Up (None where surfaces lie level), light of all but the beams, and beams; tells the effects of it."""
+        if not self._sun:
+            return None, None, None
+        directed = None not in (weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
+        if directed and self.normals == "splats":
+            effects["sunlight"] = {"surfaces": "shortest axes", "sky": "isotropic"}
+            beams = weather.direct_w_m2[:, None] * weather.sun / 1000.0
+            return weather.up.to(torch.float64), weather.diffuse_w_m2 / 1000.0, beams
+        if weather.irradiance_w_m2 is None:
+            effects["convection"]["left_out_sun"] = "sunlight, of which the weather has no irradiance"
+            log.warning("the weather has no irradiance: nothing is heated by the sun")
+            return None, None, None
+        effects["sunlight"] = {"surfaces": "level"}
+        if self.normals == "splats":
+            effects["sunlight"]["left_out"] = "the direction of the sun, which the weather lacks"
+        return None, weather.irradiance_w_m2 / 1000.0, None
+
+
+def _live_on(model: EnergyBalance, _: Any) -> None:
+    """Builds the tables anew after a checkpoint has brought the constants of its own weather."""
+    if model._weather is not None:
+        model.under(model._weather)
