@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
 
 from datamodules.base import RawFrame, SceneDataModule
 from datamodules.formats.images import ImageIndex, read_image
 from datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from datamodules.points import obj_vertices, random_points
+from datamodules.surroundings import FEATURES_FILE, LABELS_FILE, WEATHER_FILE, Surroundings
+from datamodules.weather import utc_seconds
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
@@ -19,13 +24,19 @@ class NTR(SceneDataModule):
     """root/scene with transforms_train.json, transforms_test.json, the images they name and mesh.obj.
 
     Camera-to-world matrices are in OpenCV axes already, although the files look like Blender's: turning them would
-    break the scene. Times are seconds. The vertices of the mesh are the points.
+    break the scene. Times are seconds. The vertices of the mesh are the points; space_features.npy holds their features.
+    The data set has no weather and no classes; weather.csv (on the clock of the frames, or UTC with ``start_utc``) and
+    labels.npy are read where someone has added them.
 
     Args:
         min_c, max_c: temperatures of black and white; no file holds them. 10 and 50 are the authors' for summer,
             their winter scenes have -20 and 20.
         ambient_c: the authors' constant, or None.
         random_points: number of points to make up where the scene has no mesh.
+        metres_per_unit: scale of the world, or None when unknown.
+        start_utc: date-time of the frames' second 0, or None; weather in UTC and the sun need it.
+        weather, weather_zone, weather_max_gap_h, latitude, longitude, altitude_m, up, north, labels, features: see
+            ``Surroundings``.
         shared: options of every loader (``SceneDataModule``).
     """
 
@@ -38,46 +49,39 @@ class NTR(SceneDataModule):
         max_c: float = 50.0,
         ambient_c: float | None = 36.0,
         random_points: int = 20_000,
+        metres_per_unit: float | None = None,
+        start_utc: str | None = None,
+        weather: str | None = WEATHER_FILE,
+        weather_zone: str | None = None,
+        weather_max_gap_h: float = 3.0,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        altitude_m: float | None = None,
+        up: Sequence[float] | None = None,
+        north: Sequence[float] | None = None,
+        labels: str | None = LABELS_FILE,
+        features: str | None = FEATURES_FILE,
         **shared: Any,
     ) -> None:
         super().__init__(split=split, alpha_mask=alpha_mask, **shared)
         self.bounds = ThermalRange(min_c, max_c)
         self.ambient_c = ambient_c
         self.random_points = random_points
+        self.metres_per_unit = metres_per_unit
+        self.start_s = 0.0 if start_utc is None else utc_seconds(start_utc, weather_zone, "data.start_utc")
+        site = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m, "up": up, "north": north}
+        self.surroundings = Surroundings(weather, weather_zone, weather_max_gap_h, site, labels, features)
 
     def load(self) -> SceneData:
         def is_scene(path: Any) -> bool:
             return all((path / file).is_file() for file in FILES.values())
 
         folder = self.scene_folder(is_scene, " and ".join(FILES.values()))
-        index, masks = ImageIndex(folder), ImageIndex(folder / self.masks)
-        frames, missing = [], []
-        for subset, file_name in FILES.items():
-            transforms = read_transforms(folder / file_name)
-            for frame in transforms.frames:
-                path = PurePosixPath(str(frame["file_path"]))
-                file = index.find(str(path)) or index.find(f"{path}.png")
-                if file is None:
-                    missing.append(str(path))
-                    continue
-                read = partial(read_image, folder / file)
-                # Some frames carry their own field of view; the file's holds for the others.
-                own = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
-                frames.append(
-                    RawFrame(
-                        name=file,
-                        viewmat=viewmat_of(transforms, frame, opengl=False),
-                        lens=lens_in(transforms, {**frame, **own}, lambda read=read: read().shape[1::-1]),
-                        read=read,
-                        time_s=None if frame.get("time") is None else float(frame["time"]),
-                        read_mask=self.mask_reader(masks, file),
-                        subset=subset,
-                    )
-                )
-        if not frames:
-            raise SceneError(
-                f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png"
-            )
+
+        def describe(frame: dict[str, Any], file: str) -> dict[str, Any]:
+            return {"time_s": None if frame.get("time") is None else self.start_s + float(frame["time"])}
+
+        frames, missing = listed_frames(self, folder, describe)
         notes: dict[str, Any] = {
             "registered": len(frames) + len(missing),
             "cameras": "transforms_train.json and transforms_test.json, OpenCV axes",
@@ -86,17 +90,65 @@ class NTR(SceneDataModule):
         }
         if missing:
             notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
-        mesh = folder / "mesh.obj"
-        if mesh.is_file():
-            points, notes["points_source"] = obj_vertices(mesh), "vertices of mesh.obj"
-        else:
-            points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
-            notes["points_source"] = f"{len(points)} random points in the cube that the cameras look at: no mesh.obj"
+        points, notes["points_source"] = mesh_points(folder, frames, self.random_points, self.seed)
         return self.finish(
             folder.name,
             frames,
             points,
             thermal_range=self.bounds,
             ambient_c=self.ambient_c,
+            metres_per_unit=self.metres_per_unit,
             notes=notes,
+            **self.surroundings.read(folder, {}, frames),
         )
+
+
+def listed_frames(
+    module: SceneDataModule, folder: Path, describe: Callable[[dict[str, Any], str], dict[str, Any]]
+) -> tuple[list[RawFrame], list[str]]:
+    """The frames of transforms_train.json and transforms_test.json that have an image, and the names of those without.
+
+    Args:
+        module: whose masks are looked up.
+        folder: of the scene.
+        describe: function from the entry of a frame and its file to further fields of ``RawFrame``, such as time_s.
+
+    Raises:
+        SceneError: no frame has an image.
+    """
+    index, masks = ImageIndex(folder), ImageIndex(folder / module.masks)
+    frames: list[RawFrame] = []
+    missing: list[str] = []
+    for subset, file_name in FILES.items():
+        transforms = read_transforms(folder / file_name)
+        for frame in transforms.frames:
+            path = PurePosixPath(str(frame["file_path"]))
+            file = index.find(str(path)) or index.find(f"{path}.png")
+            if file is None:
+                missing.append(str(path))
+                continue
+            read = partial(read_image, folder / file)
+            # Some frames carry their own field of view; the file's holds for the others.
+            own = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
+            frames.append(
+                RawFrame(
+                    name=file,
+                    viewmat=viewmat_of(transforms, frame, opengl=False),
+                    lens=lens_in(transforms, {**frame, **own}, lambda read=read: read().shape[1::-1]),
+                    read=read,
+                    read_mask=module.mask_reader(masks, file),
+                    **{"subset": subset, **describe(frame, file)},
+                )
+            )
+    if not frames:
+        raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
+    return frames, missing
+
+
+def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, str]:
+    """Points [P, 3] of a scene and where they come from: vertices of mesh.obj, or ``count`` random ones without it."""
+    mesh = folder / "mesh.obj"
+    if mesh.is_file():
+        return obj_vertices(mesh), "vertices of mesh.obj"
+    points = random_points([f.viewmat for f in frames], count, seed)
+    return points, f"{len(points)} random points in the cube that the cameras look at: no mesh.obj"

@@ -147,7 +147,7 @@ def make_weather(
     absolute = bool(times_s[0] >= FIRST_EPOCH_S)
     if absolute:
         notes["utc_at_zero_s"] = 0.0
-        notes["from_utc"], notes["to_utc"] = (_utc(t) for t in (times_s[0], times_s[-1]))
+        notes["from_utc"], notes["to_utc"] = (utc_text(t) for t in (times_s[0], times_s[-1]))
     notes["span_h"] = round((times_s[-1] - times_s[0]) / 3600.0, 3)
     notes["step_min"] = round(float(np.median(np.diff(times_s))) / 60.0, 3)
     notes["ranges"] = {name: [round(float(v.min()), 2), round(float(v.max()), 2)] for name, v in columns.items()}
@@ -452,13 +452,14 @@ def write_weather(path: Path, weather: Weather, names: Sequence[str] = WEATHER_C
         rows = csv.writer(file)
         rows.writerow(["time_s" if zero is None else "utc", *there])
         for i, time in enumerate(weather.times_s.tolist()):
-            moment = repr(time) if zero is None else _utc(zero + time)
+            moment = repr(time) if zero is None else utc_text(zero + time)
             rows.writerow([moment, *(f"{getattr(weather, name)[i].item():.10g}" for name in there)])
 
 
-def _utc(seconds: float) -> str:
+def utc_text(seconds: float) -> str:
+    """ISO date-time in UTC of seconds since 1970."""
     return datetime.fromtimestamp(float(seconds), UTC).isoformat()
 
 
 def _moment(seconds: float) -> str:
-    return _utc(seconds) if seconds >= FIRST_EPOCH_S else f"second {seconds:.6g}"
+    return utc_text(seconds) if seconds >= FIRST_EPOCH_S else f"second {seconds:.6g}"

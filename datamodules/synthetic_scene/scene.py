@@ -13,7 +13,7 @@ from torch import Tensor
 from datamodules.synthetic_scene import heat
 from datamodules.synthetic_scene.presets import Preset, Surface
 from datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
-from heatsplat.contracts import ThermalRange
+from heatsplat.contracts import ThermalRange, Weather
 
 # Where the visible light comes from (unit length), and its share that comes from everywhere.
 _SUN = (-0.398, -0.597, 0.697)
@@ -50,12 +50,14 @@ class Scene:
 
     Attributes:
         route: how the camera moves: (frames, seed) -> (times [F], viewmats [F, 4, 4]); None for a hand that sweeps.
+        weather: what drives the heat, on the clock of the record, or None indoors; such a scene has ``labels`` too.
         thermal_range: bounds of the camera's images; None for those that its frames need.
         point_noise_m: how far a sparse point lies off its surface, standard deviation of each coordinate.
         probe_reach_m: how far about a probe its surface should be of one temperature.
     """
 
     route: Callable[[int, int], tuple[np.ndarray, Tensor]] | None = None
+    weather: Weather | None = None
     thermal_range: ThermalRange | None = None
     point_noise_m: float = 0.003
     probe_reach_m: float = 0.04

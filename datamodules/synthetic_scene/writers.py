@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib import colormaps
 from PIL import Image
 
 from datamodules.formats.colmap import write_model
 from datamodules.synthetic_scene.film import Recording
+from datamodules.synthetic_scene.outdoor import training_frames
+from datamodules.weather import utc_text, write_weather
 from heatsplat.contracts import KELVIN_AT_0_C
 
 # What nerfstudio does to COLMAP's world: it swaps x and y and turns z round.
@@ -162,6 +165,41 @@ def write_ntr(recording: Recording, folder: Path) -> None:
     (folder / "mesh.obj").write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in recording.points.tolist()))
 
 
+def write_thermo(recording: Recording, folder: Path) -> None:
+    """Our layout for Thermo: NTR's poses, 16-bit greys, meta.json, and weather.csv and labels.npy of outdoor scenes.
+
+    Outdoors the frames of the first day train and those of the second test; elsewhere every 8th frame is test.
+    """
+    lens, weather, bounds = recording.lens, recording.scene.weather, recording.thermal_range
+    if lens.is_distorted or lens.fx != lens.fy:
+        raise ValueError("the thermo layout knows square pixels without distortion only")
+    count = len(recording.times_s)
+    first_day = training_frames(count)
+    start_s = 0.0 if weather is None else weather.notes["utc_at_zero_s"]
+    frames: dict[str, list[dict[str, Any]]] = {"train": [], "test": []}
+    for frame, time in enumerate(recording.times_s):
+        is_test = frame % 8 == 0 if weather is None else frame >= first_day
+        subset = "test" if is_test else "train"
+        path = f"./{subset}/{frame:04d}"
+        _png(folder / f"{path}.png", recording.grey(frame, np.uint16))
+        when = {"time": float(time)} if weather is None else {"utc": utc_text(start_s + float(time))}
+        frames[subset].append(
+            {"file_path": path, "transform_matrix": np.linalg.inv(recording.viewmats[frame]).tolist(), **when}
+        )
+    angle = 2.0 * float(np.arctan(0.5 * lens.width / lens.fx))
+    for subset, listed in frames.items():
+        _json(folder / f"transforms_{subset}.json", {"camera_angle_x": angle, "frames": listed})
+    (folder / "mesh.obj").write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in recording.points.tolist()))
+    meta = {"min_value": bounds.min_c, "max_value": bounds.max_c, "metres_per_unit": 1.0}
+    if weather is None:
+        meta["ambient_c"] = recording.scene.preset.ambient_c
+    else:
+        meta |= {key: weather.notes[key] for key in ("latitude", "longitude", "altitude_m", "up", "north")}
+        write_weather(folder / "weather.csv", weather)
+        np.save(folder / "labels.npy", recording.scene.labels(torch.from_numpy(recording.points)).numpy())
+    _json(folder / "meta.json", meta)
+
+
 LAYOUTS: dict[str, Callable[[Recording, Path], None]] = {
     "rhd": write_rhd,
     "thermoscenes": write_thermoscenes,
@@ -169,6 +207,7 @@ LAYOUTS: dict[str, Callable[[Recording, Path], None]] = {
     "colmap": write_colmap,
     "rgbt_scenes": write_rgbt_scenes,
     "ntr": write_ntr,
+    "thermo": write_thermo,
 }
 
 

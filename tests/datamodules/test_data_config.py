@@ -13,7 +13,7 @@ from datamodules.colmap import Colmap
 from heatsplat.contracts import SceneError
 
 CONF = Path(__file__).parents[2] / "conf"
-LOADERS = ("rhd", "thermoscenes", "ti_nsd", "colmap", "rgbt_scenes", "ntr")
+LOADERS = ("rhd", "thermoscenes", "ti_nsd", "colmap", "rgbt_scenes", "ntr", "thermo")
 
 
 def config_of(data, *overrides):

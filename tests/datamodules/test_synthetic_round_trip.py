@@ -19,6 +19,7 @@ from datamodules.synthetic_scene.film import SIZES, Recording, expose, film, pix
 from datamodules.synthetic_scene.presets import PRESETS
 from datamodules.synthetic_scene.scene import Scene
 from datamodules.synthetic_scene.writers import APPLIED_TRANSFORM, LAYOUTS, PALETTE, clock_digits, write_rhd
+from datamodules.thermo import Thermo
 from datamodules.thermoscenes import ThermoScenes
 from datamodules.ti_nsd import TINSD
 from heatsplat.contracts import SceneData, View
@@ -55,6 +56,7 @@ def loaded(root: Path, layout: str) -> SceneData:
         "colmap": lambda **where: Colmap(rgb="rgb", time_csv="times.csv", ambient_c=22.0, **where),
         "rgbt_scenes": lambda **where: RGBTScenes(**where),
         "ntr": lambda **where: NTR(min_c=bounds.min_c, max_c=bounds.max_c, ambient_c=22.0, **where),
+        "thermo": lambda **where: Thermo(**where),
     }
     return modules[layout](root=str(root / layout), scene="cooling").scene
 
@@ -96,7 +98,7 @@ def test_poses_lenses_and_points_survive(root, layout):
         assert np.abs(data.point_colors.numpy()[order] - recording().point_colors).max() <= 0.5 / 255 + 1e-6
 
 
-@pytest.mark.parametrize("layout", ["rhd", "thermoscenes", "colmap", "ntr"])
+@pytest.mark.parametrize("layout", ["rhd", "thermoscenes", "colmap", "ntr", "thermo"])
 def test_temperatures_survive_to_half_a_grey_level(root, layout):
     data = loaded(root, layout)
     assert data.thermal_range == recording().thermal_range
@@ -132,7 +134,7 @@ def test_pseudo_colour_survives_and_is_no_temperature(root):
         assert np.abs(view.thermal.numpy() - expected).max() <= 0.5 / 255 + 1e-6
 
 
-@pytest.mark.parametrize("layout", ["rhd", "ti_nsd", "colmap", "ntr"])
+@pytest.mark.parametrize("layout", ["rhd", "ti_nsd", "colmap", "ntr", "thermo"])
 def test_times_survive_to_the_millisecond(root, layout):
     data = loaded(root, layout)
     recorded = recording().times_s
@@ -156,7 +158,7 @@ def test_visible_images_survive(root, layout):
         assert np.array_equal((view.rgb * 255.0).round().numpy().astype(np.uint8), recording().rgb[frame])
 
 
-@pytest.mark.parametrize("layout", ["thermoscenes", "rgbt_scenes", "ntr", "ti_nsd", "colmap"])
+@pytest.mark.parametrize("layout", ["thermoscenes", "rgbt_scenes", "ntr", "ti_nsd", "colmap", "thermo"])
 def test_every_eighth_frame_is_test(root, layout):
     data = loaded(root, layout)
     centers = np.linalg.inv(recording().viewmats)[:, :3, 3] @ turn_of(layout)[:3, :3].T
@@ -165,7 +167,7 @@ def test_every_eighth_frame_is_test(root, layout):
 
 
 def test_ambient_temperature_survives(root):
-    assert loaded(root, "rhd").ambient_c == loaded(root, "ntr").ambient_c == 22.0
+    assert {loaded(root, layout).ambient_c for layout in ("rhd", "ntr", "thermo")} == {22.0}
 
 
 def test_distorted_images_are_straightened(tmp_path):

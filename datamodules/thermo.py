@@ -1,0 +1,184 @@
+"""Thermo, the data set of ThermoGS. It is not published, so this layout is our own: NTR's or COLMAP's, with weather."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datamodules.base import RawFrame, SceneDataModule
+from datamodules.bounds import number_in, range_in, read_json
+from datamodules.colmap import image_index, match_model
+from datamodules.formats.colmap import find_model, read_model
+from datamodules.formats.images import ImageIndex, read_image
+from datamodules.ntr import FILES, listed_frames, mesh_points
+from datamodules.surroundings import FEATURES_FILE, LABELS_FILE, WEATHER_FILE, Surroundings, environment_of
+from datamodules.timestamps import stem_of
+from datamodules.weather import utc_seconds
+from heatsplat.contracts import SceneData, SceneError
+
+META_FILE = "meta.json"
+
+
+class Thermo(SceneDataModule):
+    """root/scene with meta.json, poses (NTR's two JSON files, or images/ and sparse/0), and what else there is.
+
+    meta.json holds min_value and max_value (°C of black and white) and may hold latitude, longitude, altitude_m, up,
+    north, metres_per_unit, ambient_c, start_utc (of the frames' second 0) and frames: name -> {"utc", "env", "split"}.
+    Frames of the JSON files may carry "utc" and "env" themselves, or "time" in seconds as in NTR. "env" holds any of
+    the five weather values by the names of ``Environment``; weather.csv, where it is there, is used instead.
+
+    Args:
+        test_period: [from, to] in UTC or seconds; frames within are test, the others training, whatever the files say.
+        min_c, max_c: temperatures of black and white; None takes meta.json's.
+        ambient_c: temperature of the surroundings; None takes meta.json's, or the mean air temperature of the record.
+        metres_per_unit: scale of the world; None takes meta.json's.
+        random_points: number of points to make up where the scene has neither mesh nor sparse model.
+        weather, weather_zone, weather_max_gap_h, latitude, longitude, altitude_m, up, north, labels, features: see
+            ``Surroundings``; places of meta.json are used where these are None.
+        shared: options of every loader (``SceneDataModule``).
+    """
+
+    def __init__(
+        self,
+        *,
+        split: str = "json",
+        alpha_mask: bool = True,
+        test_period: Sequence[str | float] | None = None,
+        min_c: float | None = None,
+        max_c: float | None = None,
+        ambient_c: float | None = None,
+        metres_per_unit: float | None = None,
+        random_points: int = 20_000,
+        weather: str | None = WEATHER_FILE,
+        weather_zone: str | None = None,
+        weather_max_gap_h: float = 3.0,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        altitude_m: float | None = None,
+        up: Sequence[float] | None = None,
+        north: Sequence[float] | None = None,
+        labels: str | None = LABELS_FILE,
+        features: str | None = FEATURES_FILE,
+        **shared: Any,
+    ) -> None:
+        super().__init__(split=split, alpha_mask=alpha_mask, **shared)
+        if test_period is not None and (len(test_period) != 2 or split != "json"):
+            raise SceneError(
+                f"data.test_period={list(test_period)} with data.split={split}: two moments [from, to] and split=json"
+            )
+        self.test_period = test_period
+        self.bounds_c = {"min_value": min_c, "max_value": max_c}
+        self.ambient_c = ambient_c
+        self.metres_per_unit = metres_per_unit
+        self.random_points = random_points
+        self.zone = weather_zone
+        site = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m, "up": up, "north": north}
+        self.surroundings = Surroundings(weather, weather_zone, weather_max_gap_h, site, labels, features)
+
+    def load(self) -> SceneData:
+        def is_scene(path: Path) -> bool:
+            return (path / META_FILE).is_file() and (_has_transforms(path) or find_model(path) is not None)
+
+        looked_for = f"{META_FILE} with {' and '.join(FILES.values())} or sparse/0"
+        folder = self.scene_folder(is_scene, looked_for)
+        path = folder / META_FILE
+        meta = read_json(path)
+        bounds = {k: number_in(meta, k, path) if own is None else float(own) for k, own in self.bounds_c.items()}
+        frames, scene, notes = self._posed(folder, meta)
+        if self.test_period is not None:
+            frames = self._by_period(frames)
+        surroundings = self.surroundings.read(folder, meta, frames)
+        if surroundings["weather"] is not None:  # one source for all frames
+            frames = [replace(frame, environment=None) for frame in frames]
+        ambient_c = meta.get("ambient_c") if self.ambient_c is None else self.ambient_c
+        weather = surroundings["weather"]
+        if ambient_c is None and weather is not None and weather.air_c is not None:
+            ambient_c = round(float(weather.air_c.mean()), 2)
+            notes["ambient_source"] = "mean air temperature of the record"
+        metres = meta.get("metres_per_unit") if self.metres_per_unit is None else self.metres_per_unit
+        if metres is None:
+            notes["metres_per_unit"] = (
+                "unknown: methods with areas refuse the scene until data.metres_per_unit is given"
+            )
+        elif not float(metres) > 0:
+            raise SceneError(
+                f"{path}: metres_per_unit is {metres}; metres that a unit of the world stands for, above 0"
+            )
+        return self.finish(
+            folder.name,
+            frames,
+            thermal_range=range_in(path, bounds["min_value"], bounds["max_value"])[0],
+            ambient_c=None if ambient_c is None else float(ambient_c),
+            metres_per_unit=None if metres is None else float(metres),
+            notes={"layout": "our convention for Thermo, which is not published", **notes},
+            **scene,
+            **surroundings,
+        )
+
+    def _posed(
+        self, folder: Path, meta: Mapping[str, Any]
+    ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], dict[str, Any]]:
+        """Frames, points with their colours, and notes, from the JSON files or the sparse model."""
+        if _has_transforms(folder):
+            frames, missing = listed_frames(self, folder, partial(self._described, meta))
+            points, source = mesh_points(folder, frames, self.random_points, self.seed)
+            notes: dict[str, Any] = {
+                "registered": len(frames) + len(missing),
+                "cameras": "transforms_train.json and transforms_test.json, OpenCV axes",
+                "points_source": source,
+            }
+            if missing:
+                notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
+            return frames, {"points": points}, notes
+        model = read_model(folder)
+        index, masks = image_index(folder, "images", "the folder of thermal images"), ImageIndex(folder / self.masks)
+        files = {name: index.find(name) for name in model.names}
+        kept, notes = match_model(model, files, index, "images")
+        frames = [
+            RawFrame(
+                name=name,
+                viewmat=viewmat,
+                lens=lens,
+                read=partial(read_image, index.folder / files[name]),
+                read_mask=self.mask_reader(masks, name),
+                **self._described(meta, {}, name),
+            )
+            for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True)
+            if name in set(kept)
+        ]
+        return frames, {"points": model.points, "point_colors": model.colors}, {"cameras": "sparse/0", **notes}
+
+    def _described(self, meta: Mapping[str, Any], entry: Mapping[str, Any], file: str) -> dict[str, Any]:
+        """Time, weather and subset of a frame, from its own entry or from meta.json's."""
+        listed = meta.get("frames", {})
+        also = next(
+            (listed[key] for key in (file, Path(file).with_suffix("").as_posix(), stem_of(file)) if key in listed), {}
+        )
+        known = {**also, **entry}
+        where = f"{META_FILE}, frame {file}"
+        time = None
+        if known.get("utc") is not None:
+            time = utc_seconds(known["utc"], self.zone, where)
+        elif known.get("time") is not None:
+            start = meta.get("start_utc")
+            time = float(known["time"]) + (
+                0.0 if start is None else utc_seconds(start, self.zone, f"{META_FILE}, start_utc")
+            )
+        result: dict[str, Any] = {"time_s": time, "environment": environment_of(known.get("env"), where)}
+        return {**result, "subset": known["split"]} if "split" in known else result
+
+    def _by_period(self, frames: Sequence[RawFrame]) -> list[RawFrame]:
+        """The frames, those within ``test_period`` as test and all others as training frames."""
+        first, last = (utc_seconds(moment, self.zone, "data.test_period") for moment in self.test_period)
+        if any(frame.time_s is None for frame in frames):
+            raise SceneError("data.test_period needs the time of every frame: utc in meta.json or in the JSON files")
+        return [replace(f, subset="test" if first <= f.time_s <= last else "train") for f in frames]
+
+
+def _has_transforms(folder: Path) -> bool:
+    return all((folder / file).is_file() for file in FILES.values())
