@@ -100,7 +100,7 @@ def test_effects_are_bounded_and_gradients_finite_whatever_the_parameters(name, 
 
 def test_calibration_is_the_formula_of_the_paper():
     part, image = ready("calibration", 0.8), noise()
-    gain, bias = (resampled(node[..., None], HEIGHT, WIDTH, "bilinear") for node in part.nodes())
+    gain, bias = (resampled(node[..., None], HEIGHT, WIDTH, "bilinear") for node in part.nodes().values())
     v, u = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     r = torch.hypot(u - WIDTH / 2, v - HEIGHT / 2) / math.hypot(WIDTH / 2, HEIGHT / 2)
     a2, a4 = part.coefficients().tolist()
@@ -110,7 +110,7 @@ def test_calibration_is_the_formula_of_the_paper():
 
 def test_the_gauges_are_removed():
     part = ready("calibration", 2.0)
-    gain, bias = part.nodes()
+    gain, bias = part.nodes().values()
     assert abs(bias.mean().item()) < 1e-7
     r2 = radius_squared(16, 16, WIDTH / HEIGHT)
     for power in range(3):  # nothing of a constant, r² or r⁴ is left
@@ -119,8 +119,8 @@ def test_the_gauges_are_removed():
     alone.prepare(SCENE)
     with torch.no_grad():
         alone.raw_gain.copy_(r2)
-    assert abs(alone.nodes()[0].mean().item()) < 1e-7
-    assert (alone.nodes()[0] * r2).mean().abs() > 1e-4  # without vignetting a radial gain is the gain's to say
+    assert abs(alone.nodes()["gain"].mean().item()) < 1e-7
+    assert (alone.nodes()["gain"] * r2).mean().abs() > 1e-4  # without vignetting a radial gain is the gain's to say
 
 
 def test_the_field_is_the_same_at_every_resolution():
@@ -146,6 +146,28 @@ def test_without_vignetting_there_is_no_parameter_of_it():
     assert torch.equal(part.vignetting(4, 5), torch.ones(4, 5, 1))
 
 
+def test_without_bounds_the_pattern_is_absent():
+    part, image = Calibration(gain_max=0.0, bias_max=0.0), noise()
+    part.prepare(SCENE)
+    assert {name for name, _ in part.named_parameters()} == {"raw_falloff"} and not list(part.buffers())
+    assert part.nodes() == {} and set(part.effects()) == {"vignetting"}
+    with torch.no_grad():
+        part.raw_falloff.fill_(0.5)
+    assert torch.equal(part(image, FRAME), image * part.vignetting(HEIGHT, WIDTH))
+    assert part.regulariser().item() == pytest.approx(5e-4 * part.coefficients().square().sum().item())
+
+
+def test_gain_and_bias_can_be_left_out_one_by_one():
+    bias, gain = Calibration(gain_max=0.0, vignetting_max=0.0), Calibration(bias_max=0.0, vignetting_max=0.0)
+    assert set(bias.nodes()) == {"bias"} and set(gain.nodes()) == {"gain"}
+    assert set(bias.effects()) == {"fixed_pattern"}
+    with torch.no_grad():
+        bias.raw_bias[3, 5] = 1.0
+    change = bias(noise(), FRAME) - noise()
+    assert torch.allclose(bias(noise(seed=1), FRAME) - noise(seed=1), change, atol=1e-6)  # the same at every brightness
+    assert Calibration(gain_max=0, bias_max=0, vignetting_max=0).regulariser() is None
+
+
 def test_a_known_sensor_is_recovered_from_images_of_known_scenes():
     """Fixed pattern to a correlation of 0.9 and vignetting to 2 % in the corners, from 24 noisy images."""
     generator = torch.Generator().manual_seed(4)
@@ -168,7 +190,7 @@ def test_a_known_sensor_is_recovered_from_images_of_known_scenes():
         loss = (part(images, frame) - seen).abs().mean() + part.regulariser()
         loss.backward()
         optimizer.step()
-    for got, expected in zip(part.nodes(), truth.nodes(), strict=True):
+    for got, expected in zip(part.nodes().values(), truth.nodes().values(), strict=True):
         assert torch.corrcoef(torch.stack((got.flatten(), expected.flatten())))[0, 1] > 0.9
     corner = (part.vignetting(*size) / truth.vignetting(*size))[0, 0].item()
     assert corner == pytest.approx(1.0, abs=0.02)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -69,3 +70,6 @@ class GainControl(SensorPart):
             return None
         log_stretch, shift = self.settings().unbind(1)
         return self.weight * (log_stretch.expm1().square() + shift.square()).mean()
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        return {"agc": {"frames": len(self.raw)}}

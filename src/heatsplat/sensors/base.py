@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -33,6 +34,10 @@ class SensorPart(nn.Module, ABC):
         """A weighted scalar added to the loss, or None."""
         return None
 
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """The effects that the part simulates: catalogue name -> settings (for metrics.json)."""
+        return {}
+
 
 class SensorChain(nn.Module):
     """Parts in the order in which light meets them. An empty chain is absent: it returns the very tensor it was given.
@@ -59,3 +64,7 @@ class SensorChain(nn.Module):
         """Regularisers of the parts by name, absent ones left out."""
         terms = {name: part.regulariser() for name, part in self.parts.items()}
         return {name: term for name, term in terms.items() if term is not None}
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """The effects that the parts simulate: catalogue name -> settings."""
+        return {name: settings for part in self.parts.values() for name, settings in part.effects().items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +25,8 @@ class Calibration(SensorPart):
 
     Args:
         grid: nodes along each side.
-        gain_max, bias_max: bounds of the nodes of G (a factor) and B (image units) before their means are taken away.
+        gain_max, bias_max: bounds of the nodes of G (a factor) and B (image units) before their means are taken away; 0
+            leaves the field out, and both 0 the pattern.
         vignetting_max: bound of |a2| and |a4| each; 0 leaves vignetting out.
         weight: of the penalty mean G² + mean B² + total variation of both + a2² + a4².
         lr, lr_end: learning rate and the factor on it at the end of the run.
@@ -47,12 +49,15 @@ class Calibration(SensorPart):
             raise ValueError(f"bounds must not be negative, got {gain_max}, {bias_max}, {vignetting_max}")
         self.gain_max, self.bias_max, self.vignetting_max = gain_max, bias_max, vignetting_max
         self.weight, self.lr, self.lr_end = weight, lr, lr_end
-        self.raw_gain = nn.Parameter(torch.zeros(grid, grid))
-        self.raw_bias = nn.Parameter(torch.zeros(grid, grid))
+        self.raw_gain = nn.Parameter(torch.zeros(grid, grid)) if gain_max > 0 else None
+        self.raw_bias = nn.Parameter(torch.zeros(grid, grid)) if bias_max > 0 else None
         self.raw_falloff = nn.Parameter(torch.zeros(2)) if vignetting_max > 0 else None
-        self.register_buffer("shared", torch.full((grid * grid, 1), 1.0 / grid))  # orthonormal columns
+        if self.raw_gain is not None:
+            self.register_buffer("shared", torch.full((grid * grid, 1), 1.0 / grid))  # orthonormal columns
 
     def prepare(self, scene: SceneData) -> None:
+        if self.raw_gain is None:
+            return
         camera = scene.train.frames[0].camera
         r2 = radius_squared(len(self.raw_gain), len(self.raw_gain), camera.width / camera.height).flatten()
         powers = (0, 1, 2) if self.raw_falloff is not None else (0,)
@@ -60,39 +65,57 @@ class Calibration(SensorPart):
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         height, width = image.shape[:2]
-        gain, bias = resampled(torch.stack(self.nodes(), 2), height, width, "bilinear").split(1, dim=2)
-        calibrated = image * (1.0 + gain) + bias
-        return calibrated if self.raw_falloff is None else calibrated * self.vignetting(height, width)
+        nodes = self.nodes()
+        if nodes:
+            fields = resampled(torch.stack(list(nodes.values()), 2), height, width, "bilinear")
+            at = dict(zip(nodes, fields.split(1, dim=2), strict=True))
+            image = image * (1.0 + at["gain"]) if "gain" in at else image
+            image = image + at["bias"] if "bias" in at else image
+        return image if self.raw_falloff is None else image * self.vignetting(height, width)
 
-    def nodes(self) -> tuple[Tensor, Tensor]:
-        """Gain and bias at the nodes of the grid, [grid, grid] each, with what they share with others taken away."""
-        gain = self.gain_max * self.raw_gain.tanh()
-        bias = self.bias_max * self.raw_bias.tanh()
-        level = self.shared @ (self.shared.T @ gain.flatten())
-        return gain - level.reshape_as(gain), bias - bias.mean()
+    def nodes(self) -> dict[str, Tensor]:
+        """ "gain" and "bias" at the nodes of the grid, [grid, grid] each where it is there, without what others share."""
+        nodes = {}
+        if self.raw_gain is not None:
+            gain = self.gain_max * self.raw_gain.tanh()
+            level = self.shared @ (self.shared.T @ gain.flatten())
+            nodes["gain"] = gain - level.reshape_as(gain)
+        if self.raw_bias is not None:
+            bias = self.bias_max * self.raw_bias.tanh()
+            nodes["bias"] = bias - bias.mean()
+        return nodes
 
     def vignetting(self, height: int, width: int) -> Tensor:
         """V on a grid of pixels, [height, width, 1]; 1 in the middle, all 1 without vignetting."""
-        r2 = radius_squared(height, width).to(self.raw_gain)[..., None]
+        r2 = radius_squared(height, width).float()[..., None]
         if self.raw_falloff is None:
             return torch.ones_like(r2)
+        r2 = r2.to(self.raw_falloff)
         a2, a4 = self.coefficients()
         return torch.exp((a2 + a4 * r2) * r2)
 
     def coefficients(self) -> Tensor:
         """a2 and a4 of the vignetting, [2]; empty without."""
         if self.raw_falloff is None:
-            return self.raw_gain.new_zeros(0)
+            return torch.zeros(0)
         return self.vignetting_max * self.raw_falloff.tanh()
 
     def regulariser(self) -> Tensor | None:
         if self.weight == 0:
             return None
-        penalty = self.coefficients().square().sum()
-        for field in self.nodes():
-            variation = field.diff(dim=0).abs().mean() + field.diff(dim=1).abs().mean()
-            penalty = penalty + field.square().mean() + variation
-        return self.weight * penalty
+        terms = [self.coefficients().square().sum()] if self.raw_falloff is not None else []
+        for field in self.nodes().values():
+            terms += [field.diff(dim=0).abs().mean() + field.diff(dim=1).abs().mean() + field.square().mean()]
+        return self.weight * sum(terms) if terms else None
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        effects: dict[str, dict[str, Any]] = {}
+        if self.raw_gain is not None or self.raw_bias is not None:
+            effects["fixed_pattern"] = {"fields": list(self.nodes())}
+        if self.raw_falloff is not None:
+            a2, a4 = self.coefficients().tolist()
+            effects["vignetting"] = {"a2": a2, "a4": a4}
+        return effects
 
 
 @lru_cache(maxsize=16)

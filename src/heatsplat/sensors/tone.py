@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -90,6 +91,9 @@ class Tone(SensorPart):
         if self.weight == 0:
             return None
         return self.weight * self.network(self.levels).square().sum(1).mean()
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        return {"tone": {"width": self.network[0].out_features}}
 
 
 def _interpolated(curve: Tensor, brightness: Tensor) -> Tensor:
