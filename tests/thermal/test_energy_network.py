@@ -190,6 +190,7 @@ def test_the_rate_is_the_balance_of_ellipsoid_sun_and_air():
 @pytest.mark.parametrize(
     ("options", "changes"),
     [({"projected_area": "printed"}, True), ({"surface_area": "consistent"}, True), ({"sky": "swinbank"}, True),
+     ({"sky": "brutsaert"}, True),
      ({"smallest_axis_m": 0.3}, True), ({}, False)],
 )  # fmt: skip
 def test_every_switch_of_the_balance_acts(options, changes):
@@ -284,7 +285,7 @@ def test_without_terms_nothing_is_evaluated_twice(monkeypatch):
     forward = type(model.network).forward
     monkeypatch.setattr(type(model.network), "forward", lambda *args: calls.append(1) or forward(*args))
     assert penalties(model, splats) == {} and len(calls) == 1
-    assert "label" not in splats and set(model.effects()) == {"weather"}
+    assert "label" not in splats and set(model.effects()) == {"relaxation"}
 
 
 def test_the_table_in_place_of_heads():
@@ -308,7 +309,7 @@ def test_cost_and_effects_are_told():
     model, _ = make(width=32, blocks=3)
     assert model.cost == 32 * (60 + 8) + 6 * 32 * 32 + 32 + 60
     effects = model.effects()
-    assert set(effects) == {"weather", "radiation", "convection", "sunlight"}
+    assert set(effects) == {"relaxation", "radiation", "convection", "solar"}
     assert effects["convection"] == {"surface_area": "printed"} and effects["radiation"]["sky"] == "none"
 
 
@@ -320,7 +321,7 @@ def test_a_missing_column_is_left_out_and_said_to_be(column, caplog):
     with caplog.at_level(logging.WARNING):
         model, splats = make(make_scene(weather=make_weather(**{column: None})), disturb=1.0)
     assert column in caplog.text
-    assert model.effects()["weather"]["left_out"] == [column]
+    assert model.effects()["relaxation"]["left_out"] == [column]
     assert model.features(splats, query()).features.isfinite().all()
     assert all(term.isfinite() for term in penalties(model, splats).values())
 
@@ -378,6 +379,13 @@ def test_a_network_goes_to_another_scene_with_its_measures(tmp_path):
 def test_scenes_that_lack_something_are_refused_with_the_way_out(changed, message):
     with pytest.raises(SceneError, match=message):
         EnergyNetwork(weights=ALL).prepare(replace(make_scene(), **changed))
+
+
+def test_a_sky_that_needs_humidity_says_so():
+    dry = make_scene(weather=make_weather(humidity_percent=None))
+    with pytest.raises(SceneError, match="no humidity, which thermal.sky=brutsaert needs; thermal.sky=swinbank"):
+        make(dry, sky="brutsaert")
+    assert make(dry, sky="swinbank")
 
 
 def test_frames_outside_the_weather_record_are_refused():

@@ -18,11 +18,6 @@ def fourth_powers(warm_k: Tensor, cold_k: Tensor | float) -> Tensor:
     return (warm_k - cold_k) * (warm_k + cold_k) * (warm_k * warm_k + cold_k * cold_k)
 
 
-def swinbank_sky_k(air_k: float) -> float:
-    """Temperature of a clear sky, 0.0552 T_air^1.5 (Swinbank 1963): 11 K below the air at 15 °C, 20 K at -5 °C."""
-    return 0.0552 * air_k**1.5
-
-
 def heating_rate(
     temperatures_k: Tensor,
     *,

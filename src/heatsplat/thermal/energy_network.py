@@ -23,7 +23,9 @@ from heatsplat.physics.ellipsoids import (
     projected_area_ratio,
     radiating_area_ratio,
 )
-from heatsplat.physics.heat_flow import heating_rate, swinbank_sky_k
+from heatsplat.physics.heat_flow import heating_rate
+from heatsplat.physics.sky import LAWS, sky_temperature_k
+from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
@@ -37,7 +39,7 @@ log = logging.getLogger(__name__)
 TIMES = ("record", "day", "none")
 FEATURES = ("learned", "given", "labels", "none")
 BODIES = ("inferred", "table")
-SKIES = ("none", "swinbank")
+SKIES = ("none", *LAWS)
 TERMS = ("smooth", "physical", "ode", "pinn")
 BALANCED = ("ode", "pinn")  # the terms that need the balance of heat
 LATENT = "latent_heat"
@@ -98,7 +100,7 @@ class EnergyNetwork(ThermalModel):
         sampled: Gaussians in view that penalties are evaluated for, at most.
         projected_area: "exact" or "printed" (Eq. 8), the area that sunlight falls on.
         surface_area: "printed" (Eq. 6) or "consistent", the area that air cools.
-        sky: "none" lets bodies radiate into empty space (paper); "swinbank" gives them a clear sky of that temperature.
+        sky: "none" lets bodies radiate into empty space (paper); a law of ``physics.sky`` gives them a clear sky.
         smallest_axis_m: axes of Gaussians count as at least this in the balance.
         margin: T_min and T_max lie this share of the scene's range outside it, so that the sigmoid reaches the ends.
         network: checkpoint of another run whose network is taken, held still unless ``fine_tune``.
@@ -243,6 +245,12 @@ class EnergyNetwork(ThermalModel):
                 "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
             )
 
+        if self._balanced and self.sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
+            raise SceneError(
+                f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={self.sky} needs; "
+                "thermal.sky=swinbank does without"
+            )
+
     def prepare(self, scene: SceneData) -> None:
         self.check(scene)
         self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
@@ -369,13 +377,13 @@ class EnergyNetwork(ThermalModel):
     def effects(self) -> dict[str, dict]:
         missing = self._missing_columns
         used = [name for name in WEATHER_COLUMNS if name not in missing]
-        effects = {"weather": {"network_sees": used, "left_out": missing, "time": self.time}}
+        effects = {"relaxation": {"network_sees": used, "left_out": missing, "time": self.time}}
         if self._balanced:
             radiation = {"sky": self.sky, "materials": "inferred" if self.inferred else "table"}
             effects |= {"radiation": radiation, "convection": {"surface_area": self.surface_area}}
             if self.weather is not None:
                 light = source_of_sunlight(self.weather)
-                effects["sunlight"] = {"projected_area": self.projected_area, "irradiance": light}
+                effects["solar"] = {"projected_area": self.projected_area, "irradiance": light}
         return effects
 
     @property
@@ -481,7 +489,11 @@ class EnergyNetwork(ThermalModel):
         for direction, power in sunlight_at(self.weather, time_s):
             local = direction.to(areas["rotations"]) @ areas["rotations"]
             lit = lit + power * projected_area_ratio(areas["axes"], local, self.projected_area)
-        air_k = self.weather.at(time_s).air_c + KELVIN_AT_0_C
+        now = self.weather.at(time_s)
+        air_k, sky_k = kelvin(torch.tensor(now.air_c, dtype=torch.float64)), 0.0
+        if self.sky != "none":
+            moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
+            sky_k = float(sky_temperature_k(air_k, moist, self.sky))
         rate = heating_rate(
             coldest + span * units,
             absorbed_w_m3=body["absorptivity"] * lit,
@@ -490,8 +502,8 @@ class EnergyNetwork(ThermalModel):
             capacity=body["capacity"],
             radiating_ratio=areas["radiating"],
             convecting_ratio=areas["convecting"],
-            air_k=air_k,
-            sky_k=swinbank_sky_k(air_k) if self.sky == "swinbank" else 0.0,
+            air_k=float(air_k),
+            sky_k=sky_k,
         )
         return rate / span
 

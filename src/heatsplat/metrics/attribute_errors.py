@@ -1,0 +1,39 @@
+"""Mean absolute errors of material attributes, as of a model's and, beside them, of the table that it was pulled to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+# What models call an attribute -> what a scene's ``true_attributes`` calls it.
+TRUE_NAMES = {
+    "emissivity": "emissivity",
+    "absorptivity": "absorptivity",
+    "convection": "convection_w_m2_k",
+    "capacity": "heat_capacity_j_m3_k",
+}
+
+
+def attribute_errors(
+    told: Mapping[str, Tensor], truth: Mapping[str, Tensor], weights: Tensor | None = None
+) -> dict[str, float]:
+    """Mean |told - truth| by name, in the unit of each, of the attributes that both know.
+
+    An attribute was learned where the model's error (``thermal.attributes``) is smaller than that of its prior
+    (``thermal.prior``); where they are alike it is only the prior.
+
+    Args:
+        told: by the model's names, each [n]; NaN where nothing is known, which does not count.
+        truth: by the names of ``SceneData.true_attributes``, each [n].
+        weights: [n] how much each Gaussian counts, such as its opacity; None counts all alike.
+    """
+    errors = {}
+    for name, values in told.items():
+        if TRUE_NAMES.get(name, name) not in truth:
+            continue
+        off = (values.double() - truth[TRUE_NAMES.get(name, name)].to(values.device).double()).abs()
+        share = (off.new_ones(len(off)) if weights is None else weights.double()) * ~off.isnan()
+        if float(share.sum()) > 0:
+            errors[name] = float((off.nan_to_num() * share).sum() / share.sum())
+    return errors
