@@ -21,6 +21,7 @@ from datamodules.formats.images import ImageIndex, read_image, split_alpha, to_g
 from datamodules.formats.lens import Lens
 from datamodules.lowres import degraded
 from datamodules.splits import SplitRule
+from datamodules.weather import with_weather
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
 
@@ -90,6 +91,10 @@ class SceneDataModule(pl.LightningDataModule, ABC):
     def scene(self) -> SceneData:
         """The loaded scene, its training images reduced where that is asked for."""
         return degraded(self.load(), self.degrade, self.upsample)
+
+    def change_weather(self, path: Path, zone: str | None = None) -> None:
+        """Puts the scene under the weather of another table, for its place; ``datamodules.weather.with_weather``."""
+        self.scene = with_weather(self.scene, path, zone)
 
     def setup(self, stage: str | None = None) -> None:
         """Loads the scene, so that bad input is reported before anything else is built."""

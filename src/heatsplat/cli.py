@@ -138,13 +138,21 @@ def render(config: DictConfig, output_dir: Path) -> None:
     """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
     from rich.progress import track
 
+    from heatsplat.contracts import SceneError
     from heatsplat.shots import develop, plan
     from heatsplat.training.session import prepare_machine, restore
 
     prepare_machine(config.threads)
     module, data, stored = _restored(config, output_dir)
-    restore(module, data, stored["checkpoint"])
     plain = OmegaConf.to_container(config, resolve=True)
+    if plain["weather"] is not None:
+        if "weather" not in module.thermal.needs:
+            raise SceneError(
+                f"weather={plain['weather']} changes nothing: {type(module.thermal).__name__} does not use weather. Train "
+                "a method that does, or leave weather out."
+            )
+        data.change_weather(Path(plain["weather"]).expanduser().resolve(), plain["weather_zone"])
+    restore(module, data, stored["checkpoint"])
     frames = plan(module.scene, plain["trajectory"], plain["time"], plain["view"], plain["frames"])
     images = (module.predict(frame).cpu() for frame in track(frames, "rendering"))
     options = {key: plain[key] for key in ("tiff", "png", "video", "fps", "range_c")}
@@ -170,6 +178,8 @@ def _restored(config: DictConfig, output_dir: Path) -> tuple[Any, Any, dict[str,
     changed = {key: value for key, value in OmegaConf.to_container(config.data).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    if "weather" in changed and "weather" not in stored["data"]:
+        raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
     module = build(stored["module"], output_dir=str(output_dir))
     module.recipe = stored
     return module, build(stored["data"] | changed), {**stored, "checkpoint": checkpoint}

@@ -49,7 +49,7 @@ def plan(
     if trajectory in ("test", "train"):
         taken = getattr(scene, trajectory).frames
         moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
-        return [replace(frame, time_s=moment) for frame, moment in zip(taken, moments, strict=True)]
+        return [_at(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
     cameras = _cameras(scene, trajectory, view, count)
     if time is None:
         record = [t for t in scene.train.times_s if t is not None]
@@ -58,9 +58,16 @@ def plan(
     moments = [None] * count if time is None else _moments(time, count)
     first_free = 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
     return [
-        Frame(f"{trajectory}_{i:04d}", first_free + i, camera, moment)
+        _at(scene, Frame(f"{trajectory}_{i:04d}", first_free + i, camera), moment)
         for i, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
     ]
+
+
+def _at(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
+    """The frame at a moment, with the weather of that moment where the scene has a record."""
+    if moment == frame.time_s or scene.weather is None:
+        return replace(frame, time_s=moment)
+    return replace(frame, time_s=moment, environment=None if moment is None else scene.weather.at(moment))
 
 
 def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> list[Camera]:
