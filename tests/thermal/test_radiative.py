@@ -179,7 +179,7 @@ def test_without_three_parameters_there_are_none():
     assert {"radiance", "radiance_rest"} <= set(splats.names)
     assert list(thermal.parameters()) == []
     assert thermal.attributes(splats, query()) == {}
-    assert not {"grey_emission", "reflected_surroundings"} & set(thermal.effects())
+    assert not {"radiation", "reflection"} & set(thermal.effects())
     assert thermal.cost < model().cost
 
 
@@ -187,7 +187,7 @@ def test_opacities_are_two_or_one():
     assert (model().modality_channels, model().opacity_channels) == ((1, 3), (1, 3))
     single = model(dual_opacity=False)
     assert (single.modality_channels, single.opacity_channels) == ((1, 3), (4,))
-    assert "opacity_per_band" in model().effects() and "opacity_per_band" not in single.effects()
+    assert "thermal_opacity" in model().effects() and "thermal_opacity" not in single.effects()
 
 
 def test_kirchhoff_leaves_reflectance_out():

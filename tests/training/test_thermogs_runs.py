@@ -86,7 +86,7 @@ def test_all_six_terms_are_logged_and_attributes_drawn(finished):
     assert set(maps) == {"emissivity", "absorptivity", "convection", "capacity"}
     seen = maps["emissivity"][maps["emissivity"].isfinite()]
     assert len(seen) > 100 and seen.min() > 0.5 and seen.max() < 1
-    assert module.results.test["psnr"] > 8 and module.results.effects["sunlight"]["projected_area"] == "exact"
+    assert module.results.test["psnr"] > 8 and module.results.effects["solar"]["projected_area"] == "exact"
 
 
 def test_a_checkpoint_or_a_point_cloud_gives_geometry_that_never_moves(finished, tmp_path):

@@ -164,6 +164,10 @@ class ThermalModel(nn.Module, ABC):
         """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
         return {}
 
+    def rate_of(self, name: str) -> tuple[float, float]:
+        """Learning rate of the model's own parameter of that name, and the factor on it at the end of the run."""
+        return self.lr, self.lr_end
+
     def effects(self) -> dict[str, dict]:
         """The physical effects that the model simulates: catalogue name -> settings (for metrics.json)."""
         return {}

@@ -277,9 +277,9 @@ class EnergyBalance(ThermalModel):
             sky_k = sky.sky_temperature_k(air_k, weather.humidity_percent, law)
             parts["sky"] = power_excess(sky_k - reference, reference)
             parts["around"] = None if up is None else power_excess(air_k - reference, reference)
-            effects["long_waves"] = {"sky": law, "power": "T⁴" if self.solution == "corrected" else "about each mean"}
+            effects["radiation"] = {"sky": law, "power": "T⁴" if self.solution == "corrected" else "about each mean"}
             if not humid:
-                effects["long_waves"]["left_out"] = "humidity, which the weather lacks"
+                effects["radiation"]["left_out"] = "humidity, which the weather lacks"
         if self._wind and self.mean_wind > 0:
             if weather.wind_m_s is None:
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
@@ -296,16 +296,16 @@ class EnergyBalance(ThermalModel):
             return None, None, None
         directed = None not in (weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
         if directed and self.normals == "splats":
-            effects["sunlight"] = {"surfaces": "shortest axes", "sky": "isotropic"}
+            effects["solar"] = {"surfaces": "shortest axes", "sky": "isotropic"}
             beams = weather.direct_w_m2[:, None] * weather.sun / 1000.0
             return weather.up.to(torch.float64), weather.diffuse_w_m2 / 1000.0, beams
         if weather.irradiance_w_m2 is None:
             effects["convection"]["left_out_sun"] = "sunlight, of which the weather has no irradiance"
             log.warning("the weather has no irradiance: nothing is heated by the sun")
             return None, None, None
-        effects["sunlight"] = {"surfaces": "level"}
+        effects["solar"] = {"surfaces": "level"}
         if self.normals == "splats":
-            effects["sunlight"]["left_out"] = "the direction of the sun, which the weather lacks"
+            effects["solar"]["left_out"] = "the direction of the sun, which the weather lacks"
         return None, weather.irradiance_w_m2 / 1000.0, None
 
 

@@ -160,10 +160,10 @@ class Radiative(ThermalModel):
     def effects(self) -> dict[str, dict]:
         effects = self.color.effects()
         if self.three_parameter:
-            effects["grey_emission"] = {"law": "ε σ T⁴", "degrees": dict(self.degrees)}
-            effects["reflected_surroundings"] = {"reflectance": "1 - ε" if self.kirchhoff else "learned"}
+            effects["radiation"] = {"law": "ε σ T⁴", "degrees": dict(self.degrees)}
+            effects["reflection"] = {"reflectance": "1 - ε" if self.kirchhoff else "learned"}
         if not self.shared_opacity:
-            effects["opacity_per_band"] = {"opacities": len(self.opacity_channels)}
+            effects["thermal_opacity"] = {"opacities": len(self.opacity_channels)}
         return effects
 
     @property

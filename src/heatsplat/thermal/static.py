@@ -23,6 +23,7 @@ class Static(ThermalModel):
         modality: the image that is explained, "thermal" or "rgb".
         degree_every: steps after which training adds the next degree; 0 trains all from the start.
         lr: learning rate of "sh0"; that of "sh_rest" is a twentieth.
+        floor: False leaves values below zero as they are, for what comes after to decide.
 
     Raises:
         ValueError: the degree is not 0 to 3.
@@ -35,6 +36,7 @@ class Static(ThermalModel):
         modality: str = "thermal",
         degree_every: int = 1000,
         lr: float = 2.5e-3,
+        floor: bool = True,
     ) -> None:
         super().__init__()
         self.bands = spherical_harmonics.band_count(degree)
@@ -43,7 +45,7 @@ class Static(ThermalModel):
         self.modality = modality
         self.modality_channels = (channels,)
         self.degree_every = degree_every
-        self.lr = lr
+        self.lr, self.floor = lr, floor
         self.register_buffer("range_c", torch.full((2,), torch.nan, dtype=torch.float64))
 
     def prepare(self, scene: SceneData) -> None:
@@ -70,7 +72,7 @@ class Static(ThermalModel):
     def features(self, splats: Splats, query: Query) -> Emission:
         rest = splats["sh_rest"] if self.active_degree > 0 else None
         values = harmonics(splats["sh0"], rest, splats.means, query, self.active_degree)
-        return Emission((values + 0.5).clamp(min=0.0))
+        return Emission((values + 0.5).clamp(min=0.0) if self.floor else values + 0.5)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         if self.modality != "thermal" or self.modality_channels != (1,) or self.range_c.isnan().any():

@@ -119,10 +119,9 @@ class SplatTraining(pl.LightningModule):
             }
             for name, item in self._declared.items()
         ]
-        groups += [
-            {"params": [parameter], "name": f"thermal.{name}", "lr": self.thermal.lr, "lr_end": self.thermal.lr_end}
-            for name, parameter in self.thermal.named_parameters()
-        ]
+        for name, parameter in self.thermal.named_parameters():
+            lr, lr_end = self.thermal.rate_of(name)
+            groups.append({"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": lr_end})
         groups += [
             {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
             for name, part in self.sensor.parts.items()

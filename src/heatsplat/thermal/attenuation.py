@@ -1,0 +1,105 @@
+"""Air between a surface and the camera that swallows its heat and sends its own."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import SceneData
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Query
+from heatsplat.thermal.part import HeatPart
+
+LOG_DEPTHS = (-12.0, 3.0)  # of β times the typical distance: from nothing to a wall of fog, finite in float32
+
+
+class Attenuation(HeatPart):
+    """x e^{-β d} + A (1 - e^{-β d}) of what a surface emits at distance d from the camera (Beer and Lambert; air at A).
+
+    The extinction β is one number of the scene, or a curve over the record that is linear between evenly spread moments.
+    A is the temperature of the surroundings where it was measured, else it is learned.
+
+    **Convention:** d and 1/β in world units. The distance passes no gradient to the positions: haze must not move walls.
+
+    Args:
+        depth: β times the typical distance between cameras and points, at the start; positive.
+        moments: of the curve; 0 keeps β the same throughout.
+        smooth: weight of the penalty on the mean squared difference of log β from moment to moment.
+        lr, lr_end: learning rate of log β and of A, and the factor on it at the end of the run.
+
+    Raises:
+        ValueError: an option is out of its range.
+    """
+
+    def __init__(
+        self, depth: float = 0.1, moments: int = 0, smooth: float = 1e-3, lr: float = 0.01, lr_end: float = 0.1
+    ) -> None:
+        super().__init__()
+        if depth <= 0 or moments == 1 or moments < 0:
+            raise ValueError(f"depth must be positive and moments 0 or at least 2, got {depth} and {moments}")
+        self.moments, self.smooth, self.lr, self.lr_end = moments, smooth, lr, lr_end
+        self.needs = frozenset({"time"}) if moments > 0 else frozenset()
+        self.log_depth = nn.Parameter(torch.full((max(1, moments),), math.log(depth)))
+        self.register_buffer("level", torch.tensor(0.5))
+        self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
+        if moments > 0:
+            self.register_buffer("record", torch.tensor([0.0, 1.0], dtype=torch.float64))
+
+    def prepare(self, scene: SceneData) -> None:
+        centers = torch.stack([frame.camera.center for frame in scene.train.frames])
+        self.typical.copy_((scene.points.double().median(0).values - centers).norm(dim=1).median())
+        known = scene.thermal_range is not None and scene.ambient_c is not None
+        level = torch.tensor(scene.thermal_range.to_unit(scene.ambient_c) if known else 0.5)
+        if known:
+            self.level.copy_(level)
+        else:
+            del self.level
+            self.level = nn.Parameter(level)
+        if self.moments > 0:
+            times = torch.tensor(scene.train.times_s, dtype=torch.float64)
+            self.record.copy_(torch.stack([times.min(), times.max().clamp(min=times.min() + 1e-9)]))
+
+    def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        return self.level + (values - self.level) * self.transmission(splats, query)
+
+    def transmission(self, splats: Splats, query: Query) -> Tensor:
+        """e^{-β d}, [n, 1]."""
+        if query.camera is None:
+            raise ValueError("how much air lies in between depends on the view: give a camera")
+        means = query.rows(splats.means).detach()
+        distances = (means - query.camera.center.to(means)).norm(dim=1, keepdim=True)
+        return torch.exp(-self.extinction(query.time_s) * distances)
+
+    def extinction(self, time_s: float | None = None) -> Tensor:
+        """β at a time, [] in 1 per world unit."""
+        return self._log_depth_at(time_s).clamp(*LOG_DEPTHS).exp() / self.typical.to(self.log_depth)
+
+    def _log_depth_at(self, time_s: float | None) -> Tensor:
+        if self.moments == 0:
+            return self.log_depth[0]
+        if time_s is None:
+            raise ValueError("extinction changes over the record: give time_s, or set moments to 0")
+        start, end = self.record.tolist()
+        place = min(max((time_s - start) / (end - start), 0.0), 1.0) * (self.moments - 1)
+        before = min(int(place), self.moments - 2)
+        return torch.lerp(self.log_depth[before], self.log_depth[before + 1], place - before)
+
+    def regularisers(self) -> dict[str, Tensor]:
+        if self.moments == 0 or self.smooth == 0:
+            return {}
+        return {"extinction_smooth": self.smooth * self.log_depth.diff().square().mean()}
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        with torch.no_grad():
+            return {} if query.camera is None else {"transmission": self.transmission(splats, query)[:, 0]}
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        beta = (self.log_depth.detach().clamp(*LOG_DEPTHS).exp() / self.typical.to(self.log_depth)).mean()
+        return {"attenuation": {"per_unit": beta.item(), "moments": self.moments}}
+
+    @property
+    def cost(self) -> int:
+        return 16  # distance 7, exponential and root 6, mixing 3

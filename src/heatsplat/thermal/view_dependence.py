@@ -1,0 +1,56 @@
+"""What a surface emits more in one direction than in another: spherical harmonics on top of its state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from heatsplat.geometry import spherical_harmonics
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import PerGaussian, Query, Seeds
+from heatsplat.thermal.harmonics import harmonics
+from heatsplat.thermal.part import HeatPart
+
+
+class ViewDependence(HeatPart):
+    """Values plus harmonics of degree 1 and above of the direction of view (3DGS); the constant one is the state's.
+
+    Tensor: "view_rest" [N, B - 1, 1], zero at the start.
+
+    Args:
+        degree: of the harmonics, 1 to 3.
+        degree_every: steps after which training adds the next degree; 0 trains all from the start.
+        lr_rest: learning rate.
+
+    Raises:
+        ValueError: the degree is not 1 to 3.
+    """
+
+    def __init__(self, degree: int = 2, degree_every: int = 1000, lr_rest: float = 1.25e-4) -> None:
+        super().__init__()
+        self.bands = spherical_harmonics.band_count(degree)
+        if degree == 0:
+            raise ValueError("view dependence of degree 0 is none: give a degree of 1 to 3, or leave the part out")
+        self.degree = self.active_degree = degree
+        self.degree_every, self.lr_rest = degree_every, lr_rest
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        return {"view_rest": PerGaussian(seeds.values.new_zeros(len(seeds.means), self.bands - 1, 1), self.lr_rest)}
+
+    def on_step(self, step: int) -> None:
+        if self.degree_every > 0:
+            self.active_degree = min(self.degree, step // self.degree_every)
+
+    def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        if self.active_degree == 0:
+            return values
+        nothing = splats.means.new_zeros(len(splats), 1, 1)
+        return values + harmonics(nothing, splats["view_rest"], splats.means, query, self.active_degree)
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        return {"view_dependence": {"degree": self.degree}}
+
+    @property
+    def cost(self) -> int:
+        return {1: 12, 2: 27, 3: 48}[self.degree] + self.bands - 1  # normalising, polynomials and the sum
