@@ -1,0 +1,137 @@
+"""The energy balance in closed form and along the record, against Radau over 48 h of ten-minute weather."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from heatsplat.physics.energy_balance import Climate, Surface, power_excess
+from tests.physics.weather_reference import drivers, solved
+
+MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
+TIME_CONSTANTS_S = (120.0, 600.0, 3600.0, 43200.0)  # thin sheet metal to wet ground
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def bodies(wind: bool) -> Surface:
+    normals = tensor(0, 0, 1, 0.3, -0.5, 0.8, -1, 0, 0, 0, 0, 1).reshape(4, 3)
+    return Surface(
+        start=tensor(15, -8, 3, -2),
+        log_rate=-tensor(*TIME_CONSTANTS_S).log(),
+        sun=tensor(55, 45, 50, 40),
+        share=tensor(0.3, 0.5, 0.4, 0.35),
+        wind=tensor(0.6, 0.3, 0.5, 0.4) if wind else None,
+        normals=torch.nn.functional.normalize(normals, dim=1),
+    )
+
+
+def course(solution, surface: Surface) -> torch.Tensor:
+    return torch.stack([solution(surface, float(t)) for t in MOMENTS], dim=1)
+
+
+@pytest.fixture(scope="module")
+def climate() -> Climate:
+    return Climate(drivers())
+
+
+def test_linear_physics_is_exact_to_a_millikelvin(climate):
+    surface = bodies(wind=True)
+    truth = solved(climate.drivers, surface, MOMENTS, about=climate.mean_temperature(surface))
+    assert (course(climate.linear_temperature, surface) - truth).abs().max() < 1e-3
+
+
+def test_corrected_physics_is_exact_to_20_millikelvin_from_sheet_metal_to_wet_ground(climate):
+    surface = bodies(wind=True)
+    truth = solved(climate.drivers, surface, MOMENTS)
+    assert truth.max() - truth.min() > 40  # the weather does heat
+    assert (course(climate.marched_temperature, surface) - truth).abs().max() < 0.02
+    linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
+    assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
+    assert linear[3] < 1.0
+
+
+def test_both_agree_where_nothing_is_nonlinear():
+    climate = Climate(replace(drivers(wind=False), sky=None, around=None))
+    surface = bodies(wind=False)._replace(share=None)
+    torch.testing.assert_close(
+        course(climate.marched_temperature, surface), course(climate.linear_temperature, surface), atol=1e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize("solution", ["linear_temperature", "marched_temperature"])
+def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
+    surface = bodies(wind=True)
+    leaves = [x.clone().requires_grad_() for x in surface]
+    at = 40_000.0  # the start is still remembered by some
+    gradients = torch.autograd.grad(getattr(climate, solution)(Surface(*leaves), at).sum(), leaves)
+    for number, (name, gradient) in enumerate(zip(Surface._fields, gradients, strict=True)):
+        for column in range(3) if name == "normals" else (0,):
+            step = torch.zeros_like(surface[number])
+            step[(..., column) if name == "normals" else ...] = 1e-4
+            up, down = (
+                getattr(climate, solution)(surface._replace(**{name: surface[number] + sign * step}), at)
+                for sign in (1, -1)
+            )
+            ours = gradient[:, column] if name == "normals" else gradient
+            scale = ours.abs().max().clamp(min=1e-3)
+            assert ((up - down) / 2e-4 - ours).abs().max() < 5e-3 * scale, (name, column)
+
+
+def test_mean_temperature_balances_the_mean(climate):
+    surface = bodies(wind=False)
+    mean = climate.mean_temperature(surface)
+    beam = climate.beam.mean(surface.normals)
+    forcing = climate.forcing(surface, climate.means.double(), beam, 0.0)
+    left = (1 - surface.share) * mean + surface.share * power_excess(mean, climate.drivers.reference_k)
+    torch.testing.assert_close(forcing, left, atol=1e-6, rtol=0)
+
+
+def test_only_ratios_are_parameters_and_a_night_separates_convection_from_radiation(climate):
+    """At night p alone says how far below the air a light surface lies: (1 - p)(air - x) = p (w(x) - s)."""
+    level = tensor(0, 0, 1).expand(2, 3)
+    surface = Surface(tensor(0, 0), -tensor(60, 60).log(), tensor(50, 50), tensor(0.2, 0.7), None, level)
+    still = Climate(drivers(wind=False))
+    x = still.marched_temperature(surface, 4 * 3600.0)
+    air, sky = (torch.lerp(s[24], s[24], 0.0) for s in (still.drivers.air, still.drivers.sky))
+    rest = (1 - surface.share) * (air - x) + surface.share * (sky - power_excess(x, still.drivers.reference_k))
+    assert rest.abs().max() < 0.2
+    assert (air - x)[1] > 2 * (air - x)[0] > 0
+
+
+def test_cost_does_not_depend_on_the_length_of_the_record():
+    """Counted in what the last hours sum, not in seconds: those depend on the machine's neighbours."""
+    from heatsplat.physics import sunlight
+
+    lengths = []
+    original = sunlight._Recent.apply
+    surface = bodies(wind=False)
+    try:
+        sunlight._Recent.apply = lambda *a: lengths.append(len(a[2])) or original(*a)
+        for days in (2, 4, 8):
+            climate = Climate(drivers(days=days, wind=False))
+            climate.linear_temperature(surface, days * 86400.0 - 1800.0)
+            table = climate.table.at(days * 86400.0 - 1800.0)
+            assert table.shape == (126, 4, len(climate.columns))
+    finally:
+        sunlight._Recent.apply = original
+    assert len(set(lengths)) == 1
+    assert lengths[0] <= 144
+
+
+def test_extreme_bodies_stay_finite_in_float32():
+    climate = Climate(drivers())
+    surface = Surface(*(x.float() for x in bodies(wind=True)))._replace(
+        log_rate=torch.tensor([math.log(1e-7), math.log(0.1), math.log(0.1), math.log(1e-7)]),
+        share=torch.tensor([0.98, 0.02, 0.98, 0.02]),
+        sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
+        wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
+    )
+    for solution in (climate.linear_temperature, climate.marched_temperature):
+        leaves = [x.clone().requires_grad_() for x in surface]
+        x = solution(Surface(*leaves), 130_000.0)
+        assert x.isfinite().all()
+        assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves))

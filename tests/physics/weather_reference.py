@@ -1,0 +1,98 @@
+"""A real-looking record of weather, and the heat balance solved by a stiff solver at tight tolerances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+
+from heatsplat.physics.energy_balance import Drivers, Surface, power_excess
+from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.training.rng import generator_for
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Drivers:
+    """Sun over 48° north with broken clouds that change between samples, gusty wind, and the sky by its humidity."""
+    generator = generator_for(0, 0, "weather")
+    times = torch.arange(0, days * 86400 + 1, step_s, dtype=torch.float64)
+    hours, count = times / 3600, len(times)
+    noise = torch.randn(count, generator=generator, dtype=torch.float64)
+    drift = torch.zeros_like(noise)
+    for k in range(1, count):
+        drift[k] = 0.9 * drift[k - 1] + 0.44 * noise[k]
+    air = 291.0 + 7.0 * torch.sin(2 * math.pi * (hours - 9) / 24) + 0.4 * drift
+    latitude, declination, hour = math.radians(48), math.radians(15), 2 * math.pi * (hours - 12) / 24
+    height = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * hour.cos()
+    north = math.cos(latitude) * math.sin(declination) - math.sin(latitude) * math.cos(declination) * hour.cos()
+    sun = torch.stack((-math.cos(declination) * hour.sin(), north, height), dim=1)
+    clouds = 0.85 * (torch.randn(count, generator=generator, dtype=torch.float64) > 0.6)
+    direct = torch.where(height > 0, torch.exp(-0.14 / height.clamp(min=0.05)), 0.0) * (1 - clouds)
+    diffuse = 0.1 * height.clamp(min=0).sqrt() * (1 + clouds)
+    reference = float(air.mean())
+    sky = sky_temperature_k(air, torch.full_like(air, 60.0), "brutsaert")
+    breeze = (3 + 1.5 * drift).clamp(min=0)
+    return Drivers(
+        times,
+        reference,
+        air - reference,
+        power_excess(sky - reference, reference),
+        power_excess(air - reference, reference),
+        diffuse,
+        direct[:, None] * sun,
+        breeze / breeze.mean() - 1 if wind else None,
+        UP,
+    )
+
+
+def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None) -> torch.Tensor:
+    """Temperatures x [n, F] of surfaces with normals at moments [F] by Radau, one interval of the record at a time.
+
+    Args:
+        about: temperatures [n] about which T⁴ and wind are linearised; None solves the full balance.
+    """
+    reference, times = given.reference_k, given.times_s.numpy()
+    rate, share, sun = surface.log_rate.exp().numpy(), surface.share.numpy(), surface.sun.numpy()
+    wind = surface.wind.numpy() if surface.wind is not None else 0.0
+    view = ((1 + surface.normals @ UP) / 2).numpy()
+    light = view * given.light.numpy()[:, None] + (given.beams @ surface.normals.T).clamp(min=0).numpy()
+    sky = view * given.sky.numpy()[:, None] + (1 - view) * given.around.numpy()[:, None]
+    forcing, air = sun * light + share * sky, given.air.numpy()
+    breeze = np.zeros_like(air) if given.breeze is None else given.breeze.numpy()
+    calm = np.trapezoid(breeze, times) / (times[-1] - times[0])
+    mean = None if about is None else about.numpy()
+
+    def radiated(x):
+        return ((reference + x) ** 4 - reference**4) / (4 * reference**3)
+
+    ends = np.unique(np.concatenate((times, moments.numpy())))
+    x = surface.start.numpy().copy()
+    found = {ends[0]: x}
+    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+        k = min(np.searchsorted(times, begin, side="right") - 1, len(times) - 2)
+
+        def now(series, t, k=k):
+            part = (t - times[k]) / (times[k + 1] - times[k])
+            return series[k] * (1 - part) + series[k + 1] * part
+
+        def slope(t, x, now=now):
+            a, b, f = now(air, t), now(breeze, t), now(forcing, t)
+            if mean is None:
+                return rate * (f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x))
+            steep = (1 + mean / reference) ** 3
+            convected = (1 + wind * calm) * (a - x) + wind * (now(breeze * air, t) - calm * a - (b - calm) * mean)
+            return rate * (f + (1 - share) * convected - share * (radiated(mean) + steep * (x - mean)))
+
+        def jacobian(t, x, now=now):
+            if mean is None:
+                steep = (1 + x / reference) ** 3
+                return np.diag(-rate * ((1 - share) * (1 + wind * now(breeze, t)) + share * steep))
+            return np.diag(-rate * ((1 - share) * (1 + wind * calm) + share * (1 + mean / reference) ** 3))
+
+        step = (end - begin) / 4
+        x = solve_ivp(slope, (begin, end), x, "Radau", rtol=1e-7, atol=1e-6, jac=jacobian, first_step=step).y[:, -1]
+        found[end] = x
+    return torch.tensor(np.stack([found[t] for t in moments.numpy()], axis=1))
