@@ -1,0 +1,228 @@
+"""The energy balance as a thermal model: what it needs, what is absent, what it says, and what a checkpoint carries."""
+
+import io
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.energy_balance import EnergyBalance
+
+HOUR = 3600.0
+FULL = ("log_rate", "raw_sun", "raw_share", "raw_wind")
+
+
+def weather(**changes) -> Weather:
+    """A day and a half from midnight: warm afternoon, sun from east over south to west, wind that rises by day."""
+    times = torch.arange(-6 * HOUR, 30 * HOUR + 1, 1800.0, dtype=torch.float64)
+    angle = 2 * math.pi * times / (24 * HOUR)
+    sun = torch.stack((-angle.sin(), -0.6 * angle.cos() * -1 - 1.2, -angle.cos()), dim=1)
+    sun = torch.nn.functional.normalize(sun, dim=1)
+    height = sun[:, 2].clamp(min=0)
+    record = Weather(
+        times,
+        air_c=16 - 6 * angle.cos(),
+        wind_m_s=3 - 2 * angle.cos(),
+        humidity_percent=60 + 20 * angle.cos(),
+        irradiance_w_m2=700 * height + 100 * height.sqrt(),
+        direct_w_m2=torch.where(height > 0, 700.0, 0.0).double(),
+        diffuse_w_m2=100 * height.sqrt(),
+        sun=sun,
+    )
+    return replace(record, **changes)
+
+
+def scene(record: Weather | None = None, times=(0.0, 6 * HOUR, 12 * HOUR, 18 * HOUR), **changes) -> SceneData:
+    camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
+    above = torch.eye(4)
+    above[2, 3] = -20.0  # the camera stands at z = 20
+    camera = replace(camera, viewmat=above)
+    views = ViewSet([Frame(f"{i}.png", i, camera, time) for i, time in enumerate(times)], lambda i: None)
+    data = SceneData("yard", views, views, views, torch.zeros(4, 3), None, ThermalRange(0.0, 60.0))
+    return replace(data, weather=record or weather(), **changes)
+
+
+def splats_of(model: EnergyBalance, count: int = 6) -> Splats:
+    """Flat splats: half of them lie level, half stand upright and face east."""
+    generator = torch.Generator().manual_seed(0)
+    start = Seeds(torch.zeros(count, 3), 0.3 + 0.3 * torch.rand(count, 1, generator=generator), generator)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    quats[count // 2 :] = torch.tensor([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
+    means = torch.zeros(count, 3)
+    means[count // 2 :, 0] = -5.0  # so that the camera is on their eastern side
+    flat = torch.tensor([0.0, 0.0, -4.0]).repeat(count, 1)
+    tensors = {"means": means, "log_scales": flat, "quats": quats, "opacity_logits": torch.zeros(count, 1)}
+    return Splats(tensors | {name: item.initial for name, item in model.per_gaussian(start).items()})
+
+
+def ready(data: SceneData | None = None, **options) -> tuple[EnergyBalance, Splats]:
+    model = EnergyBalance(**options)
+    model.prepare(data or scene())
+    return model, splats_of(model)
+
+
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_it_emits_temperatures_and_all_that_it_learns_gets_a_gradient(solution):
+    model, splats = ready(solution=solution)
+    assert set(splats.names) >= {"initial_state", *FULL}
+    ids = torch.tensor([4, 1])
+    shown = model.features(splats, Query(ids, time_s=13 * HOUR)).features
+    assert shown.shape == (2, 1)
+    kelvin = model.temperature(splats, 13 * HOUR)
+    torch.testing.assert_close(shown[:, 0], ((kelvin[ids] - 273.15) / 60.0), atol=1e-4, rtol=0)
+    shown.sum().backward()
+    for name in FULL:
+        assert (splats[name].grad[ids] != 0).all(), name
+        assert (splats[name].grad[0] == 0).all(), name
+
+
+def test_both_solutions_agree_within_what_linearising_costs():
+    models = [ready(solution=solution) for solution in ("linear", "corrected")]
+    linear, corrected = (torch.stack([m.temperature(s, h * HOUR) for h in range(0, 30, 3)]) for m, s in models)
+    assert 0.0 < (linear - corrected).abs().max() < 6.0
+
+
+def test_the_sun_heats_what_faces_it_and_only_by_day():
+    model, splats = ready()
+    with torch.no_grad():
+        splats["log_rate"].fill_(-math.log(300.0))
+    level, east = (slice(0, 3), slice(3, 6))
+    bright, dark = model.temperature(splats, 7 * HOUR), model.temperature(splats, 23 * HOUR)
+    assert bright[east].mean() > bright[level].mean() + 5  # the morning sun is low
+    splats["raw_sun"].data.fill_(-100.0)
+    assert (model.temperature(splats, 7 * HOUR) < bright).all()
+    torch.testing.assert_close(model.temperature(splats, 23 * HOUR), dark, atol=1e-3, rtol=0)  # forgotten by night
+    assert dark[level].mean() < dark[east].mean()  # what lies level sees more of the cold sky
+
+
+def test_effects_that_are_off_or_unknown_are_absent():
+    model, splats = ready(sky=None, wind=False, sun=False)
+    assert set(splats.names) & {"raw_share", "raw_sun", "raw_wind"} == set()
+    assert model.effects() == {"convection": {"air": "recorded"}}
+    assert set(model.attributes(splats, Query(time_s=0.0))) == {"time_constant_h"}
+    bare = weather(wind_m_s=None, humidity_percent=None, pressure_hpa=None)
+    model, splats = ready(scene(bare))
+    assert "raw_wind" not in splats
+    assert model.effects()["convection"]["left_out"] == "wind, which the weather lacks"
+    assert model.effects()["long_waves"]["sky"] == "swinbank"
+    assert "humidity" in model.effects()["long_waves"]["left_out"]
+    assert model.temperature(splats, 5 * HOUR).isfinite().all()
+
+
+def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():
+    model, splats = ready(scene(weather(sun=None, direct_w_m2=None, diffuse_w_m2=None)))
+    assert model.effects()["sunlight"]["left_out"] == "the direction of the sun, which the weather lacks"
+    assert model.climate.beam is None
+    with torch.no_grad():
+        splats["raw_sun"].fill_(0.0)
+        splats["initial_state"].fill_(0.3)
+    temperatures = model.temperature(splats, 12 * HOUR)
+    torch.testing.assert_close(temperatures, temperatures[:1].expand(6), atol=1e-4, rtol=0)
+    model, splats = ready(scene(weather(sun=None, direct_w_m2=None, diffuse_w_m2=None, irradiance_w_m2=None)))
+    assert "raw_sun" not in splats
+    assert "no irradiance" in str(model.effects())
+
+
+def test_another_weather_changes_the_answer_without_training():
+    model, splats = ready()
+    with torch.no_grad():
+        before = model.temperature(splats, 14 * HOUR)
+        model.prepare(scene(weather(wind_m_s=torch.full((73,), 12.0, dtype=torch.float64))))
+        windy = model.temperature(splats, 14 * HOUR)
+    hot = before > 273.15 + 30
+    assert hot.any()
+    assert (windy[hot] < before[hot] - 2).all()
+    assert model.mean_wind.item() == pytest.approx(3.0, abs=1.0)  # still that of the trained record
+
+
+def test_a_checkpoint_brings_the_constants_of_its_own_weather():
+    model, splats = ready()
+    warm = scene(weather(air_c=weather().air_c + 15))
+    truth, _ = ready()
+    truth.prepare(warm)
+    file = io.BytesIO()
+    torch.save(model.state_dict(), file)
+    file.seek(0)
+    restored = EnergyBalance()
+    restored.prepare(warm)
+    assert restored.reference_k != model.reference_k
+    restored.load_state_dict(torch.load(file))
+    with torch.no_grad():
+        torch.testing.assert_close(restored.temperature(splats, 9 * HOUR), truth.temperature(splats, 9 * HOUR))
+        assert (restored.temperature(splats, 9 * HOUR) > model.temperature(splats, 9 * HOUR)).all()
+
+
+def test_attributes_follow_the_assumed_emissivity_by_one_common_factor():
+    """The gauge: absorptivity, convection, capacity and emissivity times one number show the same image."""
+    query = Query(torch.tensor([0, 5]), time_s=12 * HOUR)
+    (model, splats), (other, _) = ready(emissivity=0.9), ready(emissivity=0.45)
+    told, half = model.attributes(splats, query), other.attributes(splats, query)
+    for name in ("absorptivity", "convection_w_m2_k", "areal_heat_capacity_kj_m2_k"):
+        torch.testing.assert_close(half[name], told[name] / 2)
+    for name in ("time_constant_h", "sun_k_per_kw_m2", "radiation_share", "wind_share"):
+        torch.testing.assert_close(half[name], told[name])
+    torch.testing.assert_close(model.features(splats, query).features, other.features(splats, query).features)
+    assert (told["absorptivity"] > 0).all()
+
+
+def test_scenes_and_moments_that_cannot_be_answered_are_refused():
+    with pytest.raises(SceneError, match="EnergyBalance needs weather"):
+        ready(replace(scene(), weather=None))
+    with pytest.raises(SceneError, match="EnergyBalance needs thermal_range"):
+        ready(scene(thermal_range=None))
+    with pytest.raises(SceneError, match="has no air_c, the temperature of the air"):
+        ready(scene(weather(air_c=None)))
+    with pytest.raises(SceneError, match="there is no weather for second 720000"):
+        ready(scene(times=(0.0, 200 * HOUR)))
+    with pytest.raises(SceneError, match="sky=brunt needs humidity_percent"):
+        ready(scene(weather(humidity_percent=None)), sky="brunt")
+    model, splats = ready()
+    with pytest.raises(SceneError, match="the record runs from -21600 to 108000 s"):
+        model.features(splats, Query(time_s=-1e6))
+    with pytest.raises(ValueError, match="give time_s"):
+        model.features(splats, Query())
+    with pytest.raises(SceneError, match="trained with wind, but this weather has no wind_m_s"):
+        model.prepare(scene(weather(wind_m_s=None)))
+
+
+def test_a_night_only_record_works_without_sun():
+    night = torch.arange(0, 6 * HOUR + 1, 600.0, dtype=torch.float64)
+    zero = torch.zeros_like(night)
+    down = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(len(night), 3)
+    record = Weather(night, air_c=zero + 10, direct_w_m2=zero, diffuse_w_m2=zero, irradiance_w_m2=zero, sun=down)
+    model, splats = ready(scene(record, times=(0.0, 3 * HOUR)))
+    with torch.no_grad():
+        splats["log_rate"].fill_(-math.log(600.0))
+        late = model.temperature(splats, 6 * HOUR)
+    assert (late < 273.15 + 10).all()  # below the air, under a clear sky
+    assert (late > 273.15 - 10).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"solution": "best"}, "solution must be one of linear, corrected, got 'best'"),
+        ({"sky": "blue"}, "sky must be one of auto, brutsaert"),
+        ({"normals": "up"}, "normals must be one of splats, level, got 'up'"),
+        ({"clip": "soft"}, "clip must be one of"),
+        ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
+    ],
+)
+def test_unknown_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        EnergyBalance(**options)
+
+
+def test_the_yaml_builds_the_defaults_of_the_class():
+    settings = OmegaConf.load("conf/thermal/energy_balance.yaml")
+    assert vars(instantiate(settings))["solution"] == EnergyBalance().solution
+    built, plain = instantiate(settings), EnergyBalance()
+    for name, value in vars(plain).items():
+        if isinstance(value, (int, float, str)) and not name.startswith("_"):
+            assert getattr(built, name) == value, name
