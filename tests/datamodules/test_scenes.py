@@ -10,6 +10,7 @@ from weathered import HOUR_S, make_scene, make_weather
 from datamodules.base import SceneDataModule
 from datamodules.scenes import DAY_S, Scenes, joined
 from heatsplat.contracts import Camera, SceneError, ThermalRange, View, ViewSet
+from heatsplat.renderers.settings import Renderer
 
 
 def room(name="one", width=50.0, metres=1.0, **changed):
@@ -69,6 +70,24 @@ def test_clocks_move_by_whole_days_and_take_the_weather_along():
             before, after = scene.weather.at(time), whole.weather.at(time + delay)
             assert (before.air_c, before.irradiance_w_m2) == pytest.approx((after.air_c, after.irradiance_w_m2))
     assert joined((room(), room("other", weather=None)), far=100.0).weather is None
+
+
+@pytest.mark.parametrize(("far", "shows"), [(100.0, False), (1e10, True)])
+def test_a_renderer_that_cuts_at_far_shows_no_other_scene(far, shows):
+    """A camera 5 m before the first scene looks along x, where the second one stands 100 m behind."""
+    along = torch.tensor([[0.0, -1.0, 0.0, 2.0], [0.0, 0.0, -1.0, 0.5], [1.0, 0.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
+    lens = torch.tensor([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]])
+    scene = room()
+    frames = [replace(frame, camera=Camera(along, lens, 16, 16)) for frame in scene.train.frames]
+    scene = replace(scene, train=ViewSet(frames, lambda i: View(frames[i])))
+    whole = joined((scene, room("other")), far=100.0)
+    count = len(whole.points)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    sizes, opacities, values = torch.full((count, 3), 0.2), torch.full((1, count), 0.5), torch.ones(count, 1)
+    renderer = Renderer(backend="reference", far=far)
+    camera = whole.train.frames[0].camera
+    seen = renderer(whole.points, quats, sizes, opacities, values, camera, None, (1,)).meta["visible_ids"]
+    assert (seen < 40).sum() > 30 and ((seen >= 40).any() == shows)
 
 
 def test_images_are_brought_to_one_range():
