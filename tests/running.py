@@ -33,10 +33,12 @@ def run(output_dir: Path, *overrides: str):
     config = compose_run(output_dir, *overrides)
     plain = OmegaConf.to_container(config, resolve=True)
     prepare_machine(plain["threads"])
+    data = cli.build(plain["data"])
+    plain = cli.with_effects(plain, data)
     trainer = cli.build(
         plain["trainer"], callbacks=cli.build_callbacks(plain["callbacks"]), logger=cli.build(plain["logger"])
     )
     module = cli.build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain
-    fit(module, cli.build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
+    fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
     return module, trainer

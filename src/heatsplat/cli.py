@@ -106,11 +106,54 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     if plain["data"].get("root") is not None:
         plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
+    data = build(plain["data"])
+    plain = with_effects(plain, data)
     trainer = build(plain["trainer"], callbacks=build_callbacks(plain["callbacks"]), logger=build(plain["logger"]))
     module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain  # set, not passed: Hydra would build every part in it once more
-    results = fit(module, build(plain["data"]), trainer, ckpt=plain["ckpt"], test=plain["test"])
+    results = fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
+
+
+def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
+    """The configuration of a run with the effects that its scene calls for, where it leaves them to be chosen.
+
+    Thermal model, sensor and loss then stand in it as they are built, and "verdicts" says why. A run that goes on from a
+    checkpoint takes all that from there.
+    """
+    from heatsplat.effects import assembly
+
+    if not assembly.chooses(plain):
+        return plain
+    if plain["ckpt"] is not None:
+        from heatsplat.training.module import CHECKPOINT_KEY
+        from heatsplat.training.session import load_checkpoint
+
+        stored = load_checkpoint(plain["ckpt"]).get(CHECKPOINT_KEY, {}).get("recipe", {})
+        if "verdicts" in stored:
+            return assembly.filled(plain, stored, stored["verdicts"])
+
+    from heatsplat.effects.catalogue import decide
+
+    given = assembly.explicit(plain["effects"])
+    verdicts = assembly.reconciled(decide(data.scene, assembly.wishes(plain["effects"])), given)
+
+    def configured(chosen: dict[str, Any]) -> dict[str, Any]:
+        return assembly.filled(plain, assembly.recipe(chosen, plain["effects"]), assembly.told(verdicts, found))
+
+    found: dict[str, Any] = {}
+    if plain["effects"]["price"]:
+        from heatsplat.studies.prices import prices
+
+        def maker(chosen: dict[str, Any]) -> Callable[[], Any]:
+            return lambda: build(configured(chosen)["module"])
+
+        on = [name for name, verdict in verdicts.items() if verdict.on]
+        leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
+        found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"])
+    for name, verdict in verdicts.items():
+        log.info("effect %-16s %-3s  %s", name, "on" if verdict.on else "off", verdict.reason)
+    return configured(verdicts)
 
 
 @hydra.main(version_base="1.3", config_path=CONF, config_name="evaluate")

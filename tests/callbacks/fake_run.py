@@ -10,6 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
 from heatsplat.io.results import RunResults
+from heatsplat.sensors.base import SensorChain
 from heatsplat.splats import Splats
 from heatsplat.training.rng import generator_for
 
@@ -90,7 +91,7 @@ class FakeModule(pl.LightningModule):
         }
         self.splats = Splats(tensors | {"opacity_logits": torch.zeros(300, 1)})
         self.scene, self.output_dir, self.recipe = scene, Path(output_dir), recipe or {}
-        self.thermal = Emitter()
+        self.thermal, self.sensor = Emitter(), SensorChain()
         self.modality = "thermal" if scene.train[0].thermal is not None else "rgb"
         self.channels = scene.train[0].image(self.modality).shape[-1]
         self.results = RunResults()

@@ -79,7 +79,7 @@ def test_every_number_is_there_or_explained(run):
             assert (value is None) == (f"{section}.{name}" in content["reasons"]), name
     assert "https://download.pytorch.org/models/alexnet" in content["reasons"]["test.lpips"]
     assert content["run"]["method"] == "etgs" and content["run"]["steps"] == 24
-    assert content["effects"] == {"newton_cooling": {"ambient": "learned"}}
+    assert content["effects"] == {"newton_cooling": {"on": True, "ambient": "learned"}}
     assert content["data"]["timestamps"] == "from file names"
     assert content["data"]["views"] == {"train": 6, "val": 3, "test": 4}
     assert content["data"]["thermal_range_c"] == [10.0, 50.0]

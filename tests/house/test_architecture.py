@@ -28,7 +28,7 @@ ALLOWED = {
     | {"sensors", "thermal", "training"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "io", "training", "shots", "studies"},
+    "cli": {"contracts", "effects", "io", "training", "shots", "studies"},
     "datamodules": {"contracts", "geometry", "sensors", "training"},
 }
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know

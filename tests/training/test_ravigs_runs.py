@@ -68,8 +68,8 @@ def test_both_images_and_the_attributes_are_drawn(finished):
 
 def test_the_effects_are_told(finished):
     effects = finished[2]["effects"]
-    assert effects["grey_emission"]["degrees"] == {"emissivity": 1, "temperature": 1, "reflectance": 0}
-    assert effects["opacity_per_band"] == {"opacities": 2}
+    assert effects["radiation"]["degrees"] == {"emissivity": 1, "temperature": 1, "reflectance": 0}
+    assert effects["thermal_opacity"] == {"on": True, "opacities": 2}
 
 
 def test_a_run_without_any_part_has_none_of_them(tmp_path):
@@ -77,7 +77,7 @@ def test_a_run_without_any_part_has_none_of_them(tmp_path):
     module, trainer = run(tmp_path, *SHORT, *off, "density=adaptive")
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5
-    assert not {"grey_emission", "opacity_per_band"} & set(found["effects"])
+    assert not {"radiation", "thermal_opacity"} & set(found["effects"])
     assert module.splats.opacities.shape[0] == 1
     assert sorted(set(module.splats.names) - {"means", "quats", "log_scales", "opacity_logits"}) == [
         "radiance",

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import spread
 from heatsplat.callbacks.metrics import CURVE_FILE, TEST_FILE, read_table
 from heatsplat.contracts import SceneData
@@ -44,7 +45,8 @@ class Report(pl.Callback):
 
     * metrics.json: every number, or null with the reason (``heatsplat.io.results``).
     * report.md: the same for people, with pictures, readable without any tool.
-    * TensorBoard's table of hyperparameters with the final scores and costs, so that runs can be compared.
+    * TensorBoard's table of hyperparameters with the final scores and costs, so that runs can be compared; and, from the
+      start, the table of effects where they were chosen.
     * The table on the screen.
 
     Args:
@@ -55,11 +57,17 @@ class Report(pl.Callback):
     def __init__(self, pictures: int = 4, show: bool = True) -> None:
         self.pictures, self.show = pictures, show
 
+    def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        writer = board(module)
+        if writer is not None and module.recipe.get("verdicts"):
+            table = effects_table(describe_effects(module))
+            writer.add_text("effects", "\n".join(table), trainer.global_step)
+
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         folder, results = module.output_dir, module.results
         results.run = describe_run(trainer, module) | results.run
         results.data = describe_data(module.scene, module.modality) | results.data
-        results.effects = results.effects or dict(module.thermal.effects())
+        results.effects = results.effects or describe_effects(module)
         results.versions = collect_versions()
         results.write(folder / METRICS_FILE)
         curves = draw_curves(folder)
@@ -90,6 +98,7 @@ def describe_run(trainer: pl.Trainer, module: pl.LightningModule) -> dict[str, A
         "steps": trainer.global_step or None,
         "thermal_model": type(module.thermal).__name__,
         "multiply_adds_per_gaussian": module.thermal.cost,
+        "parameters": sum(parameter.numel() for parameter in module.parameters()),
         "device": str(module.device),
     }
 
@@ -110,6 +119,29 @@ def describe_data(scene: SceneData, modality: str) -> dict[str, Any]:
         "metres_per_unit": scene.metres_per_unit,
         **scene.notes,
     }
+
+
+def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
+    """Physical effects by name, for metrics.json: those that are simulated with their settings.
+
+    Where a scene chose them there is an entry for every effect of the catalogue, with the verdict on it, how many numbers
+    it adds to this many Gaussians ("parameters") and what a step of training costs more ("ms_per_step").
+    """
+    simulated = module.thermal.effects() | module.sensor.effects()
+    verdicts = module.recipe.get("verdicts")
+    if not verdicts:
+        return {name: {"on": True} | settings for name, settings in simulated.items()}
+    described = {}
+    for name, verdict in verdicts.items():
+        described[name] = {key: verdict[key] for key in ("on", "statistic", "threshold", "reason")}
+        priced = "ms_per_step" in verdict
+        described[name]["parameters"] = (
+            verdict["shared"] + verdict["per_gaussian"] * len(module.splats) if priced else None if verdict["on"] else 0
+        )
+        described[name]["ms_per_step"] = verdict["ms_per_step"] if priced else None if verdict["on"] else 0.0
+        if verdict["on"]:
+            described[name]["settings"] = simulated.get(name, {})
+    return described
 
 
 def hyperparameters(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,11 +216,44 @@ def report(
     if probes is not None:
         lines += ["", "## Temperature over time", "", f"![probes]({probes.relative_to(folder).as_posix()})"]
     lines += ["", "## The run", "", *_bullets(run)]
-    lines += ["", "## Effects that were simulated", "", *(_bullets(content["effects"]) or ["None."])]
+    lines += _effects_section(content["effects"])
     lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
     lines += ["", "## What the scores mean", "", *_bullets(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"]), ""]
     return "\n".join(lines)
+
+
+EFFECTS_NOTE = (
+    "An effect is simulated where its statistic, in units of its own noise, exceeds the threshold; no number stands where it "
+    "was asked for or the data cannot say. What is off is absent: no parameter, no operation. Parameters are those of the "
+    "Gaussians at the end. Milliseconds per step: whole training steps on the Gaussians of the start, with all effects and "
+    "without the one (and what stands on it), by turns; quickest against quickest, so a few hundredths are noise."
+)
+
+
+def _effects_section(effects: Mapping[str, Any]) -> list[str]:
+    """A table where a scene chose the effects, a list where the method did."""
+    if not any("reason" in effect for effect in effects.values()):
+        return ["", "## Effects that were simulated", "", *(_bullets(effects) or ["None."])]
+    settings = {name: effect["settings"] for name, effect in effects.items() if effect.get("settings")}
+    return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_bullets(settings)]
+
+
+def effects_table(effects: Mapping[str, Any]) -> list[str]:
+    """Lines of a Markdown table of ``describe_effects``: what is simulated, why, and what it costs."""
+    lines = [
+        "| effect | simulated | statistic | threshold | reason | parameters | ms per step |",
+        "|---|---|---:|---:|---|---:|---:|",
+    ]
+    for name, effect in effects.items():
+        statistic, threshold, parameters, milliseconds = (
+            "–" if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
+            for key in ("statistic", "threshold", "parameters", "ms_per_step")
+        )
+        reason = effect["reason"].replace("|", "/")
+        on = "**yes**" if effect["on"] else "no"
+        lines.append(f"| {name} | {on} | {statistic} | {threshold} | {reason} | {parameters} | {milliseconds} |")
+    return lines
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:

@@ -1,0 +1,229 @@
+"""From verdicts to a recipe: the configuration that simulates exactly the effects that are on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from copy import deepcopy
+from dataclasses import asdict, replace
+from typing import Any
+
+from heatsplat.contracts import SceneError
+from heatsplat.effects.base import WISHES, Verdict
+
+STATE = ("relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction")
+ON_THE_WAY = ("view_dependence", "reflection", "attenuation")  # in the order in which heat meets them
+SENSOR = ("frame_offset", "agc", "fixed_pattern", "vignetting", "tone", "point_spread")
+NAMES = (*STATE, *ON_THE_WAY, "thermal_opacity", *SENSOR)
+WEATHER_DRIVEN = ("solar", "radiation", "convection")
+# An effect that acts on a changing temperature, and what makes it change.
+STANDS_ON = dict.fromkeys(("harmonic_source", "conduction", *WEATHER_DRIVEN), "relaxation")
+# Parts of the camera in the order in which light meets them, each with the effects that it simulates.
+CAMERA = {
+    "point_spread": ("point_spread",),
+    "calibration": ("fixed_pattern", "vignetting"),
+    "frame_offset": ("frame_offset",),
+    "agc": ("agc",),
+    "tone": ("tone",),
+}
+SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each wishes of an effect of which nothing is said
+
+
+def wishes(effects: Mapping[str, Any]) -> dict[str, str]:
+    """Wish for every effect, "on", "off" or "auto", of the group "effects" of a configuration.
+
+    Raises:
+        SceneError: a wish or the selection is unknown.
+    """
+    if effects["select"] not in SELECTIONS:
+        raise SceneError(f"effects.select must be one of {', '.join(SELECTIONS)}, got '{effects['select']}'")
+    return dict.fromkeys(NAMES, SELECTIONS[effects["select"]]) | explicit(effects)
+
+
+def explicit(effects: Mapping[str, Any]) -> dict[str, str]:
+    """Wishes that were given for single effects.
+
+    Raises:
+        SceneError: one is unknown.
+    """
+    given = {}
+    for name in NAMES:
+        wish = effects.get(name)
+        wish = {True: "on", False: "off"}.get(wish, wish) if isinstance(wish, bool) else wish  # YAML reads on as true
+        if wish is not None:
+            if wish not in WISHES:
+                raise SceneError(f"effects.{name} must be one of {', '.join(WISHES)}, got '{wish}'")
+            given[name] = wish
+    return given
+
+
+def chooses(config: Mapping[str, Any]) -> bool:
+    """Whether a run's configuration leaves the effects to be chosen.
+
+    Raises:
+        SceneError: effects are asked for of a method that has its own.
+    """
+    effects, method = config["effects"], config["name"]
+    chosen, composed = effects["select"] != "method", "state" in config["thermal"] and "parts" in config["thermal"]
+    if chosen and not composed:
+        raise SceneError(
+            f"effects={effects['select']} chooses the parts of method=auto, but method={method} has its own; "
+            "use method=auto, or leave effects out."
+        )
+    asked = [] if chosen else sorted(explicit(effects))
+    if asked:
+        raise SceneError(
+            f"effects.{asked[0]} is asked for, but method={method} simulates what its paper does; use method=auto "
+            f"effects=none effects.{asked[0]}=on, or the method's own options (thermal.*, sensor.*)."
+        )
+    return chosen
+
+
+def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None = None) -> dict[str, Verdict]:
+    """Verdicts that can be simulated together, in the order of NAMES; what was changed says so in its reason.
+
+    The heat source of harmonics stands for drivers that nobody recorded: where recorded weather drives the scene it goes,
+    unless it was asked for and the weather was not. What acts on a changing temperature needs relaxation.
+
+    Args:
+        verdicts: one for every name.
+        given: wishes for single effects (``explicit``), which win over what the scene says.
+
+    Raises:
+        SceneError: what was asked for cannot be had in this scene, or not together.
+    """
+    given = given or {}
+    missing = [name for name in NAMES if name not in verdicts]
+    if missing:
+        raise SceneError(f"there is no verdict on {', '.join(missing)}")
+    found = {name: verdicts[name] for name in NAMES}
+
+    def turn(name: str, on: bool, reason: str) -> None:
+        if given.get(name) == ("off" if on else "on"):
+            raise SceneError(f"effects.{name}={given[name]} cannot be had: {reason}")
+        found[name] = replace(found[name], on=on, reason=reason)
+
+    for name, wish in given.items():
+        if wish == "on" and not found[name].on:
+            raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}")
+    driven = [name for name in WEATHER_DRIVEN if found[name].on]
+    if driven and found["harmonic_source"].on:
+        wanted = given.get("harmonic_source") == "on" and not any(given.get(name) == "on" for name in driven)
+        for name in driven if wanted else ["harmonic_source"]:
+            turn(name, False, "a harmonic source was asked for" if wanted else "the recorded weather drives the scene")
+    for name, ground in STANDS_ON.items():
+        if found[name].on and not found[ground].on:
+            if given.get(ground) == "off" and given.get(name) != "on":
+                turn(name, False, f"it stands on {ground}, which is off")
+            else:
+                turn(ground, True, f"{name} stands on it")
+    return found
+
+
+def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
+    """The verdicts with one effect off, and with it those that stand on it."""
+    gone = {name, *(other for other, ground in STANDS_ON.items() if ground == name)}
+    return {other: replace(verdict, on=verdict.on and other not in gone) for other, verdict in verdicts.items()}
+
+
+def recipe(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """ "thermal", "sensor" and further terms of the "loss" as plain containers, of the effects that are on.
+
+    Args:
+        verdicts: reconciled.
+        templates: every part with its settings, the group "effects" of a configuration (conf/effects/shared/parts.yaml);
+            what a verdict says a part should start from replaces them.
+
+    Raises:
+        SceneError: a verdict says something of a part that is none of its settings.
+    """
+    templates = deepcopy(dict(templates))
+    on = [name for name in NAMES if verdicts[name].on]
+    on_the_way = {name: _set(templates["parts"][name], verdicts, [name]) for name in ON_THE_WAY if name in on}
+    thermal = {
+        "_target_": "heatsplat.thermal.composed.Composed",
+        "state": _state(verdicts, templates, open_ended=bool(on_the_way)),
+        "parts": on_the_way,
+        "companion": templates["companion"] if "thermal_opacity" in on else None,
+        "clip": templates["clip"],
+    }
+    sensor = {"_target_": templates["sensor"]["_target_"], "parts": _camera(verdicts, templates["sensor"]["parts"])}
+    loss = templates["companion_loss"] if "thermal_opacity" in on else {}
+    return {"thermal": thermal, "sensor": sensor, "loss": loss}
+
+
+def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's configuration with these parts in it, and the verdicts that led to them; templates are left out.
+
+    Args:
+        config: as composed.
+        parts: of ``recipe``, or the configuration of an earlier run.
+        verdicts: as ``told`` puts them.
+    """
+    thermal, sensor = deepcopy(parts["thermal"]), deepcopy(parts["sensor"])
+    terms = parts["loss"].get("terms", parts["loss"])  # an earlier run has all of its loss
+    loss = {**deepcopy(config["loss"]), "terms": {**config["loss"]["terms"], **deepcopy(terms)}}
+    effects = {"select": config["effects"]["select"]} | {name: verdicts[name]["on"] for name in NAMES}
+    changed = {"thermal": thermal, "sensor": sensor, "loss": loss}
+    return {
+        **config,
+        **changed,
+        "module": {**config["module"], **changed},
+        "effects": effects,
+        "verdicts": dict(verdicts),
+    }
+
+
+def told(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Verdicts as plain containers, with what the effects add where that was measured (``studies.prices``)."""
+    return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
+
+
+def _plain_price(price: Any) -> dict[str, Any]:
+    return {} if price is None else asdict(price)
+
+
+def _state(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any], open_ended: bool) -> dict[str, Any]:
+    """The state model; with ``open_ended`` it does not clip, because parts follow that do."""
+    on = [name for name in STATE if verdicts[name].on]
+    driven = [name for name in WEATHER_DRIVEN if name in on]
+    if driven:
+        state = _set(templates["states"]["energy_balance"], verdicts, driven)
+        state |= {} if "solar" in on else {"sun": False}
+        state |= {} if "radiation" in on else {"sky": None}
+        state |= {} if "convection" in on else {"wind": False}
+    elif "relaxation" in on:
+        heated = [name for name in ("relaxation", "harmonic_source") if name in on]
+        state = _set(templates["states"]["newton_harmonic"], verdicts, heated)
+        state |= {} if "harmonic_source" in on else {"frequencies": 0}
+    else:
+        state = dict(templates["states"]["static"])
+    if open_ended:
+        state |= {"floor": False} if "floor" in state else {"clip": "none"}
+    if "conduction" in on:
+        state = _set(templates["states"]["conducting"], verdicts, ["conduction"]) | {"state": state}
+    return state
+
+
+def _camera(verdicts: Mapping[str, Verdict], parts: Mapping[str, Any]) -> dict[str, Any]:
+    """The parts of the sensor chain that are on, in the order in which light meets them."""
+    chain = {}
+    for part, effects in CAMERA.items():
+        on = [name for name in effects if verdicts[name].on]
+        if on:
+            chain[part] = _set(parts[part], verdicts, on)
+    if "calibration" in chain:
+        pattern = {} if verdicts["fixed_pattern"].on else {"gain_max": 0.0, "bias_max": 0.0}
+        falloff = {} if verdicts["vignetting"].on else {"vignetting_max": 0.0}
+        chain["calibration"] |= pattern | falloff
+    return chain
+
+
+def _set(template: Mapping[str, Any], verdicts: Mapping[str, Verdict], names: Collection[str]) -> dict[str, Any]:
+    """A part's settings, with what the verdicts of ``names`` say of it."""
+    settings = dict(template)
+    for name in names:
+        for key, value in verdicts[name].settings.items():
+            if key not in settings:
+                raise SceneError(f"the evidence on {name} sets '{key}', which {settings['_target_']} does not have")
+            settings[key] = value
+    return settings

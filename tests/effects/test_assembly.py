@@ -1,0 +1,173 @@
+"""From verdicts to configuration: what is on is in it with its settings, what is off is not."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from running import compose_run
+
+from heatsplat import cli
+from heatsplat.contracts import SceneError
+from heatsplat.effects import assembly
+from heatsplat.effects.base import Verdict
+
+
+@cache
+def config(*overrides):
+    return OmegaConf.to_container(compose_run(Path("unused"), "data.size=tiny", *overrides), resolve=True)
+
+
+def verdicts(*on, **settings):
+    """Verdicts with these effects on; settings by name of effect."""
+    return {
+        name: Verdict(name, name in on, 3.0 if name in on else 0.5, 1.0, "as measured", settings.get(name, {}))
+        for name in assembly.NAMES
+    }
+
+
+def recipe(*on, **settings):
+    return assembly.recipe(verdicts(*on, **settings), config("method=auto")["effects"])
+
+
+def test_nothing_on_is_3dgs_seen_by_a_perfect_camera():
+    found = recipe()
+    assert found["thermal"]["state"] == config("method=3dgs")["thermal"] and found["loss"] == {}
+    assert found["thermal"]["parts"] == {} and found["thermal"]["companion"] is None and found["sensor"]["parts"] == {}
+
+
+@pytest.mark.parametrize(
+    "on, state, expected",
+    [
+        (["relaxation"], "NewtonHarmonic", {"frequencies": 0}),
+        (["relaxation", "harmonic_source"], "NewtonHarmonic", {"frequencies": 24}),
+        (["relaxation", "solar"], "EnergyBalance", {"sun": True, "sky": None, "wind": False}),
+        (["relaxation", "radiation", "convection"], "EnergyBalance", {"sun": False, "sky": "auto", "wind": True}),
+    ],
+)
+def test_each_selection_has_its_state(on, state, expected):
+    found = recipe(*on)["thermal"]["state"]
+    assert found["_target_"].endswith(f".{state}") and {key: found[key] for key in expected} == expected
+
+
+def test_a_state_is_open_ended_where_parts_follow_and_only_there():
+    assert recipe("relaxation")["thermal"]["state"]["clip"] == "straight_through"
+    assert recipe("relaxation", "reflection")["thermal"]["state"]["clip"] == "none"
+    assert recipe("attenuation")["thermal"]["state"]["floor"] is False
+
+
+def test_conduction_wraps_the_state():
+    found = recipe("relaxation", "conduction", conduction={"neighbours": 4})["thermal"]["state"]
+    assert found["_target_"].endswith(".Conducting") and found["neighbours"] == 4
+    assert found["state"] == recipe("relaxation")["thermal"]["state"]
+
+
+@pytest.mark.parametrize("name", assembly.ON_THE_WAY)
+def test_a_part_stands_in_the_recipe_exactly_when_its_effect_is_on(name):
+    everything = recipe(*assembly.NAMES)["thermal"]["parts"]
+    assert list(everything) == list(assembly.ON_THE_WAY)
+    assert list(recipe(name)["thermal"]["parts"]) == [name]
+
+
+def test_light_meets_the_camera_in_order_and_pattern_and_falloff_are_two_effects_of_one_part():
+    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == list(assembly.CAMERA)
+    pattern, falloff = (recipe(name)["sensor"]["parts"]["calibration"] for name in ("fixed_pattern", "vignetting"))
+    assert pattern["vignetting_max"] == 0 < pattern["gain_max"] and pattern["bias_max"] > 0
+    assert falloff["vignetting_max"] > 0 == falloff["gain_max"] == falloff["bias_max"]
+
+
+def test_thermal_opacity_brings_the_colour_image_and_its_loss():
+    found = recipe("thermal_opacity")
+    assert found["thermal"]["companion"]["modality"] == "rgb" and set(found["loss"]) == {"rgb"}
+
+
+def test_what_evidence_found_is_where_parts_start():
+    found = recipe("relaxation", "harmonic_source", harmonic_source={"frequencies": 7})
+    assert found["thermal"]["state"]["frequencies"] == 7
+    with pytest.raises(SceneError, match="the evidence on attenuation sets 'colour'"):
+        recipe("attenuation", attenuation={"colour": 1})
+
+
+def test_every_selection_of_one_effect_can_be_built():
+    for name in assembly.NAMES:
+        found = recipe(*{name, assembly.STANDS_ON.get(name, name)})
+        thermal, sensor = cli.build(found["thermal"]), cli.build(found["sensor"])
+        assert thermal.modality == "thermal" and len(sensor.parts) == (name in assembly.SENSOR)
+        simulated = set(sensor.effects())
+        assert simulated == ({name} if name in assembly.SENSOR else set())
+
+
+def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
+    thermal = cli.build(recipe(*set(assembly.NAMES) - set(assembly.WEATHER_DRIVEN))["thermal"])
+    assert set(thermal.effects()) <= set(assembly.NAMES)
+    assert {"relaxation", "conduction", *assembly.ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
+
+
+# Verdicts that fit together -------------------------------------------------------------------------------
+
+
+def names_on(found):
+    return {name for name, verdict in found.items() if verdict.on}
+
+
+def test_what_acts_on_a_changing_temperature_brings_relaxation():
+    found = assembly.reconciled(verdicts("harmonic_source"))
+    assert names_on(found) == {"relaxation", "harmonic_source"}
+    assert found["relaxation"].reason == "harmonic_source stands on it"
+
+
+def test_recorded_weather_takes_the_place_of_harmonics():
+    both = verdicts("relaxation", "harmonic_source", "solar")
+    assert names_on(assembly.reconciled(both)) == {"relaxation", "solar"}
+    assert names_on(assembly.reconciled(both, {"harmonic_source": "on"})) == {"relaxation", "harmonic_source"}
+    with pytest.raises(SceneError, match="effects.harmonic_source=on cannot be had: the recorded weather drives"):
+        assembly.reconciled(both, {"harmonic_source": "on", "solar": "on"})
+
+
+def test_relaxation_that_is_switched_off_takes_along_what_stands_on_it():
+    found = assembly.reconciled(verdicts("harmonic_source", "agc"), {"relaxation": "off"})
+    assert names_on(found) == {"agc"} and found["harmonic_source"].reason == "it stands on relaxation, which is off"
+    with pytest.raises(SceneError, match="effects.relaxation=off cannot be had: harmonic_source stands on it"):
+        assembly.reconciled(verdicts("harmonic_source"), {"relaxation": "off", "harmonic_source": "on"})
+
+
+def test_what_the_scene_cannot_give_is_refused_where_it_was_asked_for():
+    with pytest.raises(SceneError, match="effects.solar=on cannot be had: as measured"):
+        assembly.reconciled(verdicts(), {"solar": "on"})
+
+
+def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
+    full = verdicts("relaxation", "harmonic_source", "agc")
+    assert names_on(assembly.without(full, "relaxation")) == {"agc"}
+    assert names_on(assembly.without(full, "harmonic_source")) == {"relaxation", "agc"}
+
+
+# Wishes ---------------------------------------------------------------------------------------------------
+
+
+def test_selections_and_single_wishes():
+    assert set(assembly.wishes(config("method=auto")["effects"]).values()) == {"auto"}
+    assert set(assembly.wishes(config("method=auto", "effects=none")["effects"]).values()) == {"off"}
+    one = assembly.wishes(config("method=auto", "effects=all", "effects.agc=off", "effects.tone=auto")["effects"])
+    assert one == dict.fromkeys(assembly.NAMES, "on") | {"agc": "off", "tone": "auto"}
+    assert assembly.explicit({"solar": True, "agc": False}) == {"solar": "on", "agc": "off"}  # YAML's on and off
+
+
+def test_wishes_that_cannot_be_are_refused():
+    with pytest.raises(SceneError, match="effects.agc must be one of on, off, auto, got 'maybe'"):
+        assembly.wishes(config("method=auto", "effects.agc=maybe")["effects"])
+    with pytest.raises(SceneError, match="effects=all chooses the parts of method=auto, but method=etgs has its own"):
+        assembly.chooses(config("method=etgs", "effects=all") | {"name": "etgs"})
+    with pytest.raises(SceneError, match="effects.solar is asked for, but method=etgs simulates what its paper does"):
+        assembly.chooses(config("method=etgs", "effects.solar=on") | {"name": "etgs"})
+    with pytest.raises(HydraException, match="sunshine"):
+        config("method=auto", "effects.sunshine=on")
+    assert not assembly.chooses(config("method=etgs") | {"name": "etgs"})
+    assert assembly.chooses(config("method=auto") | {"name": "auto"})
+
+
+def test_the_effects_of_a_run_are_those_of_the_catalogue():
+    catalogue = pytest.importorskip("heatsplat.effects.catalogue", reason="there is no catalogue")
+    names = {effect.name for effect in catalogue.CATALOGUE}
+    assert names == set(assembly.NAMES)
