@@ -96,7 +96,7 @@ def test_only_ratios_are_parameters_and_a_night_separates_convection_from_radiat
     surface = Surface(tensor(0, 0), -tensor(60, 60).log(), tensor(50, 50), tensor(0.2, 0.7), None, level)
     still = Climate(drivers(wind=False))
     x = still.marched_temperature(surface, 4 * 3600.0)
-    air, sky = (torch.lerp(s[24], s[24], 0.0) for s in (still.drivers.air, still.drivers.sky))
+    air, sky = still.drivers.air[24], still.drivers.sky[24]
     rest = (1 - surface.share) * (air - x) + surface.share * (sky - power_excess(x, still.drivers.reference_k))
     assert rest.abs().max() < 0.2
     assert (air - x)[1] > 2 * (air - x)[0] > 0
@@ -111,7 +111,7 @@ def test_cost_does_not_depend_on_the_length_of_the_record():
     surface = bodies(wind=False)
     try:
         sunlight._Recent.apply = lambda *a: lengths.append(len(a[2])) or original(*a)
-        for days in (2, 4, 8):
+        for days in (2, 3, 5):
             climate = Climate(drivers(days=days, wind=False))
             climate.linear_temperature(surface, days * 86400.0 - 1800.0)
             table = climate.table.at(days * 86400.0 - 1800.0)

@@ -73,7 +73,7 @@ class SunlightTable:
     def mean(self, normals: Tensor) -> Tensor:
         """Mean over the record of max(n · beam, 0), [n], for normals [n, 3]; interpolated between grid lines."""
         corners, weights = _corners(normals)
-        return (self._means[corners, 0] * weights).sum(1)
+        return (self._means.to(weights)[corners, 0] * weights).sum(1)
 
     def response(self, time_s: float, normals: Tensor, log_rates: Tensor) -> Tensor:
         """Settled responses [n] at a moment of the record; differentiable by normals [n, 3] and log rates [n]."""
@@ -92,8 +92,8 @@ class SunlightTable:
         """Responses [n] at the moment of a table [heights, azimuths, rates]."""
         corners, weights = _corners(normals)
         cell, x = grid_position(log_rates, self.log_rates)
-        places = (corners * RATES + cell[:, None])[..., None] + torch.arange(4)
-        values = (table.reshape(-1)[places] * weights[..., None]).sum(1)
+        places = (corners * RATES + cell[:, None])[..., None] + torch.arange(4, device=cell.device)
+        values = (table.to(cell.device).reshape(-1)[places] * weights[..., None]).sum(1)
         terms = cubics(values.T)[0]
         return terms[0] + x * (terms[1] + x * (terms[2] + x * terms[3]))
 
