@@ -1,0 +1,93 @@
+"""render.py weather=other.csv: what a shot is told of the weather, without training anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from running import compose_run
+from weathered import HOUR_S, make_scene
+
+from datamodules.base import SceneDataModule
+from heatsplat import cli
+from heatsplat.contracts import SceneData, SceneError
+from heatsplat.shots import plan
+
+
+class Yard(SceneDataModule):
+    """The scene of ``weathered`` as a data module."""
+
+    def load(self) -> SceneData:
+        return make_scene()
+
+
+def gale(folder: Path) -> Path:
+    """A table on the clock of the yard's frames: 20 m/s from two hours before the first frame to twenty after it."""
+    path = folder / "gale.csv"
+    path.write_text("time_s,wind_m_s,air_c\n" + "".join(f"{h * HOUR_S},20,{h}\n" for h in range(-2, 21)))
+    return path
+
+
+def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
+    """The frames that a render with these overrides asks a model for."""
+    seen = []
+
+    def predict(frame):
+        seen.append(frame)
+        return torch.full((8, 8, 1), 0.5)
+
+    data = Yard()
+    module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict, scene=None)
+    monkeypatch.setattr(cli, "_restored", lambda config, output_dir: (module, data, {"checkpoint": None}))
+
+    def restore(module, data, checkpoint):
+        module.scene = data.scene
+
+    monkeypatch.setattr("heatsplat.training.session.restore", restore)
+    monkeypatch.setattr("heatsplat.training.session.prepare_machine", lambda threads: None)
+    options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", *overrides)
+    cli.render.__wrapped__.__wrapped__(compose_run(folder, *options, config_name="render"), folder)
+    return seen, module.scene
+
+
+def test_a_shot_has_the_weather_of_its_moments(monkeypatch, tmp_path):
+    seen, scene = shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=view", "time=[0,3600]")
+    assert [frame.time_s for frame in seen] == [0.0, 1800.0, 3600.0]
+    assert [frame.environment for frame in seen] == [scene.weather.at(t) for t in (0.0, 1800.0, 3600.0)]
+
+
+def test_another_table_is_what_model_and_frames_see(monkeypatch, tmp_path):
+    seen, scene = shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=test", f"weather={gale(tmp_path)}")
+    assert scene.weather.at(0.0).wind_m_s == 20.0 and scene.weather.pressure_hpa is None
+    assert [frame.environment.wind_m_s for frame in seen] == [20.0] * len(scene.test)
+    assert seen[0].environment.air_c == pytest.approx(seen[0].time_s / HOUR_S)
+
+
+def test_a_model_without_weather_says_that_it_changes_nothing(monkeypatch, tmp_path):
+    with pytest.raises(SceneError, match=r"weather=.*gale.csv changes nothing: SimpleNamespace does not use weather"):
+        shoot(monkeypatch, tmp_path, {"time"}, f"weather={gale(tmp_path)}")
+
+
+def test_a_moment_outside_the_record_is_refused():
+    with pytest.raises(SceneError, match="there is no weather for second 1e.06: the record runs from -7200 to 72000 s"):
+        plan(make_scene(), "view", 1e6, 0, 1)
+
+
+def test_without_a_record_frames_keep_what_they_had():
+    bare = make_scene()
+    scene = SceneData(bare.name, bare.train, bare.val, bare.test, bare.points)
+    assert [f.environment for f in plan(scene, "view", 10.0, 0, 2)] == [None, None]
+
+
+def test_a_data_set_without_weather_refuses_the_choice(monkeypatch, tmp_path):
+    from heatsplat.training.module import CHECKPOINT_KEY
+
+    stored = {CHECKPOINT_KEY: {"recipe": {"data": {"root": "x"}, "module": {}}}}
+    monkeypatch.setattr("heatsplat.training.session.load_checkpoint", lambda ckpt: stored)
+    config = compose_run(tmp_path, "ckpt=any.ckpt", "data.weather=windy", config_name="evaluate")
+    with pytest.raises(
+        SceneError, match="data.weather=windy: the data set of this checkpoint has no weather to choose"
+    ):
+        cli._restored(config, tmp_path)
