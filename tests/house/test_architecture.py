@@ -21,7 +21,7 @@ ALLOWED = {
     "renderers": {"contracts", "geometry", "splats", "kernels"},
     "thermal": {"contracts", "geometry", "physics", "splats", "kernels"},
     "density": {"contracts", "geometry", "splats"},
-    "effects": {"contracts", "physics"},
+    "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}

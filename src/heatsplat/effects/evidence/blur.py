@@ -1,0 +1,50 @@
+"""Evidence for a point spread beyond the pixel: how wide the sharpest edges are."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Evidence
+from heatsplat.effects.observations import Observations
+
+REACH = 4  # pixels on either side of an edge within which it has to be over
+SHARPEST = 0.1  # of the strong edges, the share that is judged: others are gradients of the scene and not its edges
+CLEAR = 20.0  # an edge is strong when it is this many times the noise high
+FEWEST = 30
+# The width of a step that is no wider than the pixel that collects it, and one of which the reconstruction should know.
+PIXEL_PX, WIDE_PX = 0.45, 0.5
+
+
+def point_spread(obs: Observations) -> Evidence:
+    """Whether edges are wider than pixels. A step's steepest pixel takes a share of it that tells its width."""
+    if obs.images.numel() == 0 or min(obs.images.shape[1:]) < 2 * REACH + 2:
+        return Evidence(None, obs.why or "the images are too small to have edges")
+    widths = torch.cat([_widths(images, obs.noise) for images in (obs.images, obs.images.mT)])
+    if len(widths) < FEWEST:
+        return Evidence(None, f"only {len(widths)} edges stand out of the noise, {FEWEST} are needed")
+    sigma = float(widths.quantile(0.5 * SHARPEST))
+    spread = math.sqrt(max(sigma**2 - PIXEL_PX**2, 0.0))
+    return Evidence(
+        spread / WIDE_PX,
+        f"the sharpest tenth of {len(widths)} edges has a width (standard deviation) of {sigma:.2f} pixels, "
+        f"{spread:.2f} beyond that of the pixel",
+    )
+
+
+def _widths(images: Tensor, noise: float) -> Tensor:
+    """Standard deviations in pixels of the strong, lone edges along the rows of images [F, H, W]."""
+    slope = images.diff(dim=2)
+    windows = slope.unfold(2, 2 * REACH + 1, 1)  # [F, H, n, 2 REACH + 1]
+    middle = windows[..., REACH]
+    step = windows.sum(-1)
+    total = windows.abs().sum(-1)
+    lone = (step.abs() > CLEAR * noise) & (step.abs() > 0.9 * total - 2 * noise)
+    lone = lone & (middle.abs() >= windows.abs().amax(-1) - 1e-12)
+    chosen, height = windows[lone], step[lone][:, None]
+    share = chosen / height
+    at = torch.arange(-REACH, REACH + 1, dtype=images.dtype)
+    mean = (share * at).sum(1, keepdim=True)
+    return (share * (at - mean) ** 2).sum(1).clamp_min(0.0).sqrt()

@@ -1,0 +1,50 @@
+"""Evidence for heat that flows between neighbouring parts of a surface."""
+
+from __future__ import annotations
+
+import torch
+
+from heatsplat.effects.base import Evidence
+from heatsplat.effects.evidence.joint_fit import joint
+from heatsplat.effects.observations import Observations
+
+HURDLE = 1.0
+NEIGHBOURS = 6
+FEWEST = 40  # points
+FASTER = (
+    1.25  # how much faster than levels contrasts must fade: bodies of one level but two rates look a little like it
+)
+LEFT = 0.02  # levels that fade to less than this share are gone in the noise
+
+
+def conduction(obs: Observations) -> Evidence:
+    """Whether contrasts between neighbours fade faster than the levels that they share.
+
+    Where every point relaxes by itself, an excess and a difference of two excesses fade alike.
+    """
+    found = joint(obs)
+    if found is None or obs.times_s is None:
+        return Evidence(None, obs.why or "no point can be followed over time")
+    fit, model = found
+    if "relaxation" not in model.own or "harmonic_source" in model.own:
+        why = "a source hides how contrasts fade" if "harmonic_source" in model.own else "nothing changes over time"
+        return Evidence(0.0, f"{why}, so that no flow between neighbours shows")
+    early, late, used = fit.early_and_late(model)
+    points = obs.tracks.points[used]
+    if len(points) < FEWEST:
+        return Evidence(None, f"{len(points)} points are too few to have neighbours, {FEWEST} are needed")
+    near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
+    first, last = early[used], late[used]
+    ambient = obs.ambient if obs.ambient is not None else float(torch.minimum(first, last).min())
+    level = (first[near].mean(1) - ambient).abs().clamp_min(1e-9)
+    kept = ((last[near].mean(1) - ambient) / level).median()
+    contrast, remains = first - first[near].mean(1), last - last[near].mean(1)
+    strong = contrast.abs() > 5.0 * obs.noise
+    if int(strong.sum()) < FEWEST or kept < LEFT:
+        return Evidence(0.0, "neighbours are too much alike, or all is cold in the end, to tell how contrasts fade")
+    still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
+    rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
+    return Evidence(
+        (rate - 1.0) / (FASTER - 1.0),
+        f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}",
+    )

@@ -1,0 +1,99 @@
+"""Evidence for matter that one modality passes and the other does not."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import SceneData
+from heatsplat.effects.base import Evidence
+from heatsplat.effects.observations import LEAST_FRAMES, MOST_FRAMES, NEARER, Observations, between, spread
+from heatsplat.geometry.projection import to_camera, to_pixels
+
+HURDLE = 4.0
+MOST_POINTS = 6000
+BESIDE_PX = 2.0  # points that fall into one square of this size are on one line of sight
+SURE = 4.0  # a vote counts where one variance is this many times the other
+STRAY = 0.05  # share of votes that differ at the edges of opaque things
+LEAST_VOTES = 12
+
+
+def thermal_opacity(obs: Observations) -> Evidence:
+    """Whether visible images show points that thermal images do not, or the other way round.
+
+    Where a farther point lies behind a nearer one, one of the two keeps its value from view to view and the other shows
+    whatever comes before it. Behind matter that is opaque to both, both modalities keep the nearer one.
+    """
+    if obs.tracks is None or obs.still:
+        return Evidence(None, obs.why or "a camera that stands still sees no parallax")
+    votes = _votes(obs.scene)
+    if votes is None:
+        return Evidence(None, "not every training view has a visible image of the thermal image's size")
+    thermal, visible = votes
+    sure = (thermal != 0) & (visible != 0)
+    n, apart = int(sure.sum()), int((thermal[sure] != visible[sure]).sum())
+    if n < LEAST_VOTES:
+        return Evidence(0.0, f"{n} points lie behind others so that both modalities could tell them apart")
+    usual = STRAY * n
+    return Evidence(
+        (apart - usual) / math.sqrt(usual + 1.0),
+        f"of {n} points that lie behind others, {apart} are seen by one modality and hidden from the other",
+    )
+
+
+def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
+    """For each point that lies behind others in some frames, 1 where the nearer one keeps its value, -1 where the farther
+    one does, 0 where neither does clearly: by the thermal and by the visible images."""
+    points = scene.points.double()[torch.tensor(spread(len(scene.points), MOST_POINTS))]
+    views = [scene.train[i] for i in spread(len(scene.train), MOST_FRAMES)]
+    views = [view for view in views if view.thermal is not None]
+    if any(view.rgb is None or view.rgb.shape[:2] != view.thermal.shape[:2] for view in views):
+        return None
+    shape, count = (len(points), len(views)), len(points)
+    inside, behind = torch.zeros(shape, dtype=torch.bool), torch.full(shape, -1)
+    values, colours = torch.zeros(*shape, 1), torch.zeros(*shape, 3)
+    for f, view in enumerate(views):
+        local = to_camera(points, view.camera.viewmat)
+        ahead = local[:, 2] > 1e-9
+        pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), view.camera.K)
+        extent = pixels.new_tensor([view.camera.width, view.camera.height])
+        inside[:, f] = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
+        behind[:, f] = _nearer(pixels, local[:, 2], inside[:, f], int(extent[0] / BESIDE_PX) + 2)
+        position = (2.0 * pixels / extent - 1.0).float()
+        values[:, f] = between(view.thermal.mean(2, keepdim=True).float(), position)
+        colours[:, f] = between(view.rgb.float(), position)
+    hidden = behind >= 0
+    found = []
+    for series in (values, colours):
+        level = series.mean(2) if series.shape[2] == 1 else series
+        level = level.reshape(count, len(views), -1)
+        far, near = _variance(level, hidden), _variance(level, inside & ~hidden)
+        before = torch.where(hidden, near[behind.clamp_min(0)], torch.nan).nanmedian(1).values
+        ratio = far / before
+        vote = (ratio > SURE).long() - (ratio < 1.0 / SURE).long()
+        found.append(torch.where(ratio.isfinite(), vote, 0))
+    return found[0], found[1]
+
+
+def _nearer(pixels: Tensor, depths: Tensor, inside: Tensor, across: int) -> Tensor:
+    """Which point [n] lies nearest to the camera in the same small square, where it is nearer by far; else -1."""
+    squares = (pixels[:, 1] / BESIDE_PX).long() * across + (pixels[:, 0] / BESIDE_PX).long()
+    ids = inside.nonzero()[:, 0]
+    order = ids[depths[ids].argsort(descending=True)]
+    first = torch.full((int(squares[ids].max()) + 1 if len(ids) else 1,), -1)
+    for_last = squares[order]
+    first[for_last] = order  # the last one written, the nearest, stays
+    nearest = torch.where(inside, first[squares.clamp(0, len(first) - 1)], -1)
+    much = depths > (1.0 + NEARER) * depths[nearest.clamp_min(0)]
+    return torch.where(inside & (nearest >= 0) & much, nearest, -1)
+
+
+def _variance(series: Tensor, keep: Tensor) -> Tensor:
+    """Variance [P] of series [P, F, C] over the frames that are kept, summed over C; nan where there are too few."""
+    weights = keep[..., None].to(series)
+    n = weights.sum(1).clamp_min(1.0)
+    mean = (series * weights).sum(1) / n
+    variance = ((series - mean[:, None]) ** 2 * weights).sum(1) / n
+    return torch.where(keep.sum(1) >= LEAST_FRAMES, variance.sum(1) + 1e-7, torch.nan)

@@ -1,0 +1,27 @@
+"""Which way the surface faces at the points that are followed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.effects.observations import MOST_IN_FRONT, Observations, spread
+
+NEIGHBOURS = 8
+FEWEST = 12  # points below which no surface can be told
+
+
+def normals(obs: Observations) -> Tensor | None:
+    """Unit normals [P, 3] at the tracks' points, towards the cameras, of planes through the nearest scene points."""
+    tracks, points = obs.tracks, obs.scene.points.double()
+    if tracks is None or obs.still or len(points) < FEWEST:
+        return None
+    points = points[torch.tensor(spread(len(points), MOST_IN_FRONT))]
+    near = torch.cdist(tracks.points, points).topk(min(NEIGHBOURS + 1, len(points)), largest=False).indices
+    around = points[near]
+    around = around - around.mean(1, keepdim=True)
+    _, axes = torch.linalg.eigh(around.mT @ around)
+    normal = axes[..., 0]
+    seen = functional.normalize((tracks.directions * tracks.weights[..., None]).sum(1), dim=1)
+    return torch.where((normal * seen).sum(1, keepdim=True) < 0, -normal, normal)

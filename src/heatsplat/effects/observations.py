@@ -1,0 +1,245 @@
+"""What all evidence shares: training images as tracks of scene points over time, and the noise of the sensor.
+
+A track is what the training views show at the projections of one scene point. Everything is read once, subsampled to a
+size at which all evidence takes a few seconds, and held in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.contracts import SceneData, View
+from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
+from heatsplat.geometry.projection import to_camera, to_pixels
+
+MOST_FRAMES = 64
+MOST_POINTS = 500  # points whose tracks are fitted; all of them, up to MOST_IN_FRONT, hide each other
+MOST_CANDIDATES = 1500
+MOST_IN_FRONT = 20000
+LEAST_FRAMES = 4  # a track of fewer observations says nothing about time
+# A point is hidden where another one is nearer to the camera by this share within a cell of about two points.
+NEARER = 0.08
+STILL = 1e-6  # cameras whose matrices differ by less stand still
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """P points seen in F frames. Where ``weights`` is 0 the point is not seen and the other values mean nothing.
+
+    Args:
+        points: [P, 3] in the world.
+        values: [P, F] image values, bilinear between pixels.
+        slopes: [P, F] steepest change of the image about there, per pixel: what a point that lies astray brings in.
+        weights: [P, F] 0 or 1.
+        distances: [P, F] from the camera, in the world's units.
+        directions: [P, F, 3] unit vectors from the point to the camera.
+        positions: [P, F, 2] in the image: from -1 (left, top) to 1 (right, bottom).
+        radii: [P, F] squared distance from the middle of the image, 1 in its corners.
+        rgb: [P, F, 3] visible image values, or None.
+    """
+
+    points: Tensor
+    values: Tensor
+    slopes: Tensor
+    weights: Tensor
+    distances: Tensor
+    directions: Tensor
+    positions: Tensor
+    radii: Tensor
+    rgb: Tensor | None = None
+
+    def of(self, keep: Tensor) -> Tracks:
+        """The tracks of the points that ``keep`` [P] (bool or positions) selects."""
+        return Tracks(**{name: value if value is None else value[keep] for name, value in self.__dict__.items()})
+
+
+@dataclass
+class Observations:
+    """What a scene's training views show, for the evidence of all effects.
+
+    Args:
+        scene: where it comes from.
+        images: [F, H, W] thermal training images (mean over channels), at most MOST_FRAMES evenly spread.
+        times_s: [F] float64, or None where a frame has no time.
+        noise: standard deviation of the noise of a pixel, in image units.
+        still: whether all frames were taken from one place; tracks are then pixels.
+        tracks: of scene points, or None where there are none (``why``).
+        why: why there are no tracks.
+        found: what evidence works out once for several effects, by name.
+    """
+
+    scene: SceneData
+    images: Tensor
+    times_s: Tensor | None
+    noise: float
+    still: bool
+    tracks: Tracks | None
+    why: str = ""
+    found: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def unit_k(self) -> float | None:
+        """Kelvin per image unit, or None where image values are no temperatures."""
+        return None if self.scene.thermal_range is None else self.scene.thermal_range.span_k
+
+    def size(self, value: float) -> str:
+        """A difference of image values in words: in kelvin where they are temperatures."""
+        return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
+
+    @property
+    def ambient(self) -> float | None:
+        """Temperature of the surroundings as an image value, or None."""
+        if self.scene.ambient_c is None or self.scene.thermal_range is None:
+            return None
+        return self.scene.thermal_range.to_unit(self.scene.ambient_c)
+
+
+def observe(scene: SceneData) -> Observations:
+    """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
+    frames = scene.train.frames
+    chosen = spread(len(frames), MOST_FRAMES)
+    views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
+    nothing = torch.zeros(0, 1, 1)
+    if not views:
+        return Observations(scene, nothing, None, math.nan, False, None, "no training view has a thermal image")
+    shape = views[0].thermal.shape[:2]
+    views = [view for view in views if view.thermal.shape[:2] == shape]
+    images = torch.stack([view.thermal.mean(2) for view in views]).double()
+    times = [view.time_s for view in views]
+    times_s = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float64)
+    viewmats = torch.stack([view.camera.viewmat for view in views])
+    still = len(views) > 1 and bool((viewmats - viewmats[0]).abs().max() < STILL)
+    step = max(quantum_of(images[0]), quantum_of(images[-1]))
+    noise = noise_of(images, step)
+    if still:
+        noise = max(noise_of_repeats(images), step / math.sqrt(12.0), 1e-6)
+    tracks, why = None, ""
+    if len(views) < LEAST_FRAMES:
+        why = f"{len(views)} training view(s) are too few to follow anything over"
+    elif still:
+        tracks = _pixels(views, images)
+    elif len(scene.points) < 1:
+        why = "the scene has no points to follow through the images"
+    else:
+        tracks = _tracks(scene.points.double(), views, images, noise)
+        if tracks is None:
+            why = f"no scene point is seen in {LEAST_FRAMES} or more training views"
+    return Observations(scene, images, times_s, noise, still, tracks, why)
+
+
+def spread(count: int, most: int) -> list[int]:
+    """At most ``most`` positions out of ``count``, evenly spread, first and last among them."""
+    return sorted(set(torch.linspace(0, count - 1, min(count, most)).round().long().tolist())) if count else []
+
+
+def _pixels(views: list[View], images: Tensor) -> Tracks:
+    """Tracks of a grid of pixels of a camera that stands still, one unit away."""
+    count, height, width = images.shape
+    every = max(1, math.ceil(math.sqrt(height * width / MOST_POINTS)))
+    y, x = torch.meshgrid(
+        torch.arange(every // 2, height, every), torch.arange(every // 2, width, every), indexing="ij"
+    )
+    x, y = x.flatten(), y.flatten()
+    values = images[:, y, x].T
+    camera = views[0].camera
+    rays = torch.stack([(x + 0.5 - camera.K[0, 2]) / camera.K[0, 0], (y + 0.5 - camera.K[1, 2]) / camera.K[1, 1]], 1)
+    local = functional.normalize(torch.cat([rays, torch.ones(len(rays), 1, dtype=torch.float64)], 1), dim=1)
+    world = local @ camera.viewmat[:3, :3]
+    positions = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], 1)
+    ones = torch.ones_like(values)
+    return Tracks(
+        points=camera.center + world,
+        values=values,
+        slopes=torch.zeros_like(values),
+        weights=ones.clone(),
+        distances=ones,
+        directions=-world[:, None].expand(-1, count, -1),
+        positions=positions[:, None].expand(-1, count, -1),
+        radii=_radii(positions, width, height)[:, None].expand(-1, count),
+    )
+
+
+def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
+    """Tracks of scene points; None where too few are seen often enough."""
+    points = points[torch.tensor(spread(len(points), MOST_IN_FRONT))]
+    count, height, width = images.shape
+    followed = torch.tensor(spread(len(points), MOST_CANDIDATES))
+    cell = max(2.0, math.sqrt(2.0 * width * height / len(points)))
+    slopes = _steepest(images, noise)
+    has_rgb = all(view.rgb is not None and view.rgb.shape[:2] == (height, width) for view in views)
+    columns: dict[str, list[Tensor]] = {name: [] for name in Tracks.__dataclass_fields__ if name != "points"}
+    for image, slope, view in zip(images, slopes, views, strict=True):
+        camera = view.camera
+        local = to_camera(points, camera.viewmat)
+        ahead = local[:, 2] > 1e-9
+        pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), camera.K)
+        extent = pixels.new_tensor([width, height])
+        inside = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
+        inside = inside & ~_hidden(pixels, local[:, 2], inside, cell, width)
+        pixels, inside, centre = pixels[followed], inside[followed], camera.center
+        line, column = pixels[:, 1].clamp(0, height - 1).long(), pixels[:, 0].clamp(0, width - 1).long()
+        if view.mask is not None:
+            inside = inside & view.mask[line, column]
+        towards = centre - points[followed]
+        distance = towards.norm(dim=1)
+        position = 2.0 * pixels / extent - 1.0
+        columns["values"].append(between(image[..., None], position)[:, 0])
+        columns["slopes"].append(slope[line, column])
+        columns["weights"].append(inside.double())
+        columns["distances"].append(distance)
+        columns["directions"].append(towards / distance[:, None].clamp_min(1e-12))
+        columns["positions"].append(position)
+        columns["radii"].append(_radii(position, width, height))
+        if has_rgb:
+            columns["rgb"].append(between(view.rgb.double(), position))
+    tracks = Tracks(
+        points[followed], **{name: torch.stack(values, 1) if values else None for name, values in columns.items()}
+    )
+    seen = tracks.weights.sum(1)
+    often = seen >= max(LEAST_FRAMES, 0.4 * count)
+    if not often.any():
+        often = seen >= LEAST_FRAMES
+    if not often.any():
+        return None
+    tracks = tracks.of(often.nonzero()[:, 0])
+    if len(tracks.points) <= MOST_POINTS:
+        return tracks
+    # The points of even surroundings: a point at an edge shows how well it is placed and little else.
+    mean = (tracks.slopes * tracks.weights).sum(1) / tracks.weights.sum(1)
+    return tracks.of(mean.argsort()[:MOST_POINTS].sort().values)
+
+
+def _steepest(images: Tensor, noise: float) -> Tensor:
+    """Largest slope [F, H, W] of images within a pixel of each, per pixel; what noise alone makes is taken away."""
+    padded = functional.pad(images[:, None], (1, 1, 1, 1), mode="replicate")
+    horizontal = 0.5 * (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2])
+    vertical = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
+    squared = (horizontal**2 + vertical**2 - noise**2).clamp_min(0.0)  # of white noise it is noise² on average
+    return functional.max_pool2d(squared.sqrt(), 3, stride=1, padding=1)[:, 0]
+
+
+def _hidden(pixels: Tensor, depths: Tensor, inside: Tensor, cell: float, width: int) -> Tensor:
+    """Which points [n] have a much nearer one beside them in the image."""
+    across = int(width / cell) + 2
+    cells = (pixels[:, 1] / cell).long() * across + (pixels[:, 0] / cell).long()
+    cells = torch.where(inside, cells, 0)
+    nearest = torch.full((int(cells.max()) + 1,), math.inf, dtype=depths.dtype)
+    nearest.scatter_reduce_(0, cells[inside], depths[inside], "amin")
+    return depths > (1.0 + NEARER) * nearest[cells]
+
+
+def between(image: Tensor, positions: Tensor) -> Tensor:
+    """Values [n, C] of an image [H, W, C] at positions [n, 2] in [-1, 1], bilinear between pixel centres."""
+    found = functional.grid_sample(
+        image.permute(2, 0, 1)[None], positions[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return found[0, :, 0].T
+
+
+def _radii(positions: Tensor, width: int, height: int) -> Tensor:
+    return ((positions * positions.new_tensor([width, height])) ** 2).sum(-1) / (width**2 + height**2)
