@@ -270,8 +270,13 @@ def test_parameters_learn_at_the_rates_of_their_owners():
 def test_needs_are_those_of_all_owners():
     timeless = scene(timed=False)
     with pytest.raises(SceneError, match="Composed needs time"):
-        made("static", ["attenuation"]).check(timeless)
-    Composed(Static(floor=False), {"attenuation": Attenuation()}).check(timeless)
+        made("relaxation", ["attenuation"]).check(timeless)
+    model = Composed(Static(floor=False), {"attenuation": Attenuation(moments=5)})
+    model.check(timeless)
+    model.prepare(timeless)
+    part = model.parts["attenuation"]
+    assert part.log_depth.shape == (1,) and part.regularisers() == {}
+    assert part.extinction().item() == pytest.approx(0.1 / part.typical.item())
 
 
 @pytest.mark.parametrize(

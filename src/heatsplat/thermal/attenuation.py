@@ -19,7 +19,8 @@ LOG_DEPTHS = (-12.0, 3.0)  # of β times the typical distance: from nothing to a
 class Attenuation(HeatPart):
     """x e^{-β d} + A (1 - e^{-β d}) of what a surface emits at distance d from the camera (Beer and Lambert; air at A).
 
-    The extinction β is one number of the scene, or a curve over the record that is linear between evenly spread moments.
+    The extinction β is one number of the scene, or a curve over the record whose logarithm is linear between evenly spread
+    moments; a scene without time has one number.
     A is the temperature of the surroundings where it was measured, else it is learned.
 
     **Convention:** d and 1/β in world units. The distance passes no gradient to the positions: haze must not move walls.
@@ -35,13 +36,12 @@ class Attenuation(HeatPart):
     """
 
     def __init__(
-        self, depth: float = 0.1, moments: int = 0, smooth: float = 1e-3, lr: float = 0.01, lr_end: float = 0.1
+        self, depth: float = 0.1, moments: int = 0, smooth: float = 1e-4, lr: float = 0.01, lr_end: float = 0.1
     ) -> None:
         super().__init__()
         if depth <= 0 or moments == 1 or moments < 0:
             raise ValueError(f"depth must be positive and moments 0 or at least 2, got {depth} and {moments}")
         self.moments, self.smooth, self.lr, self.lr_end = moments, smooth, lr, lr_end
-        self.needs = frozenset({"time"}) if moments > 0 else frozenset()
         self.log_depth = nn.Parameter(torch.full((max(1, moments),), math.log(depth)))
         self.register_buffer("level", torch.tensor(0.5))
         self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
@@ -58,6 +58,10 @@ class Attenuation(HeatPart):
         else:
             del self.level
             self.level = nn.Parameter(level)
+        if self.moments > 0 and "time" not in scene.metadata:
+            self.moments = 0
+            del self.record
+            self.log_depth = nn.Parameter(self.log_depth.detach()[:1])
         if self.moments > 0:
             times = torch.tensor(scene.train.times_s, dtype=torch.float64)
             self.record.copy_(torch.stack([times.min(), times.max().clamp(min=times.min() + 1e-9)]))

@@ -1,0 +1,190 @@
+"""What choosing effects is worth: auto against none, all and the truth, and each chosen effect left out in turn."""
+
+from __future__ import annotations
+
+import logging
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+
+log = logging.getLogger(__name__)
+
+TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
+NOTE = (
+    "Means over seeds on held-out images as the camera records them. Milliseconds are those of whole training steps of the "
+    "run itself, one run after another: compare them on a machine that does nothing else. Parameters are those at the end, "
+    "after Gaussians were added and removed."
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of the study: a selection of effects on a preset; ``left_out`` names an effect that auto must do without."""
+
+    preset: str
+    selection: str
+    seed: int
+    left_out: str | None = None
+
+    @property
+    def folder(self) -> str:
+        return "_".join([self.preset, self.selection, *([f"without_{self.left_out}"] if self.left_out else [])])
+
+    def overrides(self, truth: Sequence[str]) -> list[str]:
+        """What the command line of the run says of it."""
+        if self.selection == "oracle":
+            effects = ["effects=none", *(f"effects.{name}=on" for name in truth)]
+        else:
+            effects = [f"effects={self.selection}"]
+        if self.left_out:
+            effects.append(f"effects.{self.left_out}=off")
+        scene = ["data=synthetic", f"data.scene={self.preset}", f"data.scene_seed={self.seed}", f"seed={self.seed}"]
+        return ["method=auto", *scene, *effects]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Means over the seeds of a job: PSNR in dB, MAE in °C, numbers that are learned, milliseconds per step."""
+
+    job: Job
+    effects: tuple[str, ...]
+    psnr: float
+    mae_c: float | None
+    parameters: float
+    ms_per_step: float
+
+
+def run(
+    output_dir: Path | str,
+    train: str,
+    presets: Mapping[str, Sequence[str]],
+    selections: Sequence[str],
+    leave_one_out: bool,
+    seeds: Sequence[int],
+    overrides: Sequence[str],
+) -> None:
+    """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
+
+    Args:
+        output_dir: of the study; runs that have results there are not run again.
+        train: path of train.py.
+        presets: synthetic scene -> the effects that are truly there.
+        selections: some of "auto", "none", "all", "oracle".
+        leave_one_out: whether chosen effects are left out in turn.
+        seeds: of every row.
+        overrides: of every run.
+    """
+    folder = Path(output_dir)
+
+    def trained(job: Job) -> RunResults:
+        place = folder / "runs" / job.folder / str(job.seed)
+        if not (place / METRICS_FILE).exists():
+            log.info("training %s, seed %d", job.folder, job.seed)
+            command = [sys.executable, train, *overrides, *job.overrides(presets[job.preset]), f"hydra.run.dir={place}"]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                raise RuntimeError(f"{' '.join(command)} failed:\n{(done.stderr or done.stdout)[-2000:]}")
+        return RunResults.read(place / METRICS_FILE)
+
+    rows = []
+    for preset in presets:
+        for job in _jobs(preset, selections):
+            rows.append(_mean(job, [trained(_at(job, seed)) for seed in seeds]))
+            if job.selection == "auto" and leave_one_out:
+                for name in rows[-1].effects:
+                    left = Job(preset, "auto", 0, name)
+                    rows.append(_mean(left, [trained(_at(left, seed)) for seed in seeds]))
+        write_atomically(folder / TABLE_FILE, tables(rows))  # what is known so far
+    figure = picture(rows)
+    if figure is not None:
+        write_png(folder / PICTURE_FILE, figure_picture(figure))
+
+
+def _jobs(preset: str, selections: Sequence[str]) -> Iterator[Job]:
+    yield from (Job(preset, selection, 0) for selection in selections)
+
+
+def _at(job: Job, seed: int) -> Job:
+    return Job(job.preset, job.selection, seed, job.left_out)
+
+
+def _mean(job: Job, results: Sequence[RunResults]) -> Row:
+    """The row of a job's runs; effects are those that were on in any of them."""
+    effects = {name: None for result in results for name, effect in result.effects.items() if effect["on"]}
+    maes = [result.test["mae_c"] for result in results if result.test.get("mae_c") is not None]
+    return Row(
+        job,
+        tuple(effects),
+        statistics.fmean(result.test["psnr"] for result in results),
+        statistics.fmean(maes) if maes else None,
+        statistics.fmean(result.run["parameters"] for result in results),
+        statistics.fmean(1000.0 / result.cost["steps_per_second"] for result in results),
+    )
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown: selections side by side, then what leaving each effect out costs."""
+    lines = ["# What choosing effects is worth", "", NOTE, ""]
+    lines += ["| scene | selection | effects | PSNR (dB) | MAE (°C) | parameters | ms per step |"]
+    lines += ["|---|---|---|---:|---:|---:|---:|"]
+    for row in rows:
+        if row.job.left_out is None:
+            effects = ", ".join(row.effects) or "none"
+            lines.append(
+                f"| {row.job.preset} | {row.job.selection} | {effects} | {row.psnr:.2f} | {_number(row.mae_c)} "
+                f"| {row.parameters:,.0f} | {row.ms_per_step:.1f} |"
+            )
+    whole = {row.job.preset: row for row in rows if row.job.selection == "auto" and row.job.left_out is None}
+    left = [row for row in rows if row.job.left_out]
+    if left:
+        lines += ["", "## Left out of what auto chose", ""]
+        lines += ["What the run loses (PSNR down, MAE up) and saves without the effect and what stands on it.", ""]
+        lines += ["| scene | without | PSNR lost (dB) | MAE gained (°C) | parameters saved | ms per step saved |"]
+        lines += ["|---|---|---:|---:|---:|---:|"]
+    for row in left:
+        auto = whole[row.job.preset]
+        worse = None if None in (row.mae_c, auto.mae_c) else row.mae_c - auto.mae_c
+        lines.append(
+            f"| {row.job.preset} | {row.job.left_out} | {auto.psnr - row.psnr:.2f} | {_number(worse)} "
+            f"| {auto.parameters - row.parameters:,.0f} | {auto.ms_per_step - row.ms_per_step:.2f} |"
+        )
+    return "\n".join([*lines, ""])
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def picture(rows: Sequence[Row]) -> Figure | None:
+    """PSNR and milliseconds per step of each selection beside those of the truth, by scene; None without an oracle."""
+    truths = {row.job.preset: row for row in rows if row.job.selection == "oracle"}
+    if not truths:
+        return None
+    figure = Figure(figsize=(10, 0.5 * len(truths) + 1.8), dpi=110, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    names = list(truths)
+    for i, selection in enumerate(("auto", "none", "all")):
+        found = [row for row in rows if row.job.selection == selection and row.job.left_out is None]
+        found = [row for row in found if row.job.preset in truths]
+        heights = [names.index(row.job.preset) + 0.15 * (i - 1) for row in found]
+        style = {"marker": "os^"[i], "linestyle": "", "color": f"C{i}", "label": selection}
+        left.plot([row.psnr - truths[row.job.preset].psnr for row in found], heights, **style)
+        right.plot([row.ms_per_step / truths[row.job.preset].ms_per_step for row in found], heights, **style)
+    left.axvspan(-0.3, 0.3, color="0.9", zorder=0)  # what counts as equal
+    left.set(xlabel="PSNR minus that of the true effects (dB)", yticks=range(len(names)), yticklabels=names)
+    left.set_xscale("symlog", linthresh=1.0)
+    right.axvline(1.0, color="0.7", linewidth=1)
+    right.set(xlabel="time of a training step over that with the true effects")
+    for axes in (left, right):
+        axes.grid(alpha=0.25)
+    left.invert_yaxis()
+    right.legend()
+    return figure

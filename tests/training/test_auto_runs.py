@@ -1,0 +1,118 @@
+"""method=auto: a scene's verdicts become a run that simulates exactly them, and tells why."""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from running import TINY, compose_run, run
+
+from heatsplat import cli
+from heatsplat.contracts import SceneError
+from heatsplat.effects import assembly
+from heatsplat.effects.base import Verdict
+from heatsplat.io.results import RunResults
+from heatsplat.training.session import load_checkpoint, restore
+
+SHORT = (*TINY, "max_steps=12", "density=fixed", "trainer.val_check_interval=12", "trainer.limit_test_batches=1")
+PRESENT = ("relaxation", "frame_offset")
+
+
+@pytest.fixture
+def scene_says(monkeypatch):
+    """Replaces the looking at the scene by verdicts that are known; counts how often it is asked."""
+    asked = []
+
+    def decide(scene, wishes):
+        asked.append(dict(wishes))
+        on = {"on": True, "off": False}
+        return {
+            name: Verdict(name, on.get(wish, name in PRESENT), 4.0 if name in PRESENT else 0.1, 1.0, "as known")
+            for name, wish in wishes.items()
+        }
+
+    monkeypatch.setitem(sys.modules, "heatsplat.effects.catalogue", SimpleNamespace(decide=decide))
+    return asked
+
+
+def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(scene_says, tmp_path):
+    module, _ = run(tmp_path, *SHORT, "method=auto")
+    assert set(module.thermal.effects()) | set(module.sensor.effects()) == set(PRESENT)
+    assert {"initial_state", "log_rate"} == set(module.splats.names) - {
+        "means",
+        "log_scales",
+        "quats",
+        "opacity_logits",
+    }
+    effects = RunResults.read(tmp_path / "metrics.json").effects
+    assert list(effects) == list(assembly.NAMES) and {n for n, e in effects.items() if e["on"]} == set(PRESENT)
+    assert effects["relaxation"]["parameters"] == len(module.splats)  # a state and a rate in place of one value
+    assert effects["frame_offset"]["parameters"] == len(module.scene.train)
+    assert effects["agc"] == {
+        "on": False,
+        "statistic": 0.1,
+        "threshold": 1.0,
+        "reason": "as known",
+        "parameters": 0,
+        "ms_per_step": 0.0,
+    }
+    assert all(isinstance(effects[name]["ms_per_step"], float) for name in PRESENT)
+    text = (tmp_path / "report.md").read_text()
+    assert "| frame_offset | **yes** | 4 | 1 | as known | 16 |" in text.replace(
+        f"| {len(module.scene.train)} |", "| 16 |"
+    )
+    assert "quickest against quickest" in text and "| agc | no | 0.1 | 1 | as known | 0 | 0 |" in text
+
+
+def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, tmp_path):
+    overrides = (
+        *SHORT,
+        "method=auto",
+        "effects.price=false",
+        "callbacks.checkpoint.every_n_train_steps=6",
+        "test=false",
+    )
+    module, trainer = run(tmp_path / "whole", *overrides)
+    last = tmp_path / "whole" / "checkpoints" / "last.ckpt"
+    stored = load_checkpoint(last)
+    recipe = stored["heatsplat"]["recipe"]
+    assert "states" not in recipe["effects"] and recipe["thermal"] == recipe["module"]["thermal"]
+    restored = cli.build(recipe["module"], output_dir=str(tmp_path))
+    restored.recipe = recipe
+    frame = module.scene.test.frames[0]
+    assert torch.equal(restore(restored, cli.build(recipe["data"]), stored).predict(frame), module.predict(frame))
+    assert len(scene_says) == 1
+    half = tmp_path / "whole" / "checkpoints" / "step_000006.ckpt"
+    resumed, _ = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
+    assert len(scene_says) == 1  # the choice is the checkpoint's
+    weights, again = module.state_dict(), resumed.state_dict()
+    assert weights.keys() == again.keys() and all(torch.equal(weights[name], again[name]) for name in weights)
+
+
+def test_none_is_3dgs_to_the_last_bit(scene_says, tmp_path):
+    same = (*SHORT, "test=false", "data.scene=static", "effects.price=false")
+    none, _ = run(tmp_path / "none", *same, "method=auto", "effects=none")
+    plain, _ = run(tmp_path / "3dgs", *same[:-1], "method=3dgs")
+    assert set(scene_says[0].values()) == {"off"}
+    assert none.splats.names == plain.splats.names and not list(none.sensor.parameters())
+    assert len(list(none.parameters())) == len(list(plain.parameters()))
+    for name in plain.splats.names:
+        assert torch.equal(none.splats[name], plain.splats[name])
+
+
+def test_everything_at_once_trains(scene_says, tmp_path):
+    off = [f"effects.{name}=off" for name in assembly.WEATHER_DRIVEN]
+    module, _ = run(tmp_path, *SHORT, "method=auto", "effects=all", "data.scene=heated", *off, "effects.price=false")
+    simulated = set(module.thermal.effects()) | set(module.sensor.effects())
+    assert simulated == set(assembly.NAMES) - set(assembly.WEATHER_DRIVEN)
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5
+    assert found["run"]["parameters"] == sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_a_method_with_parts_of_its_own_cannot_choose(tmp_path):
+    config = OmegaConf.to_container(compose_run(tmp_path, *SHORT, "method=3dgs", "effects=auto"), resolve=True)
+    with pytest.raises(SceneError, match="effects=auto chooses the parts of method=auto, but method=3dgs"):
+        cli.with_effects(config, None)
