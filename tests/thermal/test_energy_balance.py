@@ -22,7 +22,7 @@ def weather(**changes) -> Weather:
     """A day and a half from midnight: warm afternoon, sun from east over south to west, wind that rises by day."""
     times = torch.arange(-6 * HOUR, 30 * HOUR + 1, 1800.0, dtype=torch.float64)
     angle = 2 * math.pi * times / (24 * HOUR)
-    sun = torch.stack((-angle.sin(), -0.6 * angle.cos() * -1 - 1.2, -angle.cos()), dim=1)
+    sun = torch.stack((angle.sin(), 0.6 * angle.cos() - 1.2, -angle.cos()), dim=1)  # x is east
     sun = torch.nn.functional.normalize(sun, dim=1)
     height = sun[:, 2].clamp(min=0)
     record = Weather(
@@ -110,14 +110,14 @@ def test_effects_that_are_off_or_unknown_are_absent():
     model, splats = ready(scene(bare))
     assert "raw_wind" not in splats
     assert model.effects()["convection"]["left_out"] == "wind, which the weather lacks"
-    assert model.effects()["long_waves"]["sky"] == "swinbank"
-    assert "humidity" in model.effects()["long_waves"]["left_out"]
+    assert model.effects()["radiation"]["sky"] == "swinbank"
+    assert "humidity" in model.effects()["radiation"]["left_out"]
     assert model.temperature(splats, 5 * HOUR).isfinite().all()
 
 
 def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():
     model, splats = ready(scene(weather(sun=None, direct_w_m2=None, diffuse_w_m2=None)))
-    assert model.effects()["sunlight"]["left_out"] == "the direction of the sun, which the weather lacks"
+    assert model.effects()["solar"]["left_out"] == "the direction of the sun, which the weather lacks"
     assert model.climate.beam is None
     with torch.no_grad():
         splats["raw_sun"].fill_(0.0)

@@ -44,7 +44,7 @@ def test_a_run_learns_tells_its_effects_and_answers_in_other_weather(tmp_path):
     module, trainer = run(tmp_path, *SHORT, "max_steps=60", "trainer.val_check_interval=30")
     scene = module.scene
     results = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(results["effects"]) == {"convection", "sunlight", "long_waves"}
+    assert set(results["effects"]) == {"convection", "solar", "radiation"}
     start = torch.tensor(3600.0)
     assert (module.splats["log_rate"] + start.log()).abs().max() > 0.1  # what is learned has moved
     moment = scene.test.times_s[0]
@@ -66,5 +66,5 @@ def test_the_full_balance_trains_too(tmp_path):
     module, _ = run(
         tmp_path, *SHORT, "max_steps=6", "thermal.solution=corrected", "trainer.val_check_interval=6", "test=false"
     )
-    assert module.thermal.effects()["long_waves"]["power"] == "T⁴"
+    assert module.thermal.effects()["radiation"]["power"] == "T⁴"
     assert all(parameter.isfinite().all() for parameter in module.splats.parameters())
