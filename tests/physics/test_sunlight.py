@@ -62,7 +62,7 @@ def test_derivatives_are_those_of_the_values():
     normals, log_rates = (x.requires_grad_() for x in surfaces(30))
 
     def response(normals, log_rates):
-        return TABLE.response(2.4 * 86400, normals, log_rates)
+        return TABLE.response(0.7 * 86400, normals, log_rates)  # later tables are float32
 
     assert torch.autograd.gradcheck(response, (normals, log_rates), eps=1e-6, atol=1e-6)
 

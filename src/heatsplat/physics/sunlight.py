@@ -110,7 +110,8 @@ def _normals() -> Tensor:
 def _corners(normals: Tensor) -> tuple[Tensor, Tensor]:
     """The four grid normals about each of normals [n, 3], [n, 4] int64, and their weights [n, 4]."""
     x, y, z = normals.unbind(1)
-    row = (torch.asin(z.clamp(-0.999999, 0.999999)) / math.pi + 0.5) * (HEIGHTS - 1)
+    level = (x * x + y * y + 1e-18).sqrt()  # not 0, where the root has no derivative
+    row = (torch.atan2(z, level) / math.pi + 0.5) * (HEIGHTS - 1)
     column = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * (AZIMUTHS - 1)
     i = row.detach().long().clamp(0, HEIGHTS - 2)
     j = column.detach().long().clamp(0, AZIMUTHS - 2)
