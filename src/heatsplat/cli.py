@@ -136,7 +136,8 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
     from heatsplat.effects.catalogue import decide
 
     given = assembly.explicit(plain["effects"])
-    verdicts = assembly.reconciled(decide(data.scene, assembly.wishes(plain["effects"])), given)
+    seen = decide(data.scene, assembly.wishes(plain["effects"]))
+    verdicts = assembly.reconciled(assembly.possible(seen, data.scene), given)
 
     def configured(chosen: dict[str, Any]) -> dict[str, Any]:
         return assembly.filled(plain, assembly.recipe(chosen, plain["effects"]), assembly.told(verdicts, found))
@@ -151,8 +152,8 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
         found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"])
-    for name, verdict in verdicts.items():
-        log.info("effect %-16s %-3s  %s", name, "on" if verdict.on else "off", verdict.reason)
+    for line in assembly.lines(assembly.told(verdicts, found)):
+        log.info("%s", line)
     return configured(verdicts)
 
 

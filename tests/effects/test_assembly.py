@@ -1,5 +1,6 @@
 """From verdicts to configuration: what is on is in it with its settings, what is off is not."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -9,9 +10,10 @@ from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat import cli
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
+from heatsplat.studies.prices import Price
 
 
 @cache
@@ -137,10 +139,29 @@ def test_what_the_scene_cannot_give_is_refused_where_it_was_asked_for():
         assembly.reconciled(verdicts(), {"solar": "on"})
 
 
+def test_an_opacity_for_each_image_needs_two_images():
+    from datamodules.synthetic import Synthetic
+
+    scene = Synthetic(scene="static", size="tiny").scene
+    assert assembly.possible(verdicts("thermal_opacity", "agc"), scene) == verdicts("thermal_opacity", "agc")
+    thermal = ViewSet(scene.train.frames, lambda i: replace(scene.train[i], rgb=None))
+    found = assembly.possible(verdicts("thermal_opacity", "agc"), replace(scene, train=thermal))
+    assert names_on(found) == {"agc"} and found["thermal_opacity"].reason == "there are no visible images"
+
+
 def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
     full = verdicts("relaxation", "harmonic_source", "agc")
     assert names_on(assembly.without(full, "relaxation")) == {"agc"}
     assert names_on(assembly.without(full, "harmonic_source")) == {"relaxation", "agc"}
+
+
+def test_the_log_tells_verdict_statistic_price_and_reason():
+    told = assembly.told(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
+    head, *rows = assembly.lines(told)
+    assert head.split() == ["effect", "statistic", "ms/step", "numbers", "reason"] and len(rows) == len(assembly.NAMES)
+    of = {row.split()[0]: row.split() for row in rows}
+    assert of["agc"] == ["agc", "on", "3", ">", "1", "+0.26", "+2", "N", "+10", "as", "measured"]
+    assert of["tone"] == ["tone", "off", "0.5", "≤", "1", "as", "measured"]
 
 
 # Wishes ---------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects.base import WISHES, Verdict
 
 STATE = ("relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction")
@@ -76,6 +76,14 @@ def chooses(config: Mapping[str, Any]) -> bool:
             f"effects=none effects.{asked[0]}=on, or the method's own options (thermal.*, sensor.*)."
         )
     return chosen
+
+
+def possible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
+    """The verdicts, without an opacity for each image where there is only one image."""
+    found = dict(verdicts)
+    if found["thermal_opacity"].on and any(len(part) and part[0].rgb is None for part in (scene.train, scene.test)):
+        found["thermal_opacity"] = replace(found["thermal_opacity"], on=False, reason="there are no visible images")
+    return found
 
 
 def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None = None) -> dict[str, Verdict]:
@@ -176,6 +184,23 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
 def told(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Verdicts as plain containers, with what the effects add where that was measured (``studies.prices``)."""
     return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
+
+
+def lines(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A table for the log of what ``told`` says: effect, verdict, statistic and threshold, price, reason."""
+    rows = [("effect", "", "statistic", "ms/step", "numbers", "reason")]
+    for name, verdict in verdicts.items():
+        measured = verdict["statistic"] is not None
+        sign = ">" if measured and verdict["statistic"] > verdict["threshold"] else "≤"
+        statistic = f"{verdict['statistic']:.3g} {sign} {verdict['threshold']:.3g}" if measured else "–"
+        priced = "ms_per_step" in verdict
+        numbers = f"{verdict['per_gaussian']:+d} N {verdict['shared']:+d}" if priced else ""
+        milliseconds = f"{verdict['ms_per_step']:+.2f}" if priced else ""
+        rows.append((name, "on" if verdict["on"] else "off", statistic, milliseconds, numbers, verdict["reason"]))
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+    return [
+        "  ".join([*(cell.ljust(width) for cell, width in zip(row[:5], widths, strict=True)), row[5]]) for row in rows
+    ]
 
 
 def _plain_price(price: Any) -> dict[str, Any]:
