@@ -11,6 +11,12 @@ from hypothesis import strategies as st
 
 from heatsplat.geometry.projection import project_gaussians
 from heatsplat.geometry.rotations import matrices_to_quats, normalised, quats_to_matrices, slerp
+from heatsplat.physics.ellipsoids import (
+    THOMSEN_POWER,
+    convecting_area_ratio,
+    projected_area_ratio,
+    radiating_area_ratio,
+)
 from heatsplat.physics.grey_body import radiance, temperature_of
 from heatsplat.renderers.base import BLUR, FOV_MARGIN
 from heatsplat.thermal.imaging_field import octaves
@@ -90,6 +96,25 @@ def test_gaussians_of_any_shape_have_a_sound_image(seed, a, b, c, slope, depth):
     tilt = max(a, b, c) / depth * 500 * 1e-6
     exact = 1 / truth.whitening[:, 0]
     assert ((1 / found.whitening[:, 0].double() - exact).abs() <= 1e-3 * exact + tilt).all()
+
+
+@pytest.mark.parametrize("dtype", TYPES, ids=str)
+@settings(max_examples=100)
+@given(axes, axes, axes, seeds())
+def test_areas_over_volumes_of_ellipsoids_of_any_size(dtype, a, b, c, seed):
+    semi = torch.tensor([a, b, c], dtype=dtype).requires_grad_()
+    towards = directions(seed, 3)
+    towards = (towards / towards.norm()).to(dtype)
+    surface, shadow = radiating_area_ratio(semi), projected_area_ratio(semi, towards)
+    (surface + shadow + convecting_area_ratio(semi, "printed")).backward()
+    assert semi.grad.isfinite().all() and surface > 0 and shadow > 0
+    # A body shows between none and half of its surface (a flat disc from the front), within Thomsen's 1.1 %.
+    assert shadow <= 0.5 * surface * 1.011
+    with mpmath.workdps(50):
+        p, sides = mpmath.mpf(THOMSEN_POWER), [mpmath.mpf(x) for x in (a, b, c)]
+        pairs = sum((sides[i] * sides[j]) ** p for i, j in ((0, 1), (0, 2), (1, 2)))
+        exact = 3 * (pairs / 3) ** (1 / p) / (sides[0] * sides[1] * sides[2])
+    assert abs(surface.item() - exact) <= 12 * torch.finfo(dtype).eps * exact
 
 
 @settings(max_examples=100)

@@ -22,6 +22,7 @@ log = logging.getLogger("heatsplat")
 
 FAMILIES = {
     "closed_form": "Heat in closed form",
+    "balance": "Balance of heat",
     "splatting": "Splatting",
     "sensing": "Sensor and field",
     "images": "Losses",
