@@ -104,6 +104,7 @@ class Synthetic(SceneDataModule):
             notes={
                 "source": f"synthetic preset {self.scene_name}, scene_seed {self.scene_seed}",
                 "noise_k": self.noise_k,
+                "effects": sorted(preset.effects),
                 "heat": recording.scene.how_solved(),
                 "probes": probe_names,
             },
@@ -138,7 +139,7 @@ def _with_clean(scene: SceneData, recording: Recording) -> SceneData:
 
     notes = {
         **scene.notes,
-        "camera": "fixed pattern, vignetting and gain steps; clean_* scores are against its clean record",
+        "camera": "has flaws (effects); clean_* scores are against its clean record",
     }
     return replace(scene, train=known(scene.train), val=known(scene.val), test=known(scene.test), notes=notes)
 

@@ -1,4 +1,4 @@
-"""What stands between a surface and a record: haze on the path of the light, and the flaws of a camera."""
+"""What stands between a surface and a record: its gloss, haze on the path of the light, and the flaws of a camera."""
 
 from __future__ import annotations
 
@@ -37,11 +37,47 @@ class Haze:
 
 
 @dataclass(frozen=True)
-class CameraFlaws:
-    """Flaws of an uncooled camera: y = s_f [x (1 + G) + B] exp(a2 r² + a4 r⁴) of image values x.
+class Gloss:
+    """Surfaces that are no black bodies: they emit less along themselves, and mirror warm surroundings.
 
-    G and B are smooth fields (a grid of random nodes, enlarged bicubically) plus a column pattern, r is 0 in the middle
-    and 1 in the corners, and s_f, the gain, steps where the camera's shutter closes.
+    A surface T that is seen at the angle θ to its normal, and mirrors the direction m, looks as warm as
+    A + (1 - ρ) [1 - s (1 - cos θ)] (T - A) + ρ W ((1 + m · m_0) / 2)², A being the ambient temperature.
+
+    Args:
+        fade: s, the share of its excess that a surface loses when it is seen edge-on.
+        mirrors: ρ, the share of the surroundings that it mirrors.
+        warm_k: W, excess of the warmest part of the surroundings.
+        towards: m_0, where that part is; any length.
+    """
+
+    fade: float = 0.0
+    mirrors: float = 0.0
+    warm_k: float = 0.0
+    towards: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def apparent(self, excess: Tensor, outwards: Tensor, normals: Tensor) -> Tensor:
+        """Apparent excess over ambient [n] of surfaces of an excess [n].
+
+        Args:
+            outwards: unit vectors [n, 3] from the surface to the camera.
+            normals: [n, 3], on the camera's side.
+        """
+        facing = (outwards * normals).sum(1)
+        mirrored = 2.0 * facing[:, None] * normals - outwards
+        warmest = torch.nn.functional.normalize(excess.new_tensor(self.towards), dim=0)
+        around = self.warm_k * (0.5 * (1.0 + mirrored @ warmest)) ** 2
+        return (1.0 - self.mirrors) * (
+            1.0 - self.fade * (1.0 - facing.clamp(0.0, 1.0))
+        ) * excess + self.mirrors * around
+
+
+@dataclass(frozen=True)
+class CameraFlaws:
+    """Flaws of an uncooled camera: y = C(s_f [P(x) (1 + G) + B] exp(a2 r² + a4 r⁴) + o_f) of image values x.
+
+    P is a Gaussian blur. G and B are smooth fields (a grid of random nodes, enlarged bicubically) plus a column pattern, r
+    is 0 in the middle and 1 in the corners. s_f, the gain, steps where the camera's shutter closes; o_f, the offset, walks
+    at random in between and starts anew there. C(y) = y + c y (1 - y) is the tone curve.
 
     Args:
         gain, bias: standard deviation of the nodes of G and of B (image units).
@@ -50,6 +86,9 @@ class CameraFlaws:
         falloff: a2, a4.
         step: standard deviation of s_f - 1 from shutter to shutter.
         frames_per_step: frames between two shutters.
+        drift: standard deviation of what o_f changes by from frame to frame (image units).
+        blur_px: standard deviation of the blur.
+        bend: c.
     """
 
     gain: float = 0.03
@@ -59,6 +98,9 @@ class CameraFlaws:
     falloff: tuple[float, float] = (-0.12, -0.08)
     step: float = 0.0
     frames_per_step: int = 12
+    drift: float = 0.0
+    blur_px: float = 0.0
+    bend: float = 0.0
 
     def fields(self, height: int, width: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """G, B and the falloff over the image, each [H, W] float64."""
@@ -78,8 +120,29 @@ class CameraFlaws:
         drawn = torch.randn(shutters, generator=generator_for(seed, 1, "camera flaws"), dtype=torch.float64)
         return 1.0 + self.step * drawn.repeat_interleave(self.frames_per_step)[:frames]
 
+    def offsets(self, frames: int, seed: int) -> Tensor:
+        """o_f of every frame, [F] float64; their mean is 0, because a level that all share is nobody's flaw."""
+        drawn = torch.randn(frames, generator=generator_for(seed, 2, "camera flaws"), dtype=torch.float64)
+        walks = torch.cat([part.cumsum(0) for part in (self.drift * drawn).split(self.frames_per_step)])
+        return walks - walks.mean()
+
+    def blurred(self, images: Tensor) -> Tensor:
+        """Images [F, H, W] through the point spread; beyond the border they go on as they end."""
+        if not self.blur_px:
+            return images
+        reach = math.ceil(4.0 * self.blur_px)
+        at = torch.arange(-reach, reach + 1, dtype=images.dtype)
+        kernel = torch.exp(-0.5 * (at / self.blur_px) ** 2)
+        kernel = kernel / kernel.sum()
+        wide = torch.nn.functional.pad(images[:, None], (reach,) * 4, mode="replicate")
+        rows = torch.nn.functional.conv2d(wide, kernel[None, None, None])
+        return torch.nn.functional.conv2d(rows, kernel[None, None, :, None])[:, 0]
+
     def record(self, unit: Tensor, seed: int) -> Tensor:
         """What the camera makes of clean images [F, H, W] of values in [0, 1]; values beyond are kept."""
         gain, bias, falloff = self.fields(*unit.shape[1:], seed)
-        seen = (unit * (1.0 + gain) + bias) * falloff
-        return self.steps(len(unit), seed)[:, None, None] * seen
+        seen = (self.blurred(unit) * (1.0 + gain) + bias) * falloff
+        grey = self.steps(len(unit), seed)[:, None, None] * seen
+        if self.drift:
+            grey = grey + self.offsets(len(unit), seed)[:, None, None]
+        return grey + self.bend * grey * (1.0 - grey) if self.bend else grey

@@ -163,6 +163,7 @@ class OutdoorPreset(Preset):
     surfaces: tuple[OutdoorSurface, ...] = YARD
     duration_s: float = DURATION_S
     ambient_c: float = 18.0
+    effects: frozenset[str] = frozenset({"relaxation", "solar", "radiation", "convection"})
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from datamodules.synthetic_scene.flaws import CameraFlaws, Haze
+from datamodules.synthetic_scene.flaws import CameraFlaws, Gloss, Haze
 from datamodules.synthetic_scene.heat import Material, Waveform, periodic
 from datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
 
@@ -47,13 +47,22 @@ class Pattern:
         """Values [n] at ``points`` [n, 3]."""
         value = torch.full_like(points[:, 0], self.level)
         if self.swing:
-            waves = points.new_tensor(_WAVES) * (2.0 * math.pi / self.wavelength_m)
-            phases = waves @ points.T + points.new_tensor(_PHASES)[:, None]
-            value += self.swing * torch.sin(phases).mean(0)
+            value += self.waves(points).sum(1)
         if self.step:
             tile = (points.T / self.tile_m + 0.5).floor().sum(0)
             value += self.step * (1.0 - 2.0 * torch.remainder(tile, 2.0))
         return value
+
+    def waves(self, points: Tensor) -> Tensor:
+        """The parts [n, 3] of the smooth part at ``points`` [n, 3], each a plane wave."""
+        phases = points @ points.new_tensor(_WAVES).T * (2.0 * math.pi / self.wavelength_m) + points.new_tensor(_PHASES)
+        return self.swing / len(_WAVES) * torch.sin(phases)
+
+    def wave_numbers(self, normals: Tensor) -> Tensor:
+        """Wave numbers [n, 3] of ``waves`` along surfaces with unit ``normals`` [n, 3] (the shape's own axes), in 1/m."""
+        waves = normals.new_tensor(_WAVES) * (2.0 * math.pi / self.wavelength_m)
+        across = normals @ waves.T
+        return (waves.square().sum(1) - across**2).clamp_min(0.0).sqrt()
 
 
 @dataclass(frozen=True)
@@ -108,6 +117,9 @@ class Preset:
         duration_s: length of the record in seconds.
         haze: what dims the path of the heat, or None for clear air.
         flaws: what is wrong with the thermal camera, or None for nothing but noise.
+        gloss: what its surfaces are besides black bodies, or None.
+        diffusivity: of heat along the surfaces, in m²/s; exact on flat ones, as if they had no end. 0 for none.
+        effects: names of the effects that it shows (``heatsplat.effects.catalogue``), which is what ought to be found.
         sparseness: by what factor its sparse model has fewer points than that of other presets.
     """
 
@@ -120,6 +132,9 @@ class Preset:
     haze: Haze | None = None
     flaws: CameraFlaws | None = None
     sparseness: float = 1.0
+    gloss: Gloss | None = None
+    diffusivity: float = 0.0
+    effects: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         names = [surface.name for surface in self.surfaces]
@@ -210,11 +225,90 @@ _LAMP = Lamp(
     waveform=periodic(period_s=600.0, on_s=300.0, ramp_s=120.0, duration_s=1800.0),
 )
 
+# Thin copper sheets: a pattern on them levels out before the sheet is cold.
+_SHEETS = tuple(
+    Surface(one.name, one.shape, Material(390.0, 3.4e6, 0.003, 11.0), one.absorbs, one.color) for one in TABLE_TOP[:6]
+)
+_SMOOTH = {one.name: Pattern(24.0 + i, 9.0, 0.8 + 0.1 * i) for i, one in enumerate(_SHEETS)}
+
+# A camera without any flaw, to which presets add theirs.
+_GOOD = CameraFlaws(gain=0.0, bias=0.0, falloff=(0.0, 0.0))
+_DRIFTING = replace(_GOOD, drift=0.008)
+_UNEVEN = CameraFlaws(falloff=(0.0, 0.0))
+_DARK_CORNERS = replace(_GOOD, falloff=(-0.12, -0.08))
+
+
+def _shows(*names: str) -> frozenset[str]:
+    return frozenset(names)
+
+
 PRESETS: dict[str, Preset] = {
     "static": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP),
-    "cooling": Preset(start_k=_WARM, surfaces=TABLE_TOP),
-    "heated": Preset(start_k=_LUKEWARM, lamp=_LAMP, surfaces=TABLE_TOP),
-    "glass": Preset(start_k=_WARM | {"pane": Pattern(4.0, 2.0, 0.5)}, held=True, surfaces=(*TABLE_TOP, PANE)),
-    "noisy_sensor": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=CameraFlaws(step=0.02)),
-    "haze": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, haze=Haze(0.25, 0.9, 2.3), sparseness=8.0),
+    "cooling": Preset(start_k=_WARM, surfaces=TABLE_TOP, effects=_shows("relaxation")),
+    "heated": Preset(
+        start_k=_LUKEWARM, lamp=_LAMP, surfaces=TABLE_TOP, effects=_shows("relaxation", "harmonic_source")
+    ),
+    "glass": Preset(
+        start_k=_WARM | {"pane": Pattern(4.0, 2.0, 0.5)},
+        held=True,
+        surfaces=(*TABLE_TOP, PANE),
+        effects=_shows("thermal_opacity"),
+    ),
+    "noisy_sensor": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        flaws=CameraFlaws(step=0.02),
+        effects=_shows("fixed_pattern", "vignetting", "agc"),
+    ),
+    "haze": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        haze=Haze(0.25, 0.9, 2.3),
+        sparseness=8.0,
+        effects=_shows("attenuation"),
+    ),
+    "drifting": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=_DRIFTING, effects=_shows("frame_offset")),
+    "drifting_cooling": Preset(
+        start_k=_WARM, surfaces=TABLE_TOP, flaws=_DRIFTING, effects=_shows("frame_offset", "relaxation")
+    ),
+    "uneven": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=_UNEVEN, effects=_shows("fixed_pattern")),
+    "dark_corners": Preset(
+        start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=_DARK_CORNERS, effects=_shows("vignetting")
+    ),
+    "uneven_heated": Preset(
+        start_k=_LUKEWARM,
+        lamp=_LAMP,
+        surfaces=TABLE_TOP,
+        flaws=CameraFlaws(),
+        effects=_shows("relaxation", "harmonic_source", "fixed_pattern", "vignetting"),
+    ),
+    "blurred": Preset(
+        start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=replace(_GOOD, blur_px=1.4), effects=_shows("point_spread")
+    ),
+    "blurred_cooling": Preset(
+        start_k=_WARM,
+        surfaces=TABLE_TOP,
+        flaws=replace(_DARK_CORNERS, blur_px=1.4),
+        effects=_shows("point_spread", "vignetting", "relaxation"),
+    ),
+    "bent_tone": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        flaws=replace(_GOOD, drift=0.02, bend=0.25),
+        effects=_shows("frame_offset", "tone"),
+    ),
+    "mirrors": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        gloss=Gloss(mirrors=0.15, warm_k=60.0, towards=(0.5, -0.6, 0.6)),
+        effects=_shows("reflection"),
+    ),
+    "dull": Preset(
+        start_k=_WARM, held=True, surfaces=TABLE_TOP, gloss=Gloss(fade=0.4), effects=_shows("view_dependence")
+    ),
+    "sheets": Preset(start_k=_SMOOTH, surfaces=_SHEETS, diffusivity=1.2e-4, effects=_shows("relaxation", "conduction")),
 }

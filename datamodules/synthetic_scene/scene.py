@@ -32,15 +32,20 @@ class SurfaceHeat:
         start_k: [n] excess over ambient at time 0.
         flux_w_m2: [n] absorbed flux when the source is at full level.
         material: [n] position of the material in ``Scene.materials``; -1 where there is no surface.
+        waves_k: [n, w] parts of ``start_k`` that also level out sideways, or None where nothing flows sideways.
+        levelling: [n, w] the rate at which each does, 1/s.
     """
 
     start_k: Tensor
     flux_w_m2: Tensor
     material: Tensor
+    waves_k: Tensor | None = None
+    levelling: Tensor | None = None
 
     def where(self, keep: Tensor) -> SurfaceHeat:
         """The heat of the points that ``keep`` selects."""
-        return SurfaceHeat(self.start_k[keep], self.flux_w_m2[keep], self.material[keep])
+        sideways = (None, None) if self.waves_k is None else (self.waves_k[keep], self.levelling[keep])
+        return SurfaceHeat(self.start_k[keep], self.flux_w_m2[keep], self.material[keep], *sideways)
 
 
 class Scene:
@@ -86,12 +91,22 @@ class Scene:
         """What ``first_hits`` finds on rays that go on from surface points [n, 3] along ``directions`` [n, 3]."""
         return self.first_hits(points + _OFF_SURFACE_M * directions, directions)
 
+    def normals(self, points: Tensor, which: Tensor) -> Tensor:
+        """Outward unit normals [n, 3] at ``points`` [n, 3] on the surfaces numbered ``which`` [n]; 0 where there is none."""
+        result = torch.zeros_like(points)
+        for number, shape in enumerate(self.shapes):
+            here = which == number
+            if here.any():
+                result[here] = shape.normals(points[here])
+        return result
+
     def heat_at(self, points: Tensor, which: Tensor) -> SurfaceHeat:
         """Start, flux and material at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         result = SurfaceHeat(
             torch.zeros(len(points), dtype=torch.float64),
             torch.zeros(len(points), dtype=torch.float64),
             torch.full((len(points),), -1),
+            *((points.new_zeros(len(points), 3), points.new_zeros(len(points), 3)) if self.preset.diffusivity else ()),
         )
         for number, surface in enumerate(self.preset.surfaces):
             here = which == number
@@ -101,7 +116,12 @@ class Scene:
             local = surface.shape.local(on)
             result.material[here] = self.materials.index(surface.material)
             if surface.name in self.preset.start_k:
-                result.start_k[here] = self.preset.start_k[surface.name](local)
+                start = self.preset.start_k[surface.name]
+                result.start_k[here] = start(local)
+                if self.preset.diffusivity:
+                    across = surface.shape.local(on + surface.shape.normals(on)) - local
+                    result.waves_k[here] = start.waves(local)
+                    result.levelling[here] = self.preset.diffusivity * start.wave_numbers(across) ** 2
             if self.preset.held:
                 result.flux_w_m2[here] = surface.material.exchange * result.start_k[here]
             if self.preset.lamp:
@@ -130,7 +150,11 @@ class Scene:
         """Temperatures [n, F] of surface points at ``times_s`` [F], in °C; ambient where there is no surface."""
         response = torch.from_numpy(self.responses.at(times_s.numpy()))
         of_point = response[:, surface.material.clamp_min(0)]
-        rise = of_point[..., 0] * surface.start_k + of_point[..., 1] * surface.flux_w_m2
+        start = surface.start_k
+        if surface.waves_k is not None:  # (W cos) e^{-D q² t}: heat that flows along an endless sheet
+            levelled = torch.exp(-surface.levelling * times_s[:, None, None]) - 1.0
+            start = start + (levelled * surface.waves_k).sum(-1)
+        rise = of_point[..., 0] * start + of_point[..., 1] * surface.flux_w_m2
         return self.preset.ambient_c + rise.T
 
     def how_solved(self) -> str:
