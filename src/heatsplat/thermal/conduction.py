@@ -140,7 +140,9 @@ def laplacian(edges: Tensor, count: int) -> Tensor:
     every = torch.arange(count, device=edges.device)
     places = torch.cat([torch.stack([i, j]), torch.stack([j, i]), torch.stack([every, every])], dim=1)
     values = torch.cat([-torch.ones(2 * len(i), device=edges.device), degrees])
-    return torch.sparse_coo_tensor(places, values / degrees.mean().clamp(min=1e-12), (count, count)).coalesce()
+    return torch.sparse_coo_tensor(
+        places, values / degrees.mean().clamp(min=1e-12), (count, count), check_invariants=False
+    ).coalesce()
 
 
 class _ImplicitStep(torch.autograd.Function):
