@@ -1,10 +1,13 @@
 """The study of effects: its runs, its tables, and that it goes on where it stopped."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml
 
+from datamodules.synthetic_scene.presets import PRESETS as SCENES
 from heatsplat.io.results import RunResults
 from heatsplat.studies import effects as study
 
@@ -57,6 +60,13 @@ def test_every_selection_runs_and_each_chosen_effect_is_left_out(commands, tmp_p
     assert "| static | all | relaxation, harmonic_source, agc | 30.00 | 1.000 | 1,300 | 13.0 |" in table
     assert "| heated | harmonic_source | 1.00 | 0.100 | 100 | 1.00 |" in table
     assert (tmp_path / study.PICTURE_FILE).stat().st_size > 5000
+
+
+def test_the_truth_of_its_configuration_is_that_of_the_scenes():
+    conf = Path(__file__).resolve().parents[2] / "conf" / "study" / "effects.yaml"
+    truth = yaml.safe_load(conf.read_text(encoding="utf-8"))["presets"]
+    assert {name: set(effects) for name, effects in truth.items()} == {n: set(SCENES[n].effects) for n in truth}
+    assert len(truth) >= 10
 
 
 def test_it_goes_on_where_it_stopped(commands, tmp_path):
