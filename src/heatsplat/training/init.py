@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 NEIGHBOURS = 3  # a new splat is as large as the distance to its nearest points (Kerbl et al. 2023)
 MIN_SQUARED_DISTANCE = 1e-7
+LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
 
 
@@ -44,8 +45,10 @@ class Initialisation:
     def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
         means = self._means(scene, generator_for(seed, 0, "init"))
-        squared = neighbour_distances(means).square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
-        count = len(means)
+        count, distances = len(means), neighbour_distances(means)
+        if count == 1:
+            distances = torch.full((1, 1), LONE_SIZE * scene.extent)
+        squared = distances.square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
         logit = torch.logit(torch.tensor(self.opacity))
         geometry = {
             "means": means,
@@ -130,7 +133,7 @@ def neighbour_distances(points: Tensor) -> Tensor:
     """Distances from each point to its three nearest others, [P, 3]; fewer columns when there are fewer points."""
     array = points.numpy().astype(np.float64)
     k = min(NEIGHBOURS, len(array) - 1)
-    distances, _ = cKDTree(array).query(array, k=k + 1, workers=1)
+    distances, _ = cKDTree(array).query(array, k=list(range(1, k + 2)), workers=1)  # a list keeps two axes
     return torch.from_numpy(distances[:, 1:]).float()
 
 
