@@ -18,7 +18,7 @@ from heatsplat import cli
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet, Weather
 from heatsplat.geometry.projection import look_at
 from heatsplat.training.rng import generator_for
-from heatsplat.training.session import fit, load_checkpoint
+from heatsplat.training.session import fit, load_checkpoint, prepare_machine
 
 WIDTH, HEIGHT, FRAMES, POINTS, STEPS = 24, 20, 6, 80, 300
 SPAN_S = 1000.0
@@ -108,6 +108,7 @@ def everywhere(tree: Any, change) -> Any:
 
 def train(scene: SceneData, plain: dict[str, Any], output_dir: Path):
     """(module, losses) after a run with the product's guard and checkpoints; raises what the run raises."""
+    prepare_machine(plain["threads"])
     losses = Losses()
     kept = {name: plain["callbacks"][name] for name in ("interrupt", "finite", "checkpoint", "checkpoint_end")}
     trainer = pl.Trainer(

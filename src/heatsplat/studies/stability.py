@@ -43,7 +43,8 @@ within a factor of ten on any machine. Ours is promised to stay below a number o
 2.2e-16 in float64), which the test checks as well.
 
 What the renderers, the training, the step sizes and random inputs go through is not in this table but in the tests beside
-it (`tests/stability`); that the tests notice when a stable form is lost is shown in [mutations.md](mutations.md).
+it (`tests/stability`). `python src/study.py study=mutations` puts naive forms back, one by one, and lists the tests that
+notice (docs/mutations.md).
 """
 
 

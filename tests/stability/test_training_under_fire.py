@@ -1,0 +1,140 @@
+"""Every method on scenes built to break it: it converges, or stops with an error that names the cause."""
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from fire import SPAN_S, STEPS, camera, checkpoints, everywhere, plain_config, sound, train, with_views
+from helpers import ALL_METHODS
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.training.session import prepare_machine
+
+pytestmark = pytest.mark.slow  # until every method has passed on an idle machine; 60 runs of about a second
+
+CAUSE = (FloatingPointError, SceneError, RuntimeError)
+
+
+@dataclass(frozen=True)
+class Fire:
+    """What breaks a training, and how it may end.
+
+    Args:
+        scene: what is trained on.
+        change: function from the resolved configuration to the one that is run.
+        error: how a run may stop: a pattern of the message; None: it must reach its end.
+        must_stop: it has to.
+        learns: the loss at the end is below this share of what it was.
+    """
+
+    scene: Callable[[], SceneData] = sound
+    change: Callable[[dict[str, Any]], dict[str, Any]] = lambda plain: plain
+    error: str | None = None
+    must_stop: bool = False
+    learns: float | None = 0.6
+
+
+def at_times(*times: float) -> SceneData:
+    def moved(position, view):
+        return replace(view, frame=replace(view.frame, time_s=times[position]))
+
+    return with_views(sound(len(times)), moved)
+
+
+def flat() -> SceneData:
+    def even(_, view):
+        return replace(view, thermal=torch.full_like(view.thermal, 0.4), rgb=torch.full_like(view.rgb, 0.4))
+
+    return with_views(sound(), even)
+
+
+def one_frame(value: float, masked: bool = False) -> SceneData:
+    def filled(position, view):
+        if position != 2:
+            return view
+        mask = torch.zeros(view.thermal.shape[:2], dtype=torch.bool) if masked else None
+        return replace(view, thermal=torch.full_like(view.thermal, value), mask=mask)
+
+    return with_views(sound(), filled)
+
+
+def one_view_of_nothing() -> SceneData:
+    def turned(position, view):
+        return replace(view, frame=replace(view.frame, camera=camera(0.3, away=True))) if position % 2 else view
+
+    return with_views(sound(), turned)
+
+
+def one_gaussian(plain: dict[str, Any]) -> dict[str, Any]:
+    plain["module"]["init"] |= {"source": "random", "count": 1}
+    return plain
+
+
+def hundredfold(plain: dict[str, Any]) -> dict[str, Any]:
+    def faster(key, number):
+        return number * 100 if key.startswith("lr") and not key.endswith("_end") else number
+
+    def all_faster(key, number):
+        return number if key in ("means_end", "eps") else number * 100
+
+    module = everywhere(plain["module"], faster)
+    return plain | {"module": module | {"optim": everywhere(module["optim"], all_faster)}}
+
+
+def resets(plain: dict[str, Any]) -> dict[str, Any]:
+    return everywhere(plain, lambda key, number: {"reset_every": 60, "every": 30}.get(key, number))
+
+
+FIRES = {
+    "nothing wrong": Fire(),
+    "constant temperature": Fire(flat),
+    "two frames": Fire(lambda: sound(2)),
+    "duplicate timestamps": Fire(lambda: at_times(0.0, 0.0, 500.0, 500.0, SPAN_S, SPAN_S)),
+    "one moment": Fire(lambda: at_times(0.0, 0.0, 0.0)),
+    "one saturated frame": Fire(lambda: one_frame(1.0), learns=1.0),  # no cloud explains it beside the others
+    "a masked frame of NaN": Fire(lambda: one_frame(math.nan, masked=True)),
+    "a frame of NaN": Fire(lambda: one_frame(math.nan), error=r"NaN.*frame_2\.png", must_stop=True),
+    "a single Gaussian": Fire(change=one_gaussian, learns=None),
+    "learning rates a hundred times too high": Fire(
+        change=hundredfold, learns=None, error="would remove all|NaN|infinite"
+    ),
+    "opacity resets with views of nothing": Fire(one_view_of_nothing, resets, learns=None),
+    "a range of a nanokelvin": Fire(lambda: replace(sound(), thermal_range=ThermalRange(15.0, 15.0 + 1e-9))),
+}
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    prepare_machine(before)
+
+
+@pytest.mark.parametrize("fire", FIRES)
+@pytest.mark.parametrize("method", ALL_METHODS)
+def test_a_run_learns_or_says_what_is_wrong(method, fire, tmp_path):
+    case = FIRES[fire]
+    plain = case.change(plain_config(tmp_path, method))
+    try:
+        module, losses = train(case.scene(), plain, tmp_path)
+    except CAUSE as error:
+        assert case.error is not None and re.search(case.error, str(error)), repr(error)
+    else:
+        assert not case.must_stop
+        assert len(losses) == STEPS and all(map(math.isfinite, losses))
+        assert all(bool(p.isfinite().all()) for p in module.parameters())
+        assert all(bool(module.predict(frame).isfinite().all()) for frame in module.scene.train.frames)
+        if case.learns is not None:
+            assert sum(losses[-30:]) < case.learns * sum(losses[:30])
+        assert "last.ckpt" in checkpoints(tmp_path)
+    for name, tensors in checkpoints(tmp_path).items():
+        assert [key for key, value in tensors.items() if not value.isfinite().all()] == [], name
+
+
+def test_equal_bounds_are_refused_by_name():
+    with pytest.raises(SceneError, match=r"thermal range 20.0 .. 20.0 °C is not a range"):
+        ThermalRange(20.0, 20.0)
