@@ -73,8 +73,9 @@ def struck(scene: Scene, name: str, every: int) -> tuple[Scene, torch.Tensor]:
     key, value = (HIDDEN | SEEN)[name]
     changed = torch.arange(COUNT) % every == 0
     tensor = getattr(scene, key).clone()
-    tensor[..., changed] = value.double() if key == "opacities" else tensor[..., changed]
-    if key != "opacities":
+    if key == "opacities":
+        tensor[:, changed] = value.double()
+    else:
         tensor[changed] = value.double()
     return rounded(replace(scene, **{key: tensor})), changed
 
