@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from renderers.test_contract import Scene, assert_finite, facing, oracle, relative, rounded, run, runnable
 
 COUNT = 60
-pytestmark = pytest.mark.slow  # until they have passed on an idle machine
 
 
 @pytest.fixture(autouse=True)
