@@ -93,7 +93,9 @@ class Pretrained:
     def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
         if not self.path.is_file():
-            raise SceneError(f"init.path={self.path}: there is no such file (a run that started from one needs it again)")
+            raise SceneError(
+                f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
+            )
         read = _splats_of_file if self.path.suffix == ".ply" else _splats_of_checkpoint
         geometry, wanted = read(self.path), len(thermal.opacity_channels)
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
