@@ -149,9 +149,12 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
         def maker(chosen: dict[str, Any]) -> Callable[[], Any]:
             return lambda: build(configured(chosen)["module"])
 
+        import torch
+
+        on_cpu = plain["trainer"]["accelerator"] == "cpu" or not torch.cuda.is_available()
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
-        found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"])
+        found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"], "cpu" if on_cpu else "cuda")
     for line in assembly.lines(assembly.told(verdicts, found)):
         log.info("%s", line)
     return configured(verdicts)

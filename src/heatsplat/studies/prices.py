@@ -33,7 +33,11 @@ class Price:
 
 
 def prices(
-    whole: Callable[[], Any], without: Mapping[str, Callable[[], Any]], scene: SceneData, max_steps: int
+    whole: Callable[[], Any],
+    without: Mapping[str, Callable[[], Any]],
+    scene: SceneData,
+    max_steps: int,
+    device: torch.device | str = "cpu",
 ) -> dict[str, Price]:
     """What each effect adds to a run, by name.
 
@@ -46,10 +50,11 @@ def prices(
         without: for each of them, makes the module without it.
         scene: to train on.
         max_steps: length of the run.
+        device: where the run trains.
     """
     if not without:
         return {}
-    models = {name: _Stepper(make(), scene, max_steps) for name, make in {"": whole, **without}.items()}
+    models = {name: _Stepper(make(), scene, max_steps, device) for name, make in {"": whole, **without}.items()}
     views = [scene.train[i] for i in range(min(len(scene.train), ROUNDS[1]))]
     best = dict.fromkeys(models, float("inf"))
     start = time.perf_counter()
@@ -74,14 +79,15 @@ def prices(
 class _Stepper:
     """Training steps of a module without a trainer."""
 
-    def __init__(self, module: Any, scene: SceneData, max_steps: int) -> None:
+    def __init__(self, module: Any, scene: SceneData, max_steps: int, device: torch.device | str) -> None:
         self.module = module
         module.attach(scene)
         self.per_gaussian = sum(tensor[0].numel() for tensor in module.splats.parameters())
         self.shared = sum(tensor.numel() for tensor in module.parameters()) - self.per_gaussian * len(module.splats)
         module.loss.prepare(scene, module.modality)
-        self.trainer = SimpleNamespace(max_steps=max_steps, global_step=max_steps - 1)  # a module holds it weakly
+        self.trainer = SimpleNamespace(max_steps=max_steps, global_step=max_steps - 1, world_size=1)
         module.trainer = self.trainer
+        module.to(device).on_fit_start()
         self.optimizer = module.configure_optimizers()["optimizer"]
 
     def step(self, view: Any) -> float:
@@ -91,6 +97,6 @@ class _Stepper:
         self.module.training_step(view, 0)["loss"].backward()
         self.module.on_after_backward()
         self.optimizer.step()
-        if torch.cuda.is_available() and self.module.device.type == "cuda":
+        if self.module.device.type == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter() - start
