@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from fake_run import HEIGHT, WIDTH, FakeModule, evaluate, events, fit, trainer, wall
 
-from heatsplat.callbacks.attributes import AttributeMaps, attribute_picture
+from heatsplat.callbacks.attributes import AttributeErrors, AttributeMaps, attribute_picture
 from heatsplat.callbacks.metrics import QualityMetrics, read_table
 from heatsplat.contracts import ViewSet
 
@@ -69,3 +70,44 @@ def test_companions_are_scored_as_images(tmp_path):
     assert abs(module.results.test["rgb_psnr"] - 20 * np.log10(1 / 0.05)) < 1e-4
     assert module.results.reasons["test.rgb_lpips"] == "not asked for"
     assert module.results.test["psnr"] != module.results.test["rgb_psnr"]
+
+
+class Knowing(FakeModule):
+    """Tells an absorptivity of 0.6 and a convection of 9 W/m²K of every Gaussian."""
+
+    def attributes(self, frame):
+        count = len(self.splats)
+        return {
+            "absorptivity": torch.full((count,), 0.6),
+            "convection": torch.full((count,), 9.0),
+            "age": torch.ones(count),
+        }
+
+
+class Table:
+    """A thermal model whose table says an absorptivity of 0.9."""
+
+    def prior(self, splats):
+        return {"absorptivity": torch.full((len(splats),), 0.9)}
+
+
+def test_errors_of_attributes_stand_beside_those_of_the_table(tmp_path):
+    def truth(points):
+        ones = torch.ones(len(points), dtype=torch.float64)
+        return {"absorptivity": 0.7 * ones, "convection_w_m2_k": 12.0 * ones, "biot": ones}
+
+    module = Knowing(replace(wall(), true_attributes=truth), tmp_path)
+    module.thermal.prior = Table().prior
+    evaluate(module, trainer(tmp_path, [AttributeErrors()]))
+    errors = module.results.data["attribute_errors"]
+    assert errors == {
+        "absorptivity": pytest.approx(0.1),
+        "convection": pytest.approx(3.0),
+        "absorptivity, table": pytest.approx(0.2),
+    }
+
+
+def test_scenes_without_true_attributes_have_no_errors(tmp_path):
+    module = Knowing(wall(), tmp_path)
+    evaluate(module, trainer(tmp_path, [AttributeErrors()]))
+    assert "attribute_errors" not in module.results.data

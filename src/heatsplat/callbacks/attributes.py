@@ -11,6 +11,7 @@ from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import file_stem, spread
 from heatsplat.contracts import Frame
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
+from heatsplat.metrics.attribute_errors import attribute_errors
 
 COLORMAP = "viridis"  # not that of temperatures
 
@@ -47,6 +48,29 @@ class AttributeMaps(pl.Callback):
             writer: Any = board(module)
             if writer is not None:
                 writer.add_image(f"attributes/{split}/{name}", picture, step, dataformats="HWC")
+
+
+class AttributeErrors(pl.Callback):
+    """Compares what the thermal model tells of its Gaussians with the truth, where the scene knows it.
+
+    Mean absolute errors over the Gaussians, weighted by their opacity, go into the data of metrics.json and the report;
+    beside each stands that of the table that training pulled it to. Where both are alike, nothing was learned.
+    """
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        frames = module.scene.test.frames
+        if module.scene.true_attributes is None or not len(frames):
+            return
+        told = module.attributes(frames[0])
+        if not told:
+            return
+        truth = module.scene.true_attributes(module.splats.means.detach().cpu())
+        opacity = module.splats.opacities[0].detach()
+        errors = attribute_errors(told, truth, opacity)
+        table = attribute_errors(module.thermal.prior(module.splats), truth, opacity)
+        found = errors | {f"{name}, table": error for name, error in table.items() if name in errors}
+        if found:
+            module.results.data["attribute_errors"] = found
 
 
 def attribute_picture(module: pl.LightningModule, frame: Frame) -> np.ndarray | None:

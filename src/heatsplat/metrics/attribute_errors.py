@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-# What models call an attribute -> what a scene's ``true_attributes`` calls it.
+# What models call an attribute -> what a scene's ``true_attributes`` calls it, and the factor from its unit to theirs.
 TRUE_NAMES = {
-    "emissivity": "emissivity",
-    "absorptivity": "absorptivity",
-    "convection": "convection_w_m2_k",
-    "capacity": "heat_capacity_j_m3_k",
+    "emissivity": ("emissivity", 1.0),
+    "absorptivity": ("absorptivity", 1.0),
+    "convection": ("convection_w_m2_k", 1.0),
+    "convection_w_m2_k": ("convection_w_m2_k", 1.0),
+    "capacity": ("heat_capacity_j_m3_k", 1.0),
+    "areal_heat_capacity_kj_m2_k": ("areal_heat_capacity_j_m2_k", 1e-3),
 }
 
 
@@ -30,9 +32,10 @@ def attribute_errors(
     """
     errors = {}
     for name, values in told.items():
-        if TRUE_NAMES.get(name, name) not in truth:
+        true_name, factor = TRUE_NAMES.get(name, (name, 1.0))
+        if true_name not in truth:
             continue
-        off = (values.double() - truth[TRUE_NAMES.get(name, name)].to(values.device).double()).abs()
+        off = (values.double() - factor * truth[true_name].to(values.device).double()).abs()
         share = (off.new_ones(len(off)) if weights is None else weights.double()) * ~off.isnan()
         if float(share.sum()) > 0:
             errors[name] = float((off.nan_to_num() * share).sum() / share.sum())

@@ -168,6 +168,10 @@ class ThermalModel(nn.Module, ABC):
         """Learning rate of the model's own parameter of that name, and the factor on it at the end of the run."""
         return self.lr, self.lr_end
 
+    def prior(self, splats: Splats) -> dict[str, Tensor]:
+        """What a table says of attributes that training pulls towards it, by name, each [N]; NaN where it says nothing."""
+        return {}
+
     def effects(self) -> dict[str, dict]:
         """The physical effects that the model simulates: catalogue name -> settings (for metrics.json)."""
         return {}

@@ -225,13 +225,18 @@ class SplatTraining(pl.LightningModule):
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
 
     @torch.no_grad()
+    def attributes(self, frame: Frame) -> dict[str, Tensor]:
+        """What the thermal model tells of every Gaussian at the time of ``frame``, by name, each [N]."""
+        return self.thermal.attributes(self.splats, _query(frame))
+
+    @torch.no_grad()
     def attribute_maps(self, frame: Frame) -> dict[str, Tensor]:
         """Images [H, W] of what the thermal model tells of its Gaussians (``ThermalModel.attributes``), by name.
 
         Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality; NaN where none
         is seen. Empty for models that tell nothing.
         """
-        told = self.thermal.attributes(self.splats, _query(frame))
+        told = self.attributes(frame)
         if not told:
             return {}
         values, opacities = torch.stack(list(told.values()), dim=1), self.splats.opacities[:1]
