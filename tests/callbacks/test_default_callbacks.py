@@ -49,6 +49,7 @@ def test_an_evaluation_has_the_measuring_part():
         "metrics",
         "images",
         "attributes",
+        "attribute_errors",
         "probes",
         "report",
     ]  # costs first, report last
