@@ -38,6 +38,7 @@ DOORS = {
     "omegaconf": {"cli"},
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
     "pycolmap": {"datamodules/formats"},
+    "pvlib": {"datamodules"},
     "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io"},
     "numba": {"kernels"},
     "gsplat": {"renderers"},

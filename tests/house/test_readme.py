@@ -57,7 +57,7 @@ def test_the_readme_names_its_main_commands():
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("python")])
 def test_python_commands_run(command, trained, data, tmp_path):
-    words = command.replace("RUN/", f"{trained}/").replace("/data/", f"{data}/").split()
+    words = command.replace("RUN", f"{trained}").replace("/data/", f"{data}/").split()
     words = [sys.executable, str(ROOT / words[1]), *words[2:]]
     if "train.py" in command:
         words += SHORT if "data=" not in command else SHORT[1:]
@@ -67,13 +67,15 @@ def test_python_commands_run(command, trained, data, tmp_path):
     elif "render.py" in command:
         words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
     else:
-        words += [f"hydra.run.dir={tmp_path}/evaluation"]
+        words += [f"hydra.run.dir={tmp_path}/done"]
     output = shell(words, tmp_path)
     if "train.py" in command or "evaluate.py" in command:
         assert "psnr" in output
         assert len(list(tmp_path.rglob("metrics.json"))) == (
             3 if " -m " in command else 5 if "ablation" in command else 1
         )
+    elif "study.py" in command:
+        assert (tmp_path / "done" / "frontier.html").exists()
     else:
         assert (tmp_path / "views" / "video.mp4").exists()
 
