@@ -285,12 +285,12 @@ PRESETS: dict[str, Preset] = {
         effects=_shows("relaxation", "harmonic_source", "fixed_pattern", "vignetting"),
     ),
     "blurred": Preset(
-        start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=replace(_GOOD, blur_px=1.4), effects=_shows("point_spread")
+        start_k=_WARM, held=True, surfaces=TABLE_TOP, flaws=replace(_GOOD, blur_px=1.2), effects=_shows("point_spread")
     ),
     "blurred_cooling": Preset(
         start_k=_WARM,
         surfaces=TABLE_TOP,
-        flaws=replace(_DARK_CORNERS, blur_px=1.4),
+        flaws=replace(_DARK_CORNERS, blur_px=1.2),
         effects=_shows("point_spread", "vignetting", "relaxation"),
     ),
     "bent_tone": Preset(

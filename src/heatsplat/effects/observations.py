@@ -201,9 +201,7 @@ def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> 
         points[followed], **{name: torch.stack(values, 1) if values else None for name, values in columns.items()}
     )
     seen = tracks.weights.sum(1)
-    often = seen >= max(LEAST_FRAMES, 0.4 * count)
-    if not often.any():
-        often = seen >= LEAST_FRAMES
+    often = seen >= max(LEAST_FRAMES, min(0.4 * count, 0.6 * float(seen.quantile(0.9))))
     if not often.any():
         return None
     tracks = tracks.of(often.nonzero()[:, 0])

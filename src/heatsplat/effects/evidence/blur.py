@@ -15,7 +15,7 @@ SHARPEST = 0.1  # of the strong edges, the share that is judged: others are grad
 CLEAR = 20.0  # an edge is strong when it is this many times the noise high
 FEWEST = 30
 # The width of a step that is no wider than the pixel that collects it, and one of which the reconstruction should know.
-PIXEL_PX, WIDE_PX = 0.45, 0.5
+PIXEL_PX, WIDE_PX = 0.45, 0.75
 
 
 def point_spread(obs: Observations) -> Evidence:

@@ -26,6 +26,8 @@ def conduction(obs: Observations) -> Evidence:
     if found is None or obs.times_s is None:
         return Evidence(None, obs.why or "no point can be followed over time")
     fit, model = found
+    if fit.drivers is not None:
+        return Evidence(0.0, "levels follow the weather, so that nobody knows how fast they would fade by themselves")
     if "relaxation" not in model.own or "harmonic_source" in model.own:
         why = "a source hides how contrasts fade" if "harmonic_source" in model.own else "nothing changes over time"
         return Evidence(0.0, f"{why}, so that no flow between neighbours shows")

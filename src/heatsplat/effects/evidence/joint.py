@@ -25,28 +25,38 @@ from heatsplat.effects.observations import Tracks
 
 # Mixtures of these decays, as rates times the record's length, stand for any course that relaxes: the surface of a deep
 # body does not follow one exponential. Within 0.5 % of the excess for slabs of Biot number 0 to 3.
-DECAYS = (0.7, 3.0, 12.0)
+DECAYS = (0.6, 2.5, 9.0, 40.0)
+LONG = 24  # observations of a point from which all of these can be told apart; below that, DECAYS_FEW
+DECAYS_FEW = (0.7, 3.0, 12.0)
 # Courses over time that points share: one source and bodies that follow it more or less slowly need a few.
 COURSES = (1, 2, 3)
+STRENGTHS = 12  # iterations for the strength of a random pattern
 SWEEPS = 4  # of alternating least squares for them
 NODES = 5  # of the grids on which a fixed pattern is looked for
 OUTLIER = 5.0  # an observation this many times the usual residual away counts nothing (Tukey's weights)
 DISTRUSTED = 0.15  # share of the points, those that are fitted worst, that is left out: edges and hidden points
 # No fit is taken to be better than this, in squares of the expected error: a value between four pixels is less noisy.
 FLOOR = 0.1
+# Structure from motion reports 0.4 pixels at most; below a twentieth nothing depends on it.
+LEAST_ASTRAY_PX, MOST_ASTRAY_PX = 0.05, 0.4
+MEDIAN_OF_CHI2 = 0.455  # of one degree of freedom
 FEW = 4.0  # how many observations the usual residual counts for beside a point's own
 LEAST_FREE = 4  # observations of a point that its own parameters must leave free
 RIDGE = 1e-9
 
 # What an effect has to gain over the cost of its parameters. Points at edges look different from every place and hence at
 # every time, which gives a point's own parameters up to 1.5 on scenes of which it is known that nothing changes.
-OWN_HURDLE, SHARED_HURDLE = 2.0, 1.2
-SMALLEST = 0.1  # an effect whose size is less than this share of the expected error is left out
+OWN_HURDLE, SHARED_HURDLE = 2.5, 1.3
+# An effect whose size is less than this share of the expected error is left out. Points that lie astray go with distance
+# and direction a little.
+SMALLEST, SMALLEST_PATH = 0.1, 0.2
 # In a scene that changes: share of its changes that a sensor's effect must exceed.
-BESIDE_CHANGES = {"agc": 0.1, "frame_offset": 0.03, "fixed_pattern": 0.04, "vignetting": 0.04}
-BESIDE_CHANGES |= {"reflection": 0.04, "tone": 0.01}
+BESIDE_CHANGES = {"harmonic_source": 0.15, "agc": 0.1, "frame_offset": 0.03, "reflection": 0.04, "tone": 0.01}
+IN_COMMON = 0.15  # share of what half of the points leave that the other half has to explain
+BESIDE_WEATHER = 0.2  # of any effect, where a weather record, whose answers are rough, explains the changes
 # In the order in which they act on an image.
 SHARED = ("reflection", "fixed_pattern", "vignetting", "agc", "frame_offset", "tone")
+SENSOR_FIRST = ("fixed_pattern", "vignetting", "frame_offset", "tone")
 OWN = ("relaxation", "harmonic_source", "view_dependence")
 
 
@@ -105,6 +115,7 @@ class Joint:
         ambient: image value of the surroundings, or None.
         noise: of a pixel, in image units.
         normals: [P, 3] of the surface at the points, or None.
+        drivers: [F, k] how surfaces answer a weather record, which then stands for relaxation, or None.
     """
 
     tracks: Tracks
@@ -112,6 +123,7 @@ class Joint:
     ambient: float | None
     noise: float
     normals: Tensor | None = None
+    drivers: Tensor | None = None
     weights: Tensor = field(init=False)
     trust: Tensor = field(init=False)
     fits: dict[Model, Fitted] = field(default_factory=dict)
@@ -119,15 +131,23 @@ class Joint:
     _known: dict[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._expect(0.4)
+        self._expect(MOST_ASTRAY_PX)
         self.trust = torch.ones(len(self.weights), dtype=self.weights.dtype)
         self.weigh(self.rich)
+        self._expect(self._astray_px())
+        self.weigh(self.rich)
+
+    def _astray_px(self) -> float:
+        """How many pixels a point's place in an image is off by, from what steep places leave more than even ones."""
         used = self.weights > 0
         left, slopes = self.residuals(self.rich)[used], self.tracks.slopes[used]
-        steep = slopes > slopes.median()
-        astray = (float(left[steep].square().median()) / 0.455 - self.noise**2) / float(slopes[steep].square().median())
-        self._expect(math.sqrt(min(max(astray, 0.05**2), 0.4**2)))
-        self.weigh(self.rich)
+        steep = slopes > slopes.median() if len(slopes) else used[used]
+        if not steep.any():
+            return LEAST_ASTRAY_PX
+        squared = (float(left[steep].square().median()) / MEDIAN_OF_CHI2 - self.noise**2) / float(
+            slopes[steep].square().median()
+        )
+        return math.sqrt(min(max(squared, LEAST_ASTRAY_PX**2), MOST_ASTRAY_PX**2))
 
     def _expect(self, astray_px: float) -> None:
         """Sets the errors to be expected where a point's place in an image is known to so many pixels."""
@@ -149,12 +169,16 @@ class Joint:
         """Numbers of common courses that the record has frames for."""
         if self._span <= 0:
             return []
-        return [count for count in COURSES if count <= self._usual_length - 1 - len(DECAYS) - LEAST_FREE]
+        return [count for count in COURSES if count <= self._usual_length - 1 - self._decays.shape[1] - LEAST_FREE]
 
     def candidates(self, model: Model) -> list[tuple[str, Model]]:
         """Models with one effect more, by its name."""
         found = []
-        if self._span > 0 and "relaxation" not in model.own and self._usual_length >= LEAST_FREE + 1 + len(DECAYS):
+        if (
+            self._span > 0
+            and "relaxation" not in model.own
+            and self._usual_length >= LEAST_FREE + 1 + self._decays.shape[1]
+        ):
             found.append(("relaxation", replace(model, own=model.own | {"relaxation"})))
         for count in self.allowed():
             if count > model.courses:
@@ -177,16 +201,56 @@ class Joint:
         return self.fits[model]
 
     def selected(self) -> Model:
-        """The model that explains most with least, found one effect at a time."""
-        model = Model()
+        """The model that explains most with least.
+
+        Effects are taken in one at a time, in two orders: whichever explains most, and those of the sensor first. A change
+        of all points in common is cheap as an offset and dear as courses of every point, but the courses explain more at
+        once: only the ends of the two ways tell which was right.
+        """
+        start = (self.weights, self.trust)
+        ends = []
+        for first in (SENSOR_FIRST, ()):
+            self._restart(start)
+            model = self._grown(Model(), first) if first else Model()
+            model = self._grown(model, (*SHARED, *OWN, "attenuation"))
+            if model not in ends:
+                ends.append(model)
+        model = min(ends, key=lambda one: self._compared(one, start))
+        self._restart(start)
+        self._accept(model)
+        self._accept(model)
+        return self._pruned(model)
+
+    def _compared(self, model: Model, start: tuple[Tensor, Tensor]) -> float:
+        self._restart(start)
+        for _ in range(2):
+            self._known = self.contributions(model)
+            self._scenes.clear()
+        self.fits.clear()
+        return self.fitted(model).bic
+
+    def _restart(self, start: tuple[Tensor, Tensor]) -> None:
+        self.weights, self.trust = start
+        self._known = {}
+        self._scenes.clear()
+        self._courses.clear()
+        self.fits.clear()
+
+    def _grown(self, model: Model, names: tuple[str, ...]) -> Model:
+        """A model with those effects among ``names`` that earn their place, and without those that no longer do."""
+        seen = {model}
         for _ in range(12):
-            found = [(name, more) for name, more in self.candidates(model) if self._earns(more, model, name)]
-            best = min(found, key=lambda pair: self.fitted(pair[1]).bic, default=None)
-            if best is None or self.fitted(best[1]).bic >= self.fitted(model).bic:
+            tried = [(name, more) for name, more in self.candidates(model) if name in names]
+            found = [more for name, more in tried if self._earns(more, model, name)]
+            best = min(found, key=lambda more: self.fitted(more).bic, default=None)
+            if best is None or self.fitted(best).bic >= self.fitted(model).bic:
                 break
-            model = self._pruned(best[1])
+            model = self._pruned(best)
             self._accept(model)
-        return model
+            if model in seen:
+                break
+            seen.add(model)
+        return self._pruned(model)
 
     def _earns(self, more: Model, less: Model, name: str) -> bool:
         hurdle = OWN_HURDLE if name in OWN else SHARED_HURDLE
@@ -196,11 +260,39 @@ class Joint:
         """Whether what an effect adds is large enough beside the noise, and beside what the scene does by itself: how a
         model of the scene's changes errs is easily taken for a small flaw of the sensor."""
         size = self.effect_size(more, less)
-        if size < SMALLEST:
+        if size < (SMALLEST_PATH if name in ("attenuation", "reflection") else SMALLEST):
             return False
-        if name in OWN or name == "attenuation" or "relaxation" not in less.own:
+        if name in ("agc", "frame_offset") and self._may_change(less) and not self._in_common(more, less):
+            return False
+        if "relaxation" not in less.own:
             return True
-        return size > BESIDE_CHANGES[name] * self.effect_size(less, less.without("relaxation"))
+        share = BESIDE_CHANGES.get(name, 0.0) if self.drivers is None else BESIDE_WEATHER
+        return size > share * self.effect_size(less, less.without("relaxation"))
+
+    def _may_change(self, model: Model) -> bool:
+        return self.drivers is not None or "relaxation" in model.own
+
+    def _in_common(self, more: Model, less: Model) -> bool:
+        """Whether what the points that change most say of every image holds for those that change least, and conversely.
+
+        A sensor changes all points alike; a lamp does not.
+        """
+        weights, values = self.weights, self.tracks.values
+        used = weights > 0
+        mean = (values * used).sum(1) / used.sum(1).clamp_min(1)
+        change = (((values - mean[:, None]) ** 2 * used).sum(1) / used.sum(1).clamp_min(1)).sqrt()
+        loud = change > change[used.any(1)].median()
+        before = self.weights * self.residuals(less) ** 2 / self.trust[:, None]
+        _, basis, _ = self._own(more)
+        for known, asked in ((loud, ~loud), (~loud, loud)):
+            self.weights = weights * known[:, None]
+            added = sum(self.contributions(more).values())
+            self.weights = weights
+            left = self._own(more)[0] - added
+            after = weights * (left - self._own_part(basis, left)) ** 2 / self.trust[:, None]
+            if float(after[asked].sum()) > (1.0 - IN_COMMON) * float(before[asked].sum()):
+                return False
+        return True
 
     def _pruned(self, model: Model) -> Model:
         while True:
@@ -288,7 +380,7 @@ class Joint:
         gram = self._gram(basis, torch.cat([logs[..., None], columns], 2), weights)
         ridge = 1e-8 * gram.diagonal()[1:].mean().clamp_min(1e-300) * torch.eye(columns.shape[2], dtype=gram.dtype)
         thickness = -torch.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])
-        thickness = thickness.clamp(-3.0, 3.0)
+        thickness = thickness.clamp(0.0, 3.0)  # air only takes away
         return torch.exp(-(columns @ thickness)), len(thickness)
 
     def _gram(self, basis: Tensor, columns: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -348,8 +440,10 @@ class Joint:
     def rich(self) -> Model:
         """A model that follows most things; what it leaves tells good points from bad ones before anything is known."""
         allowed = [count for count in self.allowed() if count <= 1]
-        own = {"relaxation", "harmonic_source"} if allowed else ({"relaxation"} if self._span > 0 else set())
-        return Model(frozenset(own), frozenset({"frame_offset", "agc"}), max(allowed, default=0))
+        changes = self._span > 0 and self._usual_length >= 2 * (1 + len(self._rates))
+        own = {"relaxation", "harmonic_source"} if changes and allowed else ({"relaxation"} if changes else set())
+        shared = frozenset({"frame_offset", "agc"})
+        return Model(frozenset(own), shared, max(allowed, default=0) if "harmonic_source" in own else 0)
 
     def weigh(self, model: Model) -> None:
         """Weighs observations by how well a model explains them and their point: outliers not at all, and a point by its
@@ -376,6 +470,10 @@ class Joint:
     def _usual_length(self) -> float:
         return float(self.tracks.weights.sum(1).median())
 
+    @property
+    def _rates(self) -> tuple[float, ...]:
+        return DECAYS if self._usual_length >= LONG else DECAYS_FEW
+
     @cached_property
     def _moves(self) -> bool:
         """Whether points are seen from several places."""
@@ -383,8 +481,10 @@ class Joint:
 
     @cached_property
     def _decays(self) -> Tensor:
+        if self.drivers is not None:
+            return self.drivers
         passed = (self.times_s - self.times_s.min()) / self._span
-        return torch.exp(-passed[:, None] * torch.tensor(DECAYS, dtype=torch.float64))
+        return torch.exp(-passed[:, None] * torch.tensor(self._rates, dtype=torch.float64))
 
     def common_courses(self, count: int) -> Tensor:
         """Courses over time [F, count] by which points depart from relaxation, each in its own measure.
@@ -463,6 +563,37 @@ class Joint:
             criteria.append(float((counts[used] * variance.log()).sum()))
         cost = costs[1] - costs[0]
         return (criteria[0] - criteria[1]) / cost if cost > 0 else 0.0
+
+    def radial_gain(self, model: Model) -> float:
+        """What a falloff gains when the rest of the pattern is a random field as strong as it turns out to be.
+
+        A random field has a radial part, too; a falloff is there when that part stands out of what its other parts lead
+        one to expect. The strength of the field is found by expectation and maximisation.
+        """
+        none = replace(model, shared=model.shared - {"vignetting", "fixed_pattern"})
+        shared = self._shared(none)
+        image = self._scenes[replace(model, shared=frozenset())]
+        values, basis, _ = self._own(none)
+        radial, field = self._vignetting(image), self._fixed_pattern(image)
+        columns = torch.cat([values[..., None], field, radial, *shared.values()], dim=2)
+        gram = self._gram(basis, columns)
+        scale = gram.diagonal()[1:].clamp_min(1e-150).rsqrt()
+        inner, right = scale[:, None] * gram[1:, 1:] * scale, scale * gram[1:, 0]
+        inner = inner + 1e-8 * torch.eye(len(inner), dtype=inner.dtype)
+        n, half = field.shape[2], field.shape[2] // 2
+        loose = torch.zeros(len(inner), dtype=inner.dtype)  # inverse variances of the field's nodes in scaled units
+        loose[:n] = 1e-2 / scale[:n] ** 2
+        for _ in range(STRENGTHS):
+            inverse = torch.linalg.inv(inner + loose.diag())
+            found = ((inverse @ right) ** 2 + inverse.diagonal()) * scale**2
+            for part in (slice(0, half), slice(half, n)):
+                loose[part] = 1.0 / (found[part].mean().clamp_min(1e-12) * scale[part] ** -2)
+        kept = torch.ones(len(inner), dtype=torch.bool)
+        kept[n : n + radial.shape[2]] = False
+        penalised = inner + loose.diag()
+        whole = right @ torch.linalg.solve(penalised, right)
+        less = right[kept] @ torch.linalg.solve(penalised[kept][:, kept], right[kept])
+        return float(whole - less) / (radial.shape[2] * math.log(max(self.observations, 3)))
 
     def falloff(self, model: Model) -> float:
         """By what share the image is brighter in its corners than in its middle; negative where it fades."""

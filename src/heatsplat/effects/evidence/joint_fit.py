@@ -7,13 +7,11 @@ from dataclasses import replace
 import torch
 
 from heatsplat.effects.base import Evidence
-from heatsplat.effects.evidence import harmonics, surface
+from heatsplat.effects.evidence import harmonics, record, surface
 from heatsplat.effects.evidence.joint import OWN_HURDLE, SHARED_HURDLE, Joint, Model
 from heatsplat.effects.observations import Observations
 
 __all__ = ["OWN_HURDLE", "SHARED_HURDLE"]
-
-RADIAL_SHARE = 0.3  # of what a whole pattern explains: more than a random one leaves to two radial numbers
 
 
 def joint(obs: Observations) -> tuple[Joint, Model] | None:
@@ -21,7 +19,7 @@ def joint(obs: Observations) -> tuple[Joint, Model] | None:
     if obs.tracks is None:
         return None
     if "joint" not in obs.found:
-        fit = Joint(obs.tracks, obs.times_s, obs.ambient, obs.noise, surface.normals(obs))
+        fit = Joint(obs.tracks, obs.times_s, obs.ambient, obs.noise, surface.normals(obs), record.drivers(obs))
         obs.found["joint"] = (fit, fit.selected()) if fit.observations > 0 else None
     return obs.found["joint"]
 
@@ -33,7 +31,8 @@ def relaxation(obs: Observations) -> Evidence:
 
 def harmonic_source(obs: Observations) -> Evidence:
     """Whether something drives the scene, and how many harmonics say how."""
-    evidence = _evidence(obs, "harmonic_source", "points depart from any relaxation by")
+    beside = "any relaxation" if obs.scene.weather is None else "what the weather does"
+    evidence = _evidence(obs, "harmonic_source", f"points depart from {beside} by")
     found = joint(obs)
     if found is None or "harmonic_source" not in found[1].own:
         return evidence
@@ -110,20 +109,20 @@ def _pattern(obs: Observations, name: str, sentence: str) -> Evidence:
     radial = replace(none, shared=none.shared | {"vignetting"})
     uneven = replace(none, shared=none.shared | {"fixed_pattern"})
     whole = replace(none, shared=none.shared | both)
-    lost = fit.fitted(none).squares - fit.fitted(whole).squares
-    share = (fit.fitted(none).squares - fit.fitted(radial).squares) / lost if lost > 0 else 0.0
-    falls = fit.falloff(radial) < 0
-    is_radial = share > RADIAL_SHARE and falls
+    falloff, radially = fit.falloff(radial), fit.radial_gain(model)
+    fades = falloff < 0 and radially > SHARED_HURDLE
     if name == "vignetting":
-        gain, size, able = fit.gain(radial, none), fit.effect_size(radial, none), is_radial
-        why = f"; it is {100 * max(share, 0):.0f} % of what any pattern explains" + ("" if falls else " and no falloff")
-    else:
-        less = radial if is_radial else none
-        more = whole if is_radial else uneven
-        gain, size, why = fit.gain(more, less), fit.effect_size(more, less), ""
-        able = True
-    able = able and fit.worthwhile(whole if name == "vignetting" and is_radial else uneven, none, name)
-    return Evidence(gain if able else min(gain, 0.0), f"{sentence} {_beside(size)}{why}")
+        size = fit.effect_size(radial, none)
+        why = f"{sentence} {_beside(size)} ({100 * falloff:+.0f} % in the corners)"
+        if falloff >= 0:
+            return Evidence(min(radially, 0.0), f"{why}, which is no falloff")
+        return Evidence(radially if fit.worthwhile(radial, none, name) else 0.0, why)
+    more, less = (whole, radial) if fades else (uneven, none)
+    size = fit.effect_size(more, less)
+    return Evidence(
+        fit.gain(more, less) if fit.worthwhile(more, less, name) else 0.0,
+        f"{sentence} {_beside(size)}" + (" beside the falloff" if fades else ""),
+    )
 
 
 def _evidence(obs: Observations, name: str, sentence: str) -> Evidence:

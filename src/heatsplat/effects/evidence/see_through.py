@@ -9,6 +9,7 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData
 from heatsplat.effects.base import Evidence
+from heatsplat.effects.evidence.joint_fit import joint
 from heatsplat.effects.observations import LEAST_FRAMES, MOST_FRAMES, NEARER, Observations, between, spread
 from heatsplat.geometry.projection import to_camera, to_pixels
 
@@ -32,6 +33,10 @@ def thermal_opacity(obs: Observations) -> Evidence:
     if votes is None:
         return Evidence(None, "not every training view has a visible image of the thermal image's size")
     thermal, visible = votes
+    found = joint(obs)
+    if found is not None and "relaxation" in found[1].own:
+        # What is lit or cools changes by itself, so that a thermal image that varies says nothing of what it shows.
+        thermal = thermal.clamp_min(0)
     sure = (thermal != 0) & (visible != 0)
     n, apart = int(sure.sum()), int((thermal[sure] != visible[sure]).sum())
     if n < LEAST_VOTES:

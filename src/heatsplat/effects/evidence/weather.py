@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Weather
 from heatsplat.effects.base import Evidence
+from heatsplat.effects.evidence import record
 from heatsplat.effects.evidence.joint_fit import joint
 from heatsplat.effects.observations import Observations
 
 HURDLE = 2.0
-RATES_PER_S = (1 / 900.0, 1 / 5400.0, 1 / 32400.0)  # of bodies that follow within a quarter, 1.5 and 9 hours
 MEAN_K = 290.0
 
 
@@ -20,7 +19,11 @@ def solar(obs: Observations) -> Evidence:
     weather = obs.scene.weather
     if weather.irradiance_w_m2 is None or float(weather.irradiance_w_m2.max()) <= 0:
         return Evidence(None, "the record has no irradiance, or the sun does not shine in it")
-    return _driven(obs, weather, ("air_c", "irradiance_w_m2"), ("air_c",), "sunlight explains")
+    found = joint(obs)
+    if found is None:
+        return Evidence(None, obs.why)
+    gain = found[0].explained(record.drivers(obs), record.of_the_air(obs))
+    return Evidence(gain, f"sunlight explains {gain:.1f} times what its numbers for each point cost, beside the air")
 
 
 def radiation(obs: Observations) -> Evidence:
@@ -51,8 +54,8 @@ def convection(obs: Observations) -> Evidence:
         return Evidence(None, "the record has no wind, or no air temperature")
     if obs.tracks is None or obs.times_s is None:
         return Evidence(None, obs.why)
-    wind = _at(weather, weather.wind_m_s, obs.times_s)
-    air = obs.scene.thermal_range.to_unit(_at(weather, weather.air_c, obs.times_s))
+    wind = record.at(weather, weather.wind_m_s, obs.times_s)
+    air = obs.scene.thermal_range.to_unit(record.at(weather, weather.air_c, obs.times_s))
     exchange = 5.0 + 3.0 * wind
     change = (exchange - exchange.mean()) / exchange.mean()
     above = torch.where(obs.tracks.weights > 0, obs.tracks.values - air, torch.nan)
@@ -63,43 +66,6 @@ def convection(obs: Observations) -> Evidence:
         f"wind of {float(wind.min()):.1f} to {float(wind.max()):.1f} m/s changes the exchange by up to "
         f"{100 * float(change.abs().max()):.0f} %, worth {obs.size(typical)} of what surfaces are above the air",
     )
-
-
-def _driven(
-    obs: Observations, weather: Weather, drivers: tuple[str, ...], without: tuple[str, ...], sentence: str
-) -> Evidence:
-    found = joint(obs)
-    if found is None:
-        return Evidence(None, obs.why)
-    fit = found[0]
-    gain = fit.explained(_responses(weather, drivers, obs.times_s), _responses(weather, without, obs.times_s))
-    return Evidence(gain, f"{sentence} {gain:.1f} times what its numbers for each point cost, beside the air")
-
-
-def _responses(weather: Weather, names: tuple[str, ...], times_s: Tensor) -> Tensor:
-    """How bodies of several rates follow series of the record, [T, names · rates], centred and of unit size."""
-    grid, columns = weather.times_s, []
-    steps = grid.diff()
-    for name in names:
-        series = getattr(weather, name)
-        series = series - series.mean()
-        for rate in RATES_PER_S:
-            state = torch.zeros_like(series)
-            keep = torch.exp(-rate * steps)
-            middle = 0.5 * (series[1:] + series[:-1])
-            for i in range(len(steps)):
-                state[i + 1] = keep[i] * state[i] + (1 - keep[i]) * middle[i]
-            columns.append(_at(weather, state, times_s))
-    result = torch.stack(columns, 1)
-    result = result - result.mean(0)
-    return result / result.norm(dim=0).clamp_min(1e-12)
-
-
-def _at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:
-    above = torch.searchsorted(weather.times_s, times_s).clamp(1, len(weather.times_s) - 1)
-    before, after = weather.times_s[above - 1], weather.times_s[above]
-    share = ((times_s - before) / (after - before)).clamp(0, 1)
-    return series[above - 1] * (1 - share) + series[above] * share
 
 
 def _span(values: Tensor) -> float:

@@ -1,0 +1,57 @@
+"""How surfaces of several rates answer a weather record."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Weather
+from heatsplat.effects.observations import Observations
+
+QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
+
+
+def drivers(obs: Observations) -> Tensor | None:
+    """Answers [F, k] to air and sun at the frames' times, of unit size; None without a record."""
+    weather = obs.scene.weather
+    if weather is None or obs.times_s is None:
+        return None
+    found = [of_the_air(obs)]
+    if weather.irradiance_w_m2 is not None:
+        found.append(_answers(weather, weather.irradiance_w_m2, (QUICK_PER_S, SLOW_PER_S), obs.times_s))
+    if weather.direct_w_m2 is not None and weather.sun is not None:
+        # Walls that face the morning and walls that face the evening: the sun's way along the ground.
+        level = weather.sun - (weather.sun @ weather.up)[:, None] * weather.up
+        _, _, axes = torch.linalg.svd(level - level.mean(0), full_matrices=False)
+        found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), obs.times_s))
+    return torch.cat(found, 1)
+
+
+def of_the_air(obs: Observations) -> Tensor:
+    """Answers [F, k] to the air alone; k = 0 where the record lacks it."""
+    weather = obs.scene.weather
+    if weather.air_c is None:
+        return torch.zeros(len(obs.times_s), 0, dtype=torch.float64)
+    return _answers(weather, weather.air_c, (SLOW_PER_S,), obs.times_s)
+
+
+def at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:
+    """A series of the record at times within it, linear between samples; its ends beyond."""
+    above = torch.searchsorted(weather.times_s, times_s).clamp(1, len(weather.times_s) - 1)
+    before, after = weather.times_s[above - 1], weather.times_s[above]
+    share = ((times_s - before) / (after - before)).clamp(0, 1)
+    return series[above - 1] * (1 - share) + series[above] * share
+
+
+def _answers(weather: Weather, series: Tensor, rates: tuple[float, ...], times_s: Tensor) -> Tensor:
+    """What bodies of these rates make of a series, [F, rates]: centred, of unit size."""
+    series, steps = series - series.mean(), weather.times_s.diff()
+    columns = []
+    for rate in rates:
+        keep, state = torch.exp(-rate * steps), torch.zeros_like(series)
+        for i in range(len(steps)):
+            state[i + 1] = keep[i] * state[i] + (1 - keep[i]) * 0.5 * (series[i] + series[i + 1])
+        columns.append(at(weather, state, times_s))
+    found = torch.stack(columns, 1)
+    found = found - found.mean(0)
+    return found / found.norm(dim=0).clamp_min(1e-12)

@@ -1,0 +1,154 @@
+"""Whether the verdicts on effects are right where truth is known: scenes of known effects, and the page docs/effects.md."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.effects.base import Verdict
+from heatsplat.effects.catalogue import CATALOGUE, decide
+
+log = logging.getLogger("heatsplat")
+
+HEAD = """# Effects: what a scene may call for, and how that is told
+
+This page is generated: `python src/study.py study=evidence`. An effect is simulated where its evidence exceeds its
+threshold; evidence is a statistic on the training images that stays below about 1 under the null hypothesis. Effects that
+look alike one by one are told apart by one joint fit of all of them to tracks of scene points (`effects/evidence/joint.py`):
+each has to lower a Bayesian information criterion in the presence of the others. Where metadata is missing an effect is
+off, and the reason says so. `effects.<name>=on|off` overrules the evidence.
+"""
+COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The verdicts on one scene.
+
+    Args:
+        scene, size, seed: which one.
+        present: names of the effects that it shows in truth.
+        verdicts: by name.
+        seconds: what deciding took.
+    """
+
+    scene: str
+    size: str
+    seed: int
+    present: frozenset[str]
+    verdicts: Mapping[str, Verdict]
+    seconds: float
+
+    @property
+    def found(self) -> frozenset[str]:
+        """Names of the effects that are on."""
+        return frozenset(name for name, verdict in self.verdicts.items() if verdict.on)
+
+    @property
+    def wrong(self) -> int:
+        """How many verdicts are wrong."""
+        return len(self.found ^ self.present)
+
+
+def run(
+    output_dir: Path | str,
+    data: Callable[..., Any],
+    scenes: Sequence[str],
+    sizes: Sequence[str] = ("tiny",),
+    seeds: int = 5,
+    document: str | None = None,
+) -> str:
+    """The page, also written to effects.md in ``output_dir`` and to ``document``.
+
+    Args:
+        output_dir: folder of the results.
+        data: makes the data module of a scene from ``scene``, ``size`` and ``scene_seed``; its notes name the "effects".
+        scenes, sizes: every pair of them is judged.
+        seeds: how many recordings of each.
+        document: file that is written besides; None for none.
+    """
+    torch.set_num_threads(1)  # small tensors
+    outcomes = []
+    for size in sizes:
+        for scene in scenes:
+            outcomes += [judged(data, scene, size, seed) for seed in range(seeds)]
+    text = written(outcomes)
+    Path(output_dir).mkdir(parents=True, exist_ok=True)
+    for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
+        path.write_text(text, encoding="utf-8")
+    log.info("%s", text)
+    return text
+
+
+def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcome:
+    """The verdicts on one recording of a scene.
+
+    Raises:
+        SceneError: nobody knows what effects the scene shows.
+    """
+    recorded = data(scene=scene, size=size, scene_seed=seed).scene
+    if "effects" not in recorded.notes:
+        raise SceneError(
+            f"scene '{recorded.name}' does not say in its notes which effects it shows; judge synthetic ones"
+        )
+    start = time.perf_counter()
+    verdicts = decide(recorded)
+    outcome = Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, time.perf_counter() - start)
+    for name in sorted(outcome.found ^ outcome.present):
+        log.info("%s %s %d: %s is %s", scene, size, seed, name, "missed" if name in outcome.present else "not there")
+        log.info("    %s", verdicts[name].reason)
+    return outcome
+
+
+def written(outcomes: Sequence[Outcome]) -> str:
+    """The page."""
+    lines = [HEAD, "## The catalogue\n", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
+    for effect in CATALOGUE:
+        needs = ", ".join(sorted(effect.needs)) or "images"
+        lines.append(
+            f"| {effect.name} | {effect.stage} | {effect.summary} | {effect.source} | {needs} | {effect.null} | "
+            f"{effect.threshold:g} | {effect.adds} |"
+        )
+    for size in dict.fromkeys(outcome.size for outcome in outcomes):
+        lines += _confusion(size, [outcome for outcome in outcomes if outcome.size == size])
+    return "\n".join(lines) + "\n"
+
+
+def _confusion(size: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """How verdicts and truth agree at a size: one table by effect, one by scene."""
+    cases = len(outcomes) * len(CATALOGUE)
+    right = cases - sum(outcome.wrong for outcome in outcomes)
+    clean = sum(outcome.wrong == 0 for outcome in outcomes)
+    seconds = sorted(outcome.seconds for outcome in outcomes)[len(outcomes) // 2]
+    lines = [
+        f"\n## Verdicts against truth, {size}\n",
+        f"{right} of {cases} verdicts are right ({100 * right / cases:.1f} %); {clean} of {len(outcomes)} scenes have not a "
+        f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
+        "| effect | present: found | present: missed | absent: left out | absent: taken in |",
+        "|---|---|---|---|---|",
+    ]
+    for effect in CATALOGUE:
+        with_it = [effect.name in outcome.found for outcome in outcomes if effect.name in outcome.present]
+        without = [effect.name in outcome.found for outcome in outcomes if effect.name not in outcome.present]
+        counts = (sum(with_it), len(with_it) - sum(with_it), len(without) - sum(without), sum(without))
+        lines.append(f"| {effect.name} | " + " | ".join(map(str, counts)) + " |")
+    lines += ["\n| scene | shows | right | missed | taken in |", "|---|---|---|---|---|"]
+    for scene in dict.fromkeys(outcome.scene for outcome in outcomes):
+        these = [outcome for outcome in outcomes if outcome.scene == scene]
+        missed = [name for outcome in these for name in sorted(outcome.present - outcome.found)]
+        taken = [name for outcome in these for name in sorted(outcome.found - outcome.present)]
+        shows = ", ".join(sorted(these[0].present)) or "nothing"
+        good = sum(outcome.wrong == 0 for outcome in these)
+        lines.append(f"| {scene} | {shows} | {good} of {len(these)} | {_counted(missed)} | {_counted(taken)} |")
+    return lines
+
+
+def _counted(names: Sequence[str]) -> str:
+    return ", ".join(f"{name} ({names.count(name)})" for name in sorted(set(names)))

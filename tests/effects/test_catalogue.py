@@ -1,0 +1,94 @@
+"""The catalogue and its verdicts: wishes, missing metadata, and scenes in which there is nothing to see."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.effects.base import STAGES
+from heatsplat.effects.catalogue import CATALOGUE, decide
+
+NAMES = (
+    "relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction", "view_dependence", "reflection",
+    "attenuation", "thermal_opacity", "frame_offset", "agc", "fixed_pattern", "vignetting", "tone", "point_spread",
+)  # fmt: skip
+
+
+def scene_of(images, times=None, points=0, thermal_range=None) -> SceneData:
+    """A scene of these images [F, H, W] by a camera that moves sideways along a plane of points."""
+    height, width = images.shape[1:]
+    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+    frames = []
+    for i in range(len(images)):
+        viewmat = torch.eye(4)
+        viewmat[0, 3] = -0.05 * i
+        frames.append(Frame(f"{i:03d}.png", i, Camera(viewmat, K, width, height), None if times is None else times[i]))
+    views = ViewSet(frames, lambda i: View(frames[i], images[i, ..., None].float()))
+    generator = torch.Generator().manual_seed(0)
+    spots = torch.rand(points, 3, generator=generator) * torch.tensor([2.0, 1.0, 0.0]) + torch.tensor([-0.5, -0.5, 2.0])
+    empty = views.subset([])
+    return SceneData("made", views, empty, empty, spots, thermal_range=thermal_range)
+
+
+def noise(frames: int, seed: int = 0, size: tuple[int, int] = (24, 32)) -> torch.Tensor:
+    return 0.5 + 0.01 * torch.randn(frames, *size, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_catalogue_has_every_effect_once_and_says_all_of_it():
+    assert tuple(effect.name for effect in CATALOGUE) == NAMES
+    for effect in CATALOGUE:
+        assert effect.stage in STAGES
+        assert effect.threshold > 0
+        assert all((effect.summary, effect.source, effect.null, effect.adds)), effect.name
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        scene_of(noise(1), [0.0], points=50),
+        scene_of(noise(8), [10.0 * i for i in range(8)], points=0),
+        scene_of(noise(8), None, points=50),
+        scene_of(noise(8, size=(3, 4)), [10.0 * i for i in range(8)], points=50),
+        scene_of(noise(8), [5.0] * 8, points=50),
+        scene_of(torch.full((8, 24, 32), 0.5), [10.0 * i for i in range(8)], points=50),
+    ],
+    ids=["one frame", "no points", "no time", "tiny images", "one moment", "one grey"],
+)
+def test_where_there_is_nothing_to_see_all_is_off_with_a_reason(scene):
+    verdicts = decide(scene)
+    assert tuple(verdicts) == NAMES
+    for verdict in verdicts.values():
+        assert not verdict.on, verdict
+        assert len(verdict.reason) > 10, verdict
+        assert verdict.settings == {}
+
+
+def test_missing_metadata_rules_out_and_is_named():
+    verdicts = decide(scene_of(noise(8), None, points=50))
+    assert "lacks time" in verdicts["relaxation"].reason
+    assert "lacks thermal_range, time, weather" in verdicts["solar"].reason
+    wished = decide(scene_of(noise(8), None, points=50), {"solar": "on"})["solar"]
+    assert not wished.on and "lacks thermal_range, time, weather" in wished.reason
+
+
+def test_wishes_win_over_evidence():
+    scene = scene_of(noise(8), [10.0 * i for i in range(8)], points=50)
+    verdicts = decide(scene, {"vignetting": "on", "agc": "off", "tone": "auto"})
+    assert verdicts["vignetting"].on and verdicts["vignetting"].reason == "effects.vignetting=on"
+    assert not verdicts["agc"].on and verdicts["agc"].reason == "effects.agc=off"
+    assert not verdicts["tone"].on
+
+
+def test_unknown_effects_and_wishes_are_refused():
+    scene = scene_of(noise(2), [0.0, 1.0])
+    with pytest.raises(SceneError, match="effects.glow: there is no such effect"):
+        decide(scene, {"glow": "on"})
+    with pytest.raises(SceneError, match="effects.agc must be one of on, off, auto, got 'maybe'"):
+        decide(scene, {"agc": "maybe"})
+
+
+def test_verdicts_are_those_of_the_training_views_alone():
+    scene = scene_of(noise(8), [10.0 * i for i in range(8)], points=50, thermal_range=ThermalRange(0.0, 10.0))
+    other = replace(scene, test=scene_of(torch.zeros(3, 24, 32)).train, val=scene_of(torch.ones(3, 24, 32)).train)
+    assert decide(scene) == decide(other)

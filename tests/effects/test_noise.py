@@ -1,0 +1,33 @@
+"""The noise of a sensor, judged from images."""
+
+import math
+
+import pytest
+import torch
+
+from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
+
+
+def scene_images(frames: int, noise: float, seed: int = 0) -> torch.Tensor:
+    """Smooth images with a few steps, and noise of a standard deviation."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, 60), torch.linspace(0, 1, 80), indexing="ij")
+    clean = 0.4 + 0.2 * torch.sin(5 * x + 3 * y) + 0.3 * (x > 0.6) - 0.2 * (y > 0.7)
+    return clean + noise * torch.randn(frames, 60, 80, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.01, 0.05])
+def test_noise_is_found_beside_edges(noise):
+    assert noise_of(scene_images(6, noise).double()) == pytest.approx(noise, rel=0.15)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_noise_of_repeats_does_not_count_a_drift(noise):
+    drift = torch.linspace(0, 0.5, 20)[:, None, None] ** 2
+    assert noise_of_repeats(scene_images(20, noise) + drift) == pytest.approx(noise, rel=0.05)
+
+
+def test_noise_is_never_below_that_of_rounding():
+    grey = (scene_images(4, 0.0) * 255).round() / 255
+    step = quantum_of(grey[0])
+    assert step == pytest.approx(1 / 255, rel=1e-3)
+    assert noise_of(grey.double(), step) >= step / math.sqrt(12)
