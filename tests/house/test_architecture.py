@@ -25,7 +25,7 @@ ALLOWED = {
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}
-    | {"sensors", "thermal", "training"},
+    | {"effects", "sensors", "thermal", "training"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "effects", "io", "training", "shots", "studies"},
