@@ -136,6 +136,7 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
     from heatsplat.effects.catalogue import decide
 
     given = assembly.explicit(plain["effects"])
+    log.info("looking at scene %s for the effects that it calls for", data.scene.name)
     seen = decide(data.scene, assembly.wishes(plain["effects"]))
     verdicts = assembly.reconciled(assembly.possible(seen, data.scene), given)
 
@@ -154,6 +155,7 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
         on_cpu = plain["trainer"]["accelerator"] == "cpu" or not torch.cuda.is_available()
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
+        log.info("measuring what each of %d effects costs", len(on))
         found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"], "cpu" if on_cpu else "cuda")
     for line in assembly.lines(assembly.told(verdicts, found)):
         log.info("%s", line)
