@@ -155,7 +155,7 @@ CATALOGUE: tuple[Effect, ...] = (
         source="SupIR-GS, Eq. 4",
         needs=frozenset(),
         null="residuals average to nothing at every place of the image",
-        threshold=joint_fit.SHARED_HURDLE,
+        threshold=joint_fit.OWN_HURDLE,
         adds="two coarse grids over the image",
         evidence=joint_fit.fixed_pattern,
     ),

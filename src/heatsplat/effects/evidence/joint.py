@@ -46,6 +46,7 @@ RIDGE = 1e-9
 
 # What an effect has to gain over the cost of its parameters. Points at edges look different from every place and hence at
 # every time, which gives a point's own parameters up to 1.5 on scenes of which it is known that nothing changes.
+# A pattern gets up to 1.7 on heated scenes, by how the courses of their points err.
 OWN_HURDLE, SHARED_HURDLE = 2.5, 1.3
 # An effect whose size is less than this share of the expected error is left out. Points that lie astray go with distance
 # and direction a little.
@@ -253,7 +254,7 @@ class Joint:
         return self._pruned(model)
 
     def _earns(self, more: Model, less: Model, name: str) -> bool:
-        hurdle = OWN_HURDLE if name in OWN else SHARED_HURDLE
+        hurdle = OWN_HURDLE if name in (*OWN, "fixed_pattern") else SHARED_HURDLE
         return self.gain(more, less) > hurdle and self.worthwhile(more, less, name)
 
     def worthwhile(self, more: Model, less: Model, name: str) -> bool:
