@@ -21,6 +21,7 @@ MOST_FRAMES = 64
 MOST_POINTS = 500  # points whose tracks are fitted; all of them, up to MOST_IN_FRONT, hide each other
 MOST_CANDIDATES = 1500
 MOST_IN_FRONT = 20000
+LEAST_PX = 8  # along the shorter side of an image
 LEAST_FRAMES = 4  # a track of fewer observations says nothing about time
 # A point is hidden where another one is nearer to the camera by this share within a cell of about two points.
 NEARER = 0.08
@@ -121,6 +122,8 @@ def observe(scene: SceneData) -> Observations:
     tracks, why = None, ""
     if len(views) < LEAST_FRAMES:
         why = f"{len(views)} training view(s) are too few to follow anything over"
+    elif min(shape) < LEAST_PX:
+        why = f"images of {shape[1]} x {shape[0]} pixels are too small to follow a point through"
     elif still:
         tracks = _pixels(views, images)
     elif len(scene.points) < 1:
