@@ -105,8 +105,9 @@ def in_the_pane(module) -> dict[str, float]:
     for view in module.scene.test:
         pane = torch.from_numpy(recording.shows(view.frame.frame_id, "pane"))
         assert view.frame.name == f"frame_{view.frame.frame_id:05d}.png"
-        for modality, image in module.predict_all(view.frame).items():
-            scores[modality].append(psnr(image, view.image(modality), pane))
+        images = module.predict_all(view.frame)
+        for modality in scores:
+            scores[modality].append(psnr(images[modality], view.image(modality), pane))
     return {modality: sum(values) / len(values) for modality, values in scores.items()}
 
 

@@ -11,7 +11,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.studies.evidence import judged, run, written
 
-SCENES = ("static", "cooling", "haze", "drifting")
+SCENES = ("static", "cooling", "drifting")
 
 
 @pytest.fixture(scope="module")

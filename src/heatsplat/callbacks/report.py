@@ -234,7 +234,10 @@ EFFECTS_NOTE = (
 def _effects_section(effects: Mapping[str, Any]) -> list[str]:
     """A table where a scene chose the effects, a list where the method did."""
     if not any("reason" in effect for effect in effects.values()):
-        return ["", "## Effects that were simulated", "", *(_bullets(effects) or ["None."])]
+        simulated = {
+            name: {key: value for key, value in effect.items() if key != "on"} for name, effect in effects.items()
+        }
+        return ["", "## Effects that were simulated", "", *(_bullets(simulated) or ["None."])]
     settings = {name: effect["settings"] for name, effect in effects.items() if effect.get("settings")}
     return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_bullets(settings)]
 
