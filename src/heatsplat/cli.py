@@ -47,6 +47,8 @@ def _run_of(ckpt: str | None) -> str:
 
 OmegaConf.register_new_resolver("run_of", _run_of, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
+# Folders of jobs are named by their overrides; file systems allow 255 bytes, and seed and row come with the number.
+OmegaConf.register_new_resolver("start_of", lambda text: str(text)[:120], replace=True)
 OmegaConf.register_new_resolver("steps", _steps, replace=True)
 OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
 

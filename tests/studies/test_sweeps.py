@@ -99,3 +99,18 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
     assert "- c on cooling:" in table and "data.size=huge" in table
     again = subprocess.run(command, capture_output=True, text=True)
     assert (again.stdout + again.stderr).count("has results already; skipped") == 2
+
+
+def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
+    many = [
+        f"callbacks.{name}=null" for name in ("images", "probes", "attributes", "statistics", "dashboard", "checkpoint")
+    ]
+    command = [
+        sys.executable, str(ROOT / "src" / "train.py"), "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
+        "max_steps=2", "seed=0", *many, "thermal.source_l2=0.000000000000000000000000000000000001", "test=false",
+        "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", f"hydra.sweep.dir={tmp_path}/sweep",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (folder,) = (path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert folder.name.startswith("etgs_cooling_0_") and len(folder.name) < 160
