@@ -1,7 +1,7 @@
 """Puts naive forms back into the source, one by one, and shows that a test fails for each: docs/mutations.md.
 
 A mutant is a change of one place in one module, made while Python imports it; no file changes. It runs in a process of its
-own, split off from one that has the libraries loaded (so it needs an operating system that can fork).
+own, split off from a server that has the libraries loaded and no threads (so it needs an operating system that can fork).
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import logging
 import multiprocessing
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 log = logging.getLogger("heatsplat")
 
 ROOT = Path(__file__).resolve().parents[3]
+LIBRARIES = ("hypothesis", "mpmath", "pytest", "scipy.spatial", "torch")  # that mutants need and none changes
 SURVIVED = "**no test noticed**"
 HEAD = """# What the tests would notice
 
@@ -206,12 +208,15 @@ def run(
         only: names of the mutations; None for all.
         processes: how many run at a time.
     """
-    _load_libraries()
     chosen = [mutation for mutation in MUTATIONS if only is None or mutation.name in only]
-    with multiprocessing.get_context("fork").Pool(processes, maxtasksperchild=1) as pool:
-        noticed = dict(zip([m.name for m in chosen], pool.imap(first_failure, chosen, chunksize=1), strict=True))
-    for name, test in noticed.items():
-        log.info("%s: %s", name, test or "no test noticed")
+    # A child of this process would inherit OpenMP threads that do not run in it, and die of its first parallel kernel.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(LIBRARIES))
+    noticed: dict[str, str | None] = {}
+    with ProcessPoolExecutor(processes, context, max_tasks_per_child=1) as pool:
+        for mutation, test in zip(chosen, pool.map(first_failure, chosen), strict=True):
+            noticed[mutation.name] = test
+            log.info("%s: %s", mutation.name, test or "no test noticed")
     text = written(chosen, noticed)
     Path(output_dir).mkdir(parents=True, exist_ok=True)
     (Path(output_dir) / "mutations.md").write_text(text, encoding="utf-8")
@@ -236,15 +241,6 @@ def written(mutations: Sequence[Mutation], noticed: dict[str, str | None]) -> st
 
 def _readable(test: str | None) -> str:
     return SURVIVED if test is None else f"`{test.split('[')[0]}`"
-
-
-def _load_libraries() -> None:
-    """What every mutant needs and none changes, so that it is loaded once."""
-    import hypothesis  # noqa: F401
-    import mpmath  # noqa: F401
-    import pytest  # noqa: F401
-    import scipy.spatial  # noqa: F401
-    import torch  # noqa: F401
 
 
 def first_failure(mutation: Mutation) -> str | None:
