@@ -60,6 +60,16 @@ def test_broken_moments_are_no_checkpoint_either(tmp_path):
     assert (tmp_path / "good.ckpt").exists() and not (tmp_path / "bad.ckpt").exists()
 
 
+def test_a_broken_parameter_is_no_checkpoint_although_its_moments_are_sound(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    job = trainer(tmp_path, [FiniteGuard()], steps=4)
+    fit(module, job)
+    module.splats.raw["opacity_logits"].data[7] = float("nan")
+    with pytest.raises(NotFinite, match=r"parameter splats\.raw\.opacity_logits has 1 NaN"):
+        job.save_checkpoint(tmp_path / "bad.ckpt")
+    assert not (tmp_path / "bad.ckpt").exists()
+
+
 def test_a_sound_run_is_left_alone(tmp_path):
     module = FakeModule(wall(), tmp_path)
     fit(module, trainer(tmp_path, [FiniteGuard(every=1)], steps=6))

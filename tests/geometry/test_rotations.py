@@ -82,3 +82,11 @@ def test_slerp_between_neighbours(angle):
     start, end = (matrices_to_quats(about((1, 2, 3), a)) for a in (0.0, angle))
     expected = matrices_to_quats(about((1, 2, 3), 0.25 * angle))
     torch.testing.assert_close(slerp(start, end, 0.25), expected, rtol=0, atol=1e-13)
+
+
+def test_between_a_rotation_and_itself_there_is_only_itself():
+    """The dot product of a unit quaternion with itself rounds to more than 1, of which acos is NaN."""
+    for dtype, bound in ((torch.float32, 3e-7), (torch.float64, 5e-16)):
+        quats = random_quats(2000, dtype)
+        assert (normalised(quats).square().sum(-1) > 1).any()
+        torch.testing.assert_close(slerp(quats, quats, 0.3), normalised(quats), rtol=0, atol=bound)

@@ -229,3 +229,11 @@ def test_no_frequency_is_pure_relaxation():
 def test_wrong_constants_are_named(omega, time, message):
     with pytest.raises(ValueError, match=message):
         harmonic_response(torch.ones(3), omega, time)
+
+
+def test_relaxation_starts_at_the_initial_temperature_to_the_last_bit():
+    """From the late end alone ambient + (initial - ambient) it would miss by the rounding of the larger of the two."""
+    generator = torch.Generator().manual_seed(3)
+    initial, ambient = torch.rand(2, 500, generator=generator) * torch.tensor([[1.0], [1e4]])
+    rate = torch.rand(500, generator=generator)
+    assert torch.equal(relax(scalar(0.0), ambient, initial, rate), initial)
