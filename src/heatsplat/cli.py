@@ -6,9 +6,12 @@ Only Hydra is imported before the configuration is composed, so that --help, --c
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -45,6 +48,23 @@ def _run_of(ckpt: str | None) -> str:
     return str(folder.parent if folder.name == "checkpoints" else folder)
 
 
+def cores() -> int:
+    """CPU cores that this process may use: on a cluster those of the job, not those of the node."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cores_of(asked: int | None) -> int | None:
+    """Threads of a job that asked for so many cores; a run outside a sweep, or with nothing asked, takes all."""
+    return asked if HydraConfig.get().mode == RunMode.MULTIRUN else None
+
+
+def _cores_by(jobs: int) -> int | None:
+    """Threads of one of ``jobs`` side by side (-1: one per core), so that no core is asked for twice."""
+    return _cores_of(max(1, cores() // (cores() if jobs == -1 else jobs)))
+
+
+OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
+OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
 OmegaConf.register_new_resolver("run_of", _run_of, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
 # Folders of jobs are named by their overrides; file systems allow 255 bytes, and seed and row come with the number.
@@ -56,6 +76,37 @@ OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
 def build_callbacks(plain: dict[str, Any]) -> list[Any]:
     """The callbacks that are on; ``callbacks.<name>=null`` leaves one out."""
     return list(build({name: settings for name, settings in plain.items() if settings is not None}).values())
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """While it lasts, SIGTERM and SIGUSR2 stop a job as Ctrl-C does: after its step, with a checkpoint.
+
+    So a batch system says that the time of a job is over. Whoever listened before hears of it once the job has stopped:
+    submitit, which puts the job back into the queue.
+    """
+    asked: list[int] = []
+
+    def ask(number: int, _: Any) -> None:
+        if not asked:
+            asked.append(number)
+            signal.raise_signal(signal.SIGINT)
+
+    try:
+        before = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGUSR2)}
+    except (ValueError, AttributeError):  # not in the main thread, or on Windows
+        yield
+        return
+    try:
+        yield
+    except (SystemExit, KeyboardInterrupt):
+        listener = before[asked[0]] if asked else None
+        if callable(listener):
+            listener(asked[0], None)
+        raise
+    finally:
+        for number, listener in before.items():
+            signal.signal(number, listener)
 
 
 def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
@@ -70,7 +121,8 @@ def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]
         output_dir = Path(hydra_config.runtime.output_dir)
         (output_dir / FAILED).unlink(missing_ok=True)
         try:
-            return work(config, output_dir)
+            with stoppable():
+                return work(config, output_dir)
         except Exception as error:
             (output_dir / FAILED).write_text(traceback.format_exc())
             cause = _expected(error)
@@ -96,7 +148,10 @@ def _expected(error: BaseException) -> BaseException | None:
 @hydra.main(version_base="1.3", config_path=CONF, config_name="train")
 @_job
 def train(config: DictConfig, output_dir: Path) -> float | None:
-    """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
+    """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers.
+
+    A run that was stopped in this folder goes on from its last checkpoint.
+    """
     from heatsplat.io.results import METRICS_FILE, RunResults
     from heatsplat.training.session import fit, prepare_machine
 
@@ -109,12 +164,48 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     if plain["data"].get("root") is not None:
         plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
     data = build(plain["data"])
-    plain = with_effects(plain, data)
+    plain = begun(plain, data, output_dir) or with_effects(plain, data)
     trainer = build(plain["trainer"], callbacks=build_callbacks(plain["callbacks"]), logger=build(plain["logger"]))
     module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain  # set, not passed: Hydra would build every part in it once more
     results = fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
+
+
+# What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
+NOT_LEARNED = {"threads", "ckpt", "row", "test", "trainer", "callbacks", "logger"}
+
+
+def begun(plain: dict[str, Any], data: Any, output_dir: Path) -> dict[str, Any] | None:
+    """The configuration of a run that goes on where one with the same recipe was stopped in its folder, else None.
+
+    A checkpoint of the last step is passed over: from it there is no step left in which the cost could be measured.
+    """
+    from heatsplat.contracts import SceneError
+    from heatsplat.training.module import CHECKPOINT_KEY
+    from heatsplat.training.session import load_checkpoint
+
+    if plain["ckpt"] is not None:
+        return None
+    for path in sorted(
+        (output_dir / "checkpoints").glob("*.ckpt"), key=lambda path: path.stat().st_mtime, reverse=True
+    ):
+        try:
+            checkpoint = load_checkpoint(path)
+        except SceneError as error:  # a disk that was full
+            log.warning("%s", error)
+            continue
+        if checkpoint["global_step"] >= plain["max_steps"]:
+            continue
+        stored = checkpoint[CHECKPOINT_KEY]["recipe"]
+        found = with_effects(plain | {"ckpt": str(path)}, data)
+        changed = sorted(key for key in found.keys() - NOT_LEARNED if found[key] != stored.get(key))
+        if not changed:
+            log.info("going on from step %d of %s", checkpoint["global_step"], path)
+            return found
+        log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
+        return None
+    return None
 
 
 def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
