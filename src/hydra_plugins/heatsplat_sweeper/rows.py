@@ -54,12 +54,56 @@ class RowSweeper(BasicSweeper):
         from heatsplat.studies.sweeps import write_sweep
 
         folder = Path(self.config.hydra.sweep.dir)
+        if self.config.get("table") is not None and not self._plan(list(arguments)):
+            return None
         try:
-            return super().sweep(list(arguments))
+            return super().sweep(list(arguments)) if self.plan is None or self.plan.runs else None
         except BaseException:
             log.warning("Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder)
             raise
         finally:
             paper = {name: str(row["paper"]) for name, row in (self.rows or {}).items() if row.get("paper")}
-            for path in write_sweep(folder, list(self.rows or ()), paper):
+            written = write_sweep(folder, list(self.rows or ()), paper)
+            if self.plan is not None:
+                from heatsplat.studies.published import write_comparison
+
+                written += write_comparison(folder, self.plan)
+                log.info("%s", written[-2].read_text(encoding="utf-8"))
+            for path in written:
                 log.info("%s", path)
+
+    def _plan(self, arguments: list[str]) -> bool:
+        """Plans the runs of a published table and tells them, with what is missing; False where nothing is to be done.
+
+        Exit code 1 where the table asks for what there is not, or none of its scenes is on disk.
+        """
+        from heatsplat.contracts import SceneError
+        from heatsplat.studies.published import make_plan
+
+        table = OmegaConf.to_container(self.config.table)
+        metrics = self.config.callbacks.get("metrics") or {}
+        try:
+            self.plan = make_plan(
+                table,
+                self.config.data.root,
+                self.hydra_context.config_loader.get_group_options("method"),
+                self._ablation(table["ablation"]),
+                {text.lstrip("+~").partition("=")[0] for text in arguments},
+            )
+        except SceneError as error:
+            log.error("%s", error)
+            sys.exit(1)
+        nothing = bool(self.plan.missing) and not self.plan.runs
+        told = self.plan.told(metrics.get("lpips_net"), metrics.get("lpips_weights"))
+        log.log(logging.ERROR if nothing else logging.INFO, "%s", told)
+        if nothing:
+            sys.exit(1)
+        return not table["dry"]
+
+    def _ablation(self, name: str | None) -> Mapping[str, Mapping[str, Any]]:
+        """Rows of a ready-made ablation (conf/ablation); none without a name."""
+        if name is None:
+            return {}
+        loader = self.hydra_context.config_loader
+        loaded = loader.load_configuration("train", [f"ablation={name}", "method=3dgs"], RunMode.MULTIRUN)
+        return OmegaConf.to_container(loaded.hydra.sweeper.rows)

@@ -1,0 +1,218 @@
+"""Ours beside the paper's: a published table with what the runs of a sweep found, for people and for programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.published.figures import METRICS, Figure
+from heatsplat.studies.published.plans import Plan, row_name
+from heatsplat.studies.sweeps import COSTS, Row, collect
+
+COMPARISON_FILE, COMPARISON_CSV = "comparison.md", "comparison.csv"
+BESIDE = ("train_seconds", "peak_memory_mb", "gaussians")  # costs that stand beside every row
+THAT_RAN = "mean of the scenes that ran"
+
+
+@dataclass
+class Line:
+    """One line of the comparison.
+
+    Args:
+        scene, method, setting: of the table; ``scene`` may be ``THAT_RAN``.
+        members: the scenes that its figures are means of.
+        have: those of them that have results.
+        ours: metric -> our mean, in the table's unit.
+        spread: metric -> standard deviation over seeds, of single scenes.
+        seeds: runs per scene; the fewest.
+        cost: name of a cost -> our mean.
+        printed: metric -> the paper's figure.
+        theirs: metric -> its value, or the mean of the printed values of the same scenes.
+    """
+
+    scene: str
+    method: str
+    setting: str
+    members: tuple[str, ...]
+    have: tuple[str, ...] = ()
+    ours: dict[str, float] = field(default_factory=dict)
+    spread: dict[str, float] = field(default_factory=dict)
+    seeds: int = 0
+    cost: dict[str, float] = field(default_factory=dict)
+    printed: dict[str, Figure] = field(default_factory=dict)
+    theirs: dict[str, float] = field(default_factory=dict)
+
+    def difference(self, metric: str) -> float | None:
+        """Ours less theirs, None where either is missing."""
+        pair = (self.ours.get(metric), self.theirs.get(metric))
+        return None if None in pair else pair[0] - pair[1]
+
+    @property
+    def label(self) -> str:
+        """The scene, and of how many scenes ours is the mean where it is not all."""
+        name = self.scene or "(scenes not named)"
+        partial = self.have and len(self.have) < len(self.members)
+        return f"{name} ({len(self.have)} of {len(self.members)})" if partial else name
+
+
+def write_comparison(folder: Path, plan: Plan) -> list[Path]:
+    """Writes comparison.md and comparison.csv into the folder of a sweep, and returns their paths."""
+    found = collect(folder)
+    key_of = {run.folder: run.scene for run in plan.runs}
+    results = {(row.name, key_of[row.scene]): row for row in found if row.scene in key_of}
+    lines = compare(plan, results)
+    failed = [f"{row.name} on {row.scene}: {reason}" for row in found for reason in row.failed]
+    write_atomically(folder / COMPARISON_FILE, markdown(plan, lines, _reasons(folder, plan), failed))
+    write_atomically(folder / COMPARISON_CSV, comparison_csv(plan, lines))
+    return [folder / COMPARISON_FILE, folder / COMPARISON_CSV]
+
+
+def compare(plan: Plan, results: Mapping[tuple[str, str], Row]) -> list[Line]:
+    """The lines of the comparison, scene by scene in the order of the table.
+
+    Args:
+        plan: the table.
+        results: (name of the row, scene) -> its runs.
+    """
+    printed: dict[tuple[str, str, str], dict[str, Figure]] = {}
+    for figure in plan.figures:
+        printed.setdefault((figure.scene, figure.method, figure.setting), {})[figure.metric] = figure
+    scenes = list(dict.fromkeys(figure.scene for figure in plan.figures))
+    rows = plan.rows or tuple(dict.fromkeys((figure.method, figure.setting) for figure in plan.figures))
+    of_paper = {(method, setting) for _, method, setting in printed}
+    lines, incomplete = [], []
+    for scene in scenes:
+        members = plan.members(scene)
+        single = [member for member in members if member in scenes]
+        for method, setting in rows:
+            figures = printed.get((scene, method, setting), {})
+            if not figures and (method, setting) in of_paper:
+                continue
+            line = Line(scene, method, setting, members, printed=figures)
+            line.theirs = {name: figure.value for name, figure in figures.items() if figure.value is not None}
+            have = tuple(member for member in members if _of(results, method, setting, member))
+            if len(members) > 1 and len(have) < len(members) and single:
+                incomplete.append((line, have))  # the printed mean is of other scenes; see below
+            else:
+                _fill(plan, line, have, results)
+            lines.append(line)
+    for line, have in incomplete:
+        if not have:
+            continue
+        part = Line(THAT_RAN, line.method, line.setting, line.members)
+        _fill(plan, part, have, results)
+        per_scene = [printed.get((scene, line.method, line.setting), {}) for scene in have]
+        for metric in line.printed:
+            values = [figures[metric].value for figures in per_scene if metric in figures]
+            if len(values) == len(have) and None not in values:
+                part.theirs[metric] = statistics.fmean(values)
+        lines.append(part)
+    return lines
+
+
+def _of(results: Mapping[tuple[str, str], Row], method: str, setting: str, scene: str) -> Row | None:
+    row = results.get((row_name(method, setting), scene))
+    return row if row and row.jobs else None
+
+
+def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[str, str], Row]) -> None:
+    """Puts ours into a line: the mean over scenes of the means over seeds."""
+    runs = [row for scene in have if (row := _of(results, line.method, line.setting, scene))]
+    line.have, line.seeds = have, min((row.jobs for row in runs), default=0)
+    for metric in dict.fromkeys(figure.metric for figure in plan.figures):
+        ours = plan.ours(metric)
+        values = [row.mean(ours) for row in runs] if ours else []
+        if values and None not in values:
+            line.ours[metric] = statistics.fmean(METRICS[metric].convert(value) for value in values)
+            if len(runs) == 1 and runs[0].spread(ours) is not None:
+                line.spread[metric] = METRICS[metric].convert(runs[0].spread(ours))
+    for name in BESIDE:
+        values = [row.mean(name) for row in runs]
+        if values and None not in values:
+            line.cost[name] = statistics.fmean(values)
+
+
+def _reasons(folder: Path, plan: Plan) -> list[str]:
+    """Why printed metrics have no value of ours, a line each."""
+    runs = [RunResults.read(path) for path in sorted(folder.glob(f"*/{METRICS_FILE}"))]
+    lines = []
+    for metric in dict.fromkeys(figure.metric for figure in plan.figures):
+        ours, known = plan.ours(metric), METRICS[metric]
+        if ours is None:
+            lines.append(f"{known.title}: {known.why_not}")
+        elif runs and not any((run.test | run.cost).get(ours) is not None for run in runs):
+            keys = (f"test.{ours}", f"cost.{ours}")
+            reason = next((run.reasons[key] for run in runs for key in keys if key in run.reasons), "not measured")
+            lines.append(f"{known.title}: n/a, {reason}")
+    return lines
+
+
+def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), failed: Sequence[str] = ()) -> str:
+    """The comparison for people. A cell reads ours / paper's (ours less paper's)."""
+    metrics = list(dict.fromkeys(figure.metric for figure in plan.figures))
+    costs = [name for name in BESIDE if name not in {plan.ours(metric) for metric in metrics}]
+    costs = [name for name in costs if any(name in line.cost for line in lines)]
+    several = any(setting for _, setting in plan.rows)
+    head = ["scene", "method", *(["setting"] if several else []), *(METRICS[metric].title for metric in metrics)]
+    head += [f"ours: {COSTS[name][0]}" for name in costs]
+    table = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for line in lines:
+        cells = [line.label, line.method or "–", *([line.setting or "–"] if several else [])]
+        cells += [_cell(line, metric) for metric in metrics]
+        cells += [f"{line.cost[name]:,.{COSTS[name][1]}f}" if name in line.cost else "–" for name in costs]
+        table.append("| " + " | ".join(cells) + " |")
+    text = [
+        f"# {plan.title}: ours beside the paper's",
+        "",
+        "A cell reads: ours / printed (ours less printed). – is none. Ours is a mean over seeds (± standard deviation where "
+        "there are several), then over scenes. Seconds, memory and frames/s are of other machines than the paper's.",
+        "",
+        *table,
+    ]
+    wanted = {metric: plan.metrics[metric] for metric in metrics if metric in plan.metrics}
+    notes = [f"{METRICS[metric].title} of ours is `{name}` (docs/conventions.md)." for metric, name in wanted.items()]
+    if plan.source and plan.source.unsure:
+        notes.append(plan.source.unsure)
+    shown = dict.fromkeys(figure.note for figure in plan.figures if figure.note)
+    for title, items in (
+        ("Without ours", [*plan.left_out(), *reasons]),
+        ("Not on disk", [", ".join(plan.missing)] if plan.missing else []),
+        ("Jobs without a result", failed),
+        ("Notes", [*notes, *plan.notes]),
+        ("How cells were read", list(shown)),
+    ):
+        if items:
+            text += ["", f"## {title}", "", *(f"- {item}" for item in items)]
+    return "\n".join([*text, ""])
+
+
+def _cell(line: Line, metric: str) -> str:
+    digits, figure = METRICS[metric].digits, line.printed.get(metric)
+    ours, theirs, difference = line.ours.get(metric), line.theirs.get(metric), line.difference(metric)
+    paper = (figure.printed if figure else "" if theirs is None else f"{theirs:.{digits}f}") or "–"
+    if ours is None:
+        return paper if paper == "–" else f"– / {paper}"
+    spread = f" ± {line.spread[metric]:.{digits}f}" if metric in line.spread else ""
+    return f"{ours:,.{digits}f}{spread} / {paper}" + ("" if difference is None else f" ({difference:+,.{digits}f})")
+
+
+def comparison_csv(plan: Plan, lines: Sequence[Line]) -> str:
+    """The comparison for programs: a row per scene, method, setting and metric, in full precision."""
+    columns = ["scene", "method", "setting", "metric", "ours", "ours_std", "runs", "scenes", "printed", "difference"]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [*columns, *BESIDE, "note"], lineterminator="\n")
+    writer.writeheader()
+    for line in lines:
+        for metric in dict.fromkeys([*line.printed, *line.ours]):
+            figure = line.printed.get(metric)
+            told = figure.printed if figure else line.theirs.get(metric)
+            numbers = {"ours": line.ours.get(metric), "ours_std": line.spread.get(metric), "runs": line.seeds}
+            numbers |= {"scenes": len(line.have), "printed": told, "difference": line.difference(metric)}
+            place = {"scene": line.scene, "method": line.method, "setting": line.setting, "metric": metric}
+            writer.writerow(place | numbers | line.cost | {"note": figure.note if figure else ""})
+    return text.getvalue()

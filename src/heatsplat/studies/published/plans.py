@@ -1,0 +1,261 @@
+"""Which runs fill a published table: methods x settings x scenes that are on disk, and what is missing for the others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from heatsplat.contracts import SceneError
+from heatsplat.metrics import LpipsUnavailable
+from heatsplat.metrics.lpips import find_backbone
+from heatsplat.studies.published.figures import METRICS, TITLES, Figure, doubts, figures
+from heatsplat.studies.published.sources import Source, source
+
+NOT_HERE = "heatsplat does not have it"
+NOT_ASKED = "not asked for"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run of a table.
+
+    Args:
+        method, setting: of the table's row.
+        scene: key of the scene in the table.
+        folder: name of the scene's folder on disk.
+        overrides: of the configuration.
+    """
+
+    method: str
+    setting: str
+    scene: str
+    folder: str
+    overrides: tuple[str, ...]
+
+    @property
+    def row(self) -> str:
+        """Name of the row, which is also part of the run's folder."""
+        return row_name(self.method, self.setting)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A table and the runs that fill it.
+
+    Args:
+        paper, table: which; keys as in ``figures``.
+        source: its data set, None for tables of facts.
+        root: folder of the data set as it was given, or None.
+        figures: what is printed.
+        rows: (method, setting) in order; those that were asked for beyond the paper come last.
+        runs: what is to be trained, scene by scene within a row.
+        absent: (method, setting) -> why it has the paper's figures only.
+        missing: scenes that are wanted and not on disk.
+        metrics: printed metric -> score in metrics.json, where the paper's definition is another than usual.
+        unnamed: the group of scenes that stands for "the paper does not say which"; empty for none.
+        notes: what else a reader must know.
+    """
+
+    paper: str
+    table: str
+    source: Source | None
+    root: Path | None
+    figures: tuple[Figure, ...]
+    rows: tuple[tuple[str, str], ...]
+    runs: tuple[Run, ...]
+    absent: Mapping[tuple[str, str], str]
+    missing: tuple[str, ...]
+    metrics: Mapping[str, str] = field(default_factory=dict)
+    unnamed: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """Such as "ETGS, Tab. 1"."""
+        return f"{TITLES[self.paper]}, " + ("running text" if self.table == "text" else f"Tab. {self.table}")
+
+    def ours(self, metric: str) -> str | None:
+        """Score or cost in metrics.json that a printed metric is compared with."""
+        return self.metrics.get(metric, METRICS[metric].ours)
+
+    def members(self, scene: str) -> tuple[str, ...]:
+        """The scenes of which a printed figure is."""
+        return self.source.members(scene or self.unnamed) if self.source else ()
+
+    def told(self, lpips_net: str | None = "alex", lpips_weights: str | None = None) -> str:
+        """What runs, what has the paper's figures only and why, what is missing and where it is got: one message.
+
+        Args:
+            lpips_net, lpips_weights: settings of the metrics callback, to say beforehand whether there will be LPIPS.
+        """
+        rows = [row_name(*row) for row in self.rows if row not in self.absent]
+        if self.source is None or not (self.runs or self.missing):
+            lines = [f"{self.title}: nothing of this table is trained, the paper's figures stand alone"]
+        else:
+            scenes = len({run.scene for run in self.runs})
+            lines = [
+                f"{self.title}: {len(self.runs)} runs ({len(rows)} rows x {scenes} of {scenes + len(self.missing)} scenes)",
+                f"  Rows: {', '.join(rows)}",
+            ]
+        if self.runs:
+            lines.append(f"  Scenes: {', '.join(dict.fromkeys(run.folder for run in self.runs))}")
+        lines += [f"  {text}" for text in self.left_out()]
+        printed = {figure.metric for figure in self.figures}
+        if (self.runs or self.missing) and printed & {"lpips", "rgb_lpips"}:
+            try:
+                find_backbone(str(lpips_net), lpips_weights)
+            except LpipsUnavailable as error:
+                lines.append(f"  LPIPS will be n/a; callbacks.metrics.lpips_weights=FILE names another file. {error}")
+        if self.missing and self.source:
+            lines += ["", self._how_to_get(self.source)]
+        return "\n".join(lines)
+
+    def left_out(self) -> list[str]:
+        """Methods with the paper's figures only, a line per reason."""
+        reasons: dict[str, list[str]] = {}
+        for row, reason in self.absent.items():
+            reasons.setdefault(reason, []).append(row_name(*row))
+        return [f"The paper's figures only: {', '.join(rows)} ({reason})" for reason, rows in reasons.items()]
+
+    def _how_to_get(self, source: Source) -> str:
+        root = self.root or Path("/data") / source.key
+        if self.root is None:
+            why = "data.root is not set"
+        elif not self.root.is_dir():
+            why = f"there is no folder {self.root}"
+        else:
+            why = f"not in {self.root}, by name and content (one of {', '.join(source.any)} in its folder)"
+        lines = [
+            f"Missing: {len(self.missing)} scenes of {source.name}; {why}:",
+            f"  {', '.join(self.missing)}",
+            f"Get it:  {source.url}",
+            f"Put it:  {root}/<scene>/, each with",
+            *(f"    {line}" for line in source.layout),
+            f"and give data.root={root}; folders of other names: 'table.folders={{{self.missing[0]}: NAME}}'",
+        ]
+        return "\n".join([*lines, *([source.unsure] if source.unsure else [])])
+
+
+def make_plan(
+    config: Mapping[str, Any],
+    root: str | None,
+    methods: Collection[str],
+    ablation: Mapping[str, Mapping[str, Any]] | None = None,
+    given: Collection[str] = (),
+) -> Plan:
+    """The plan of a table.
+
+    Args:
+        config: the section ``table`` of an experiment (conf/experiment/shared/table.yaml has its keys).
+        root: folder of the data set.
+        methods: those that heatsplat has.
+        ablation: rows of the ablation that ``config`` names: name -> {"set": overrides}.
+        given: keys that the command line sets; they win over the table's settings.
+
+    Raises:
+        SceneError: a method, scene or setting that is asked for does not exist, or the command line names one in another way.
+    """
+    for key, instead in (("method", "methods"), ("data.scene", "scenes")):
+        if key in given:
+            raise SceneError(f"{key}=...: a table has several; choose among them with table.{instead}=[...]")
+    paper, table = str(config["paper"]), str(config["number"])
+    printed = figures(paper, table)
+    rows = list(dict.fromkeys((figure.method, figure.setting) for figure in printed if figure.method))
+    extra = [name for name in config["methods"] or () if name not in {method for method, _ in rows}]
+    if unknown := [name for name in extra if name not in methods]:
+        raise SceneError(
+            f"table.methods: {', '.join(unknown)} is neither in the table ({_listed(m for m, _ in rows)}) nor in "
+            f"conf/method ({_listed(methods)})"
+        )
+    settings = list(dict.fromkeys(setting for _, setting in rows))
+    rows += [(name, setting) for name in extra for setting in settings if not config["ablation"]]
+    run = set(_chosen(rows, [method for method, _ in rows], config["methods"], "methods"))
+    run &= set(_chosen(rows, [setting for _, setting in rows], config["settings"], "settings"))
+
+    recipes: dict[tuple[str, str], list[str]] = {}
+    absent: dict[tuple[str, str], str] = {}
+    for method, setting in rows:
+        reasons = config["absent"]
+        reason = next((reasons[key] for key in (f"{method} {setting}", method, setting) if key in reasons), None)
+        if reason is None and method not in config["recipes"] and method not in methods:
+            reason = NOT_HERE
+        if reason is None and (method, setting) not in run:
+            reason = NOT_ASKED
+        if reason is None:
+            recipe = [*config["recipes"].get(method, [f"method={method}"]), *_protocol(config, setting, ablation or {})]
+            recipes[method, setting] = [text for text in recipe if not _overruled(text, given)]
+        else:
+            absent[method, setting] = reason
+
+    data = source(config["source"]) if config["source"] else None
+    wanted: list[str] = []
+    if data is not None and recipes:
+        named = dict.fromkeys(figure.scene or config["unnamed"] for figure in printed)
+        wanted = list(dict.fromkeys(key for scene in named for key in data.members(scene)))
+        if config["scenes"]:
+            asked = {key for scene in config["scenes"] for key in data.members(scene) or (scene,)}
+            wanted = _chosen(wanted, wanted, sorted(asked), "scenes")
+    folder = Path(root).expanduser() if root else None
+    found = data.find(folder, config["folders"]) if data else {}
+    runs = [
+        Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"))
+        for (method, setting), recipe in recipes.items()
+        for scene in wanted
+        if scene in found
+    ]
+    return Plan(
+        paper,
+        table,
+        data,
+        folder,
+        tuple(printed),
+        tuple(rows),
+        tuple(runs),
+        absent,
+        tuple(scene for scene in wanted if scene not in found),
+        dict(config["metrics"]),
+        config["unnamed"],
+        (*config["notes"], *doubts(paper, table)),
+    )
+
+
+def row_name(method: str, setting: str) -> str:
+    """Name of a row."""
+    return f"{method}_{setting}" if setting else method
+
+
+def _protocol(config: Mapping[str, Any], setting: str, ablation: Mapping[str, Mapping[str, Any]]) -> Sequence[str]:
+    """Overrides of a setting: those of the table, or of a row of the ablation that has it."""
+    if not setting:
+        return ()
+    if setting in config["protocols"]:
+        return config["protocols"][setting]
+    row = config["rows"].get(setting)
+    if row not in ablation:
+        raise SceneError(f"the table's setting {setting} is in none of table.protocols, table.rows and table.absent")
+    return ablation[row].get("set") or ()
+
+
+def _overruled(override: str, given: Collection[str]) -> bool:
+    """Whether the command line decides what an override would; debug=... shortens runs by itself."""
+    key = override.partition("=")[0]
+    return key in given or (key == "max_steps" and "debug" in given)
+
+
+def _chosen(items: Sequence[Any], keys: Sequence[str], asked: Sequence[str] | None, what: str) -> list[Any]:
+    """The items whose keys are asked for, all where nothing is.
+
+    Raises:
+        SceneError: something is asked for that no item has.
+    """
+    if not asked:
+        return list(items)
+    if unknown := [str(name) for name in asked if name not in keys]:
+        raise SceneError(f"table.{what}: {', '.join(unknown)} is not in the table; there are {_listed(keys)}")
+    return [item for item, key in zip(items, keys, strict=True) if key in asked]
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(dict.fromkeys(name or "''" for name in names)) or "none"
