@@ -107,29 +107,48 @@ def everywhere(tree: Any, change) -> Any:
 
 
 def train(scene: SceneData, plain: dict[str, Any], output_dir: Path):
-    """(module, losses) after a run with the product's guard and checkpoints; raises what the run raises."""
+    """(module, what a run with the product's guard and checkpoints has shown); raises what the run raises."""
     prepare_machine(plain["threads"])
-    losses = Losses()
+    shown = Shown()
     kept = {name: plain["callbacks"][name] for name in ("interrupt", "finite", "checkpoint", "checkpoint_end")}
     trainer = pl.Trainer(
         accelerator="cpu", devices=1, max_steps=plain["max_steps"], logger=False, enable_progress_bar=False,
         enable_model_summary=False, num_sanity_val_steps=0, limit_val_batches=0, use_distributed_sampler=False,
-        callbacks=[*cli.build_callbacks(kept), losses],
+        callbacks=[*cli.build_callbacks(kept), shown],
     )  # fmt: skip
     module = cli.build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain
     fit(module, Given(scene), trainer, test=False)
-    return module, losses.values
+    return module, shown
 
 
-class Losses(pl.Callback):
-    """The loss of every step."""
+class Shown(pl.Callback):
+    """The loss of every step, and the error of the training images before the first and after the last.
+
+    Errors tell more of learning than losses, whose terms come and go with the stages of a method.
+    """
 
     def __init__(self) -> None:
-        self.values: list[float] = []
+        self.losses: list[float] = []
+        self.before = self.after = math.nan
+
+    def on_train_start(self, trainer, module) -> None:
+        self.before = image_error(module)
 
     def on_train_batch_end(self, trainer, module, outputs, *_) -> None:
-        self.values.append(outputs["loss"].item())
+        self.losses.append(outputs["loss"].item())
+
+    def on_train_end(self, trainer, module) -> None:
+        self.after = image_error(module)
+
+
+def image_error(module) -> float:
+    """Mean absolute error of the images that a module predicts of its training views, where they count."""
+    errors = []
+    for view in module.scene.train:
+        error = (module.predict(view.frame) - view.image(module.modality)).abs().mean(-1)
+        errors.append(error if view.mask is None else error[view.mask])
+    return torch.cat([error.flatten() for error in errors]).mean().item()
 
 
 def checkpoints(output_dir: Path) -> dict[str, dict[str, Tensor]]:

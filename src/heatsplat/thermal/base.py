@@ -12,6 +12,9 @@ from heatsplat.contracts import Camera, Environment, SceneData, SceneError
 from heatsplat.splats import Splats
 
 
+KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
+
+
 @dataclass(frozen=True)
 class Query:
     """What is asked of a thermal model: these Gaussians, from this camera, at this time.
@@ -96,6 +99,7 @@ class ThermalModel(nn.Module, ABC):
         modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
             features.
         shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
+        narrowest_range_k: narrowest range of temperatures in kelvin that the model can show; checked at set-up.
         lr: learning rate of the model's own parameters (those that are not per Gaussian).
         lr_end: factor on it at the last step of the run, log-linear in between.
     """
@@ -105,6 +109,7 @@ class ThermalModel(nn.Module, ABC):
     companions: tuple[str, ...] = ()
     modality_channels: tuple[int, ...] = (1,)
     shared_opacity: bool = False
+    narrowest_range_k: float = 0.0
     lr: float = 1e-3
     lr_end: float = 1.0
 
@@ -114,14 +119,20 @@ class ThermalModel(nn.Module, ABC):
         return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels
 
     def check(self, scene: SceneData) -> None:
-        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``, or a view
-        has no image of a companion."""
+        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``, its range
+        is too narrow, or a view has no image of a companion."""
         missing = sorted(self.needs - scene.metadata)
         if missing:
             raise SceneError(
                 f"{type(self).__name__} needs {', '.join(missing)}, which scene '{scene.name}' does not have "
                 f"(it has: {', '.join(sorted(scene.metadata)) or 'images only'}). Choose a method that does without, "
                 "or give the data set the missing metadata."
+            )
+        if scene.thermal_range is not None and scene.thermal_range.span_k < self.narrowest_range_k:
+            raise SceneError(
+                f"the thermal range of scene '{scene.name}' is {scene.thermal_range.span_k:.3g} K wide. {type(self).__name__} "
+                f"computes in kelvin, which float32 holds to 3e-5 K: give a range of at least {self.narrowest_range_k:g} K "
+                "(no camera resolves less), or choose a method that works in image values, such as etgs."
             )
         for modality in self.companions:
             parts = scene.train, scene.val, scene.test

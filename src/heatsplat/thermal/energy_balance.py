@@ -17,7 +17,7 @@ from heatsplat.physics.energy_balance import STEFAN_BOLTZMANN, Climate, Drivers,
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.units import celsius, kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 
 log = logging.getLogger(__name__)
@@ -74,6 +74,7 @@ class EnergyBalance(ThermalModel):
     """
 
     needs = frozenset({"time", "weather", "thermal_range"})
+    narrowest_range_k = KELVIN_RANGE
 
     def __init__(
         self,
@@ -124,7 +125,8 @@ class EnergyBalance(ThermalModel):
         if weather.air_c is None:
             raise SceneError(f"the weather of scene '{scene.name}' has no air_c, the temperature of the air; add it")
         if self.reference_k == 0:  # otherwise this is another weather for what was trained
-            self.range_c.copy_(torch.tensor([scene.thermal_range.min_c, scene.thermal_range.max_c]))
+            bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
+            self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self._wind and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))

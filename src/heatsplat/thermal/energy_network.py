@@ -28,7 +28,7 @@ from heatsplat.physics.sky import LAWS, sky_temperature_k
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
-from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
@@ -111,6 +111,8 @@ class EnergyNetwork(ThermalModel):
     Raises:
         ValueError: an option is unknown or out of its range.
     """
+
+    narrowest_range_k = KELVIN_RANGE
 
     def __init__(
         self,
@@ -271,15 +273,16 @@ class EnergyNetwork(ThermalModel):
         self.center.copy_((low + high) / 2)
         self.edge.copy_((high - low).max().clamp(min=1e-12))
         lower, width = scene.thermal_range.min_c + KELVIN_AT_0_C, scene.thermal_range.span_k
-        self.range_k.copy_(torch.tensor([lower, width]))
-        self.bounds_k.copy_(torch.tensor([lower - self.margin * width, (1 + 2 * self.margin) * width]))
+        bounds = [lower - self.margin * width, (1 + 2 * self.margin) * width]
+        self.range_k.copy_(torch.tensor([lower, width], dtype=torch.float64))
+        self.bounds_k.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._points = {"means": scene.points.float()}
         if self.labelled:
             self._points["label"] = scene.labels.float()
         if self.features_from == "given":
             given = scene.point_features.float()
             self.feature_mean.copy_(given.mean(0))
-            self.feature_scale.copy_(given.std(0).clamp(min=1e-6))
+            self.feature_scale.copy_(given.std(0, correction=0).clamp(min=1e-6))
             self._points["feature"] = given
         if self.path is not None:
             self._stored = self._network_of_another_run()
@@ -297,7 +300,8 @@ class EnergyNetwork(ThermalModel):
         self.network.draw(seeds.generator)
         if self.features_from == "learned":
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
-            feature[:, 0] = (value - value.mean()) / value.std().clamp(min=1e-3)  # warm and cold differ from the start
+            spread = value.std(correction=0).clamp(min=1e-3)  # of a single Gaussian it is 0
+            feature[:, 0] = (value - value.mean()) / spread  # warm and cold differ from the start
             tensors["feature"] = PerGaussian(feature, self.lr_feature)
         self.network.heads["temperature"].bias.fill_(self._raw_of(value.mean()))
         if self._stored is not None:

@@ -189,7 +189,7 @@ class ImagingField(ThermalModel):
         exponent = self._exponent(raw) - self._exponent(self.start[None])
         sensitivity = 2.0 * raw[:, 3].sigmoid() if self.positive else 1.0 + raw[:, 3]
         if torch.is_grad_enabled():
-            self._sensitivity = sensitivity
+            self._sensitivity = sensitivity if len(sensitivity) else None  # a mean over no Gaussian in view is NaN
         return sensitivity * torch.exp(-exponent)
 
     def _exponent(self, raw: Tensor) -> Tensor:

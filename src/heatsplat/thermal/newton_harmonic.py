@@ -113,7 +113,8 @@ class NewtonHarmonic(ThermalModel):
         if scene.thermal_range is None:
             log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
         else:
-            self.range_c.copy_(torch.tensor([scene.thermal_range.min_c, scene.thermal_range.max_c]))
+            bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
+            self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._set_ambient(scene)
 
     def _set_ambient(self, scene: SceneData) -> None:

@@ -12,12 +12,13 @@ from heatsplat.contracts import SceneData
 from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
 from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
 
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
 STORAGE = 1.0e5  # J/m²/K, unit of the heat capacity: 5 cm of ground
+FIRST_COOLING = 0.25  # of the scene's range by radiation in a window, at most, with the networks as they start
 
 
 class NtrGaussian(ThermalModel):
@@ -49,6 +50,7 @@ class NtrGaussian(ThermalModel):
     """
 
     needs = frozenset({"time", "thermal_range"})
+    narrowest_range_k = KELVIN_RANGE
 
     def __init__(
         self,
@@ -101,19 +103,24 @@ class NtrGaussian(ThermalModel):
         self.register_buffer("edge", torch.ones(()))
         self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))
         self.register_buffer("emits", torch.tensor(first_steps == 0))
+        self._storage = STORAGE
         self._terms: dict[str, Tensor] = {}
 
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
+        self.check(scene)
         bounds = scene.thermal_range
-        self.bounds_k.copy_(torch.tensor([kelvin(bounds.min_c), bounds.span_k]))
+        self.bounds_k.copy_(torch.tensor([kelvin(bounds.min_c), bounds.span_k], dtype=torch.float64))
         self.ambient.fill_(0.5 if scene.ambient_c is None else bounds.to_unit(scene.ambient_c))
         low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
         self.center.copy_((low + high) / 2)
         self.edge.copy_((high - low).max().clamp(min=1e-12))
         times = torch.tensor(scene.train.times_s, dtype=torch.float64)
         self.clock.copy_(torch.stack([times.min(), (times.max() - times.min()).clamp(min=1e-3)]))
+        # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
+        sent = 0.5 * STEFAN_BOLTZMANN * kelvin(bounds.min_c) ** 4 * min(float(self.clock[1]), self.window_s)
+        self._storage = max(STORAGE, sent / (FIRST_COOLING * bounds.span_k))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         for layer in [module for module in self.modules() if isinstance(module, nn.Linear)]:
@@ -170,7 +177,7 @@ class NtrGaussian(ThermalModel):
         rates = self._rates(units, env, wind, moments, feature, code)
         step = (time_s - start) / (self.nodes - 1)
         integral = step * (rates.sum(1) - 0.5 * (rates[:, 0] + rates[:, -1]))
-        if torch.is_grad_enabled() and self.training:
+        if torch.is_grad_enabled() and self.training and len(units):  # a mean over no Gaussian in view is NaN
             self._terms = {
                 "consistency": (units[:, 0] - integral - units[:, -1]).square().mean(),
                 "environment": (env - self.ambient).square().mean(),
@@ -197,7 +204,7 @@ class NtrGaussian(ThermalModel):
         hidden = (units[..., None] * weight[:, 0] + shared[None] + own[:, None]).relu()
         raw = (hidden.unflatten(2, (3, -1)) * self.attribute_heads).sum(-1)
         emissivity, exchange = raw[..., 0].sigmoid(), EXCHANGE * softplus(raw[..., 1])
-        storage = STORAGE * (softplus(raw[..., 2]) + 0.05)  # 5 kJ/m²/K at least: a sheet of metal
+        storage = self._storage * (softplus(raw[..., 2]) + 0.05)  # 5 kJ/m²/K at least: a sheet of metal
         span = float(self.bounds_k[1])
         flux = emissivity * STEFAN_BOLTZMANN * self._kelvin(units).square().square() + exchange * span * (units - env)
         return flux / (storage * span)

@@ -50,7 +50,8 @@ class Static(ThermalModel):
 
     def prepare(self, scene: SceneData) -> None:
         if scene.thermal_range is not None:
-            self.range_c.copy_(torch.tensor([scene.thermal_range.min_c, scene.thermal_range.max_c]))
+            bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
+            self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         (channels,) = self.modality_channels
