@@ -178,9 +178,10 @@ def make_plan(
     absent: dict[tuple[str, str], str] = {}
     for method, setting in rows:
         reasons = config["absent"]
-        reason = next((reasons[key] for key in (f"{method} {setting}", method, setting) if key in reasons), None)
+        reason = reasons.get(f"{method} {setting}", reasons.get(method))
         if reason is None and method not in config["recipes"] and method not in methods:
             reason = NOT_HERE
+        reason = reasons.get(setting) if reason is None else reason
         if reason is None and (method, setting) not in run:
             reason = NOT_ASKED
         if reason is None:

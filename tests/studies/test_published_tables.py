@@ -1,0 +1,348 @@
+"""Tables of the papers: what is planned, what is missing and told, and ours beside the paper's."""
+
+import csv
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Collection
+from pathlib import Path
+
+import pytest
+import yaml
+from running import compose_run
+
+from heatsplat.contracts import SceneError
+from heatsplat.studies.published import Plan, make_plan
+from heatsplat.studies.published.comparison import compare, markdown, write_comparison
+from heatsplat.studies.sweeps import Row
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPERIMENTS = sorted((ROOT / "conf" / "experiment").glob("table_*.yaml"))
+ALL_METHODS = sorted(path.stem for path in (ROOT / "conf" / "method").glob("*.yaml"))
+METHODS = ("3dgs", "direct_3dgs", "energy_balance", "etgs", "ntr_gaussian", "ravigs", "supirgs", "thermogs", "ti3dgs")
+SHARED = yaml.safe_load((ROOT / "conf" / "experiment" / "shared" / "table.yaml").read_text())["table"]
+
+
+def config_of(name: str, **changes: object) -> dict:
+    """The section "table" of an experiment."""
+    own = yaml.safe_load((ROOT / "conf" / "experiment" / f"table_{name}.yaml").read_text())["table"]
+    return SHARED | own | changes
+
+
+def rows_of(config: dict) -> dict:
+    """Rows of the ablation that the table names."""
+    if not config["ablation"]:
+        return {}
+    return yaml.safe_load((ROOT / "conf" / "ablation" / f"{config['ablation']}.yaml").read_text())["hydra"]["sweeper"][
+        "rows"
+    ]
+
+
+def plan_of(
+    name: str, root: Path | None = None, given: tuple[str, ...] = (), have: Collection[str] = METHODS, **changes: object
+) -> Plan:
+    """The plan where heatsplat has the methods ``have``."""
+    config = config_of(name, **changes)
+    return make_plan(config, None if root is None else str(root), have, rows_of(config), given)
+
+
+def put(root: Path, marker: str, *scenes: str) -> Path:
+    for scene in scenes:
+        (root / scene / marker).mkdir(parents=True)
+    return root
+
+
+def everything(root: Path, name: str) -> Path:
+    """A root with an empty folder for every scene that the table wants."""
+    plan = plan_of(name)
+    if plan.source:
+        put(root, plan.source.any[0], *plan.missing)
+    return root
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_every_table_is_planned_and_composes(path, tmp_path):
+    name = path.stem.removeprefix("table_")
+    plan = plan_of(name, everything(tmp_path, name), have=ALL_METHODS)
+    assert not plan.missing and (plan.runs or not plan.source)
+    assert {row for row in plan.rows if row not in plan.absent} == {(run.method, run.setting) for run in plan.runs}
+    if config_of(name)["ablation"] or not plan.source:
+        return  # composed by the slow test
+    run = next(run for run in plan.runs if run.method == plan.paper)
+    composed = compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
+    assert composed.table.paper == plan.paper and composed.data.scene == run.folder
+    assert composed.data._target_.split(".")[1] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
+    assert composed.max_steps == (7000 if run.setting == "7k" else 30000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_every_row_of_every_table_composes_as_a_recipe_of_its_own(path, tmp_path):
+    name = path.stem.removeprefix("table_")
+    plan = plan_of(name, everything(tmp_path, name), have=ALL_METHODS)
+    first = {run.row: run for run in reversed(plan.runs)}
+    assert compose_run(tmp_path, f"experiment={path.stem}").table.paper == plan.paper
+    made = [
+        {
+            key: value
+            for key, value in compose_run(tmp_path, f"experiment={path.stem}", *run.overrides).items()
+            if key != "data"
+        }
+        for run in first.values()
+    ]
+    assert len({str(config) for config in made}) == len(first)
+
+
+def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
+    root = put(tmp_path / "RHD", "thermal/sparse", "Cooling-Bench", "cooling_dumbbels", "my_bike")
+    (root / "heat_transfer").mkdir()  # no scene: nothing in it
+    plan = plan_of("etgs_1", root, folders={"cooling_ebike": "my_bike"})
+    found = {run.scene: run.folder for run in plan.runs}
+    assert found == {
+        "cooling_bench": "Cooling-Bench",
+        "cooling_dumbbells": "cooling_dumbbels",
+        "cooling_ebike": "my_bike",
+    }
+    assert "heat_transfer" in plan.missing and len(plan.missing) == 7
+    assert [run.row for run in plan.runs] == ["3dgs"] * 3 + ["ntr_gaussian"] * 3 + ["etgs"] * 3
+    assert plan.runs[-1].overrides[0] == "method=etgs" and "data.scene='Cooling-Bench'" in plan.runs[-2].overrides
+
+
+def test_protocols_that_take_more_than_one_run_are_told_and_not_run(tmp_path):
+    plan = plan_of("thermogs_2", everything(tmp_path, "thermogs_2"))
+    assert {run.row for run in plan.runs} == {"ntr_gaussian_cross_time", "thermogs_cross_time"} and len(plan.runs) == 8
+    assert "two commands per scene" in plan.absent["thermogs", "cross_scene"]
+    assert plan.absent["ntr_gaussian", "cross_scene"] == "its networks are of one scene"
+    assert plan.absent["thermalgs", "cross_scene"] == "heatsplat does not have it"
+    found = {}
+    for i, scene in enumerate(plan.source.scenes):
+        found |= results(scene, "thermogs_cross_time", psnr=30.0 + i)
+    line = next(line for line in compare(plan, found) if (line.scene, line.method) == ("thermo_s1_s4", "thermogs"))
+    assert line.ours["psnr"] == 31.5 and line.printed["psnr"].printed == "31.83"
+
+
+def test_all_that_is_missing_is_told_in_one_message(tmp_path):
+    told = plan_of("etgs_1").told(lpips_weights=str(tmp_path / "none.pth"))
+    for scene in plan_of("etgs_1").source.scenes:
+        assert scene in told
+    for text in (
+        "data.root is not set",
+        "https://huggingface.co/datasets/jankinkin/RHD_dataset",
+        "thermal/sparse/0/{cameras,images,points3D}.bin",
+        "thermal/info.json",
+        "mip_splatting, thermal3dgs, hexplane_4dgs (heatsplat does not have it)",
+        "LPIPS will be n/a",
+        "Rows: 3dgs, ntr_gaussian, etgs",
+        "data.root=/data/rhd",
+    ):
+        assert text in told, text
+    gone = plan_of("ravigs_1", tmp_path / "gone").told()
+    assert f"there is no folder {tmp_path / 'gone'}" in gone and "zenodo.org/records/15609062" in gone
+    some = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench")).told()
+    assert "3 runs (3 rows x 1 of 10 scenes)" in some and "Missing: 9 scenes" in some and f"not in {tmp_path}" in some
+
+
+def test_tables_of_facts_train_nothing_and_say_so():
+    for name in ("etgs_5", "thermogs_1", "thermogs_7", "thermogs_8"):
+        plan = plan_of(name)
+        assert not plan.runs and not plan.missing and "nothing of this table is trained" in plan.told()
+    text = markdown(plan_of("thermogs_7"), compare(plan_of("thermogs_7"), {}))
+    assert "no data set on disk has the true materials" in text and "| – / " in text
+
+
+def test_what_is_asked_for_limits_the_runs_and_not_the_table(tmp_path):
+    root = put(tmp_path, "images", "apples", "wall", "bridge")
+    plan = plan_of("ti3dgs_i", root, methods=["ti3dgs"], settings=["7k"], scenes=["wall"])
+    assert [(run.method, run.setting, run.scene) for run in plan.runs] == [("ti3dgs", "7k", "wall")]
+    assert plan.runs[0].overrides == ("method=ti3dgs", "max_steps=7000", "data.scene='wall'")
+    assert plan.absent["ti3dgs", "30k"] == "not asked for" and ("plenoxels", "") in plan.rows
+    grouped = plan_of("ti3dgs_iv", root, scenes=["ti_nsd_outdoor"])
+    assert {run.scene for run in grouped.runs} == {"bridge"} and len(grouped.missing) == 6
+
+
+def test_the_command_line_wins_over_the_settings_of_the_table(tmp_path):
+    root = put(tmp_path, "images", "wall")
+    for given in (("max_steps",), ("debug",)):
+        assert all("max_steps" not in text for run in plan_of("ti3dgs_i", root, given).runs for text in run.overrides)
+
+
+def test_methods_beyond_the_paper_join_its_table(tmp_path):
+    plan = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench"), methods=["etgs", "energy_balance"])
+    assert [run.row for run in plan.runs] == ["etgs", "energy_balance"]
+    lines = compare(plan, {("energy_balance", "cooling_bench"): Row("energy_balance", "x", {"psnr": [39.0]}, 1)})
+    (line,) = (line for line in lines if line.method == "energy_balance" and line.scene == "cooling_bench")
+    assert line.ours == {"psnr": 39.0} and not line.printed
+    assert "| cooling_bench | energy_balance | 39.00 / – | – | – |" in markdown(plan, lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "changes", "message"),
+    [
+        ("etgs_1", ("method",), {}, r"method=...: a table has several; choose among them with table.methods"),
+        ("etgs_1", ("data.scene",), {}, r"choose among them with table.scenes"),
+        (
+            "etgs_1",
+            (),
+            {"methods": ["nerf"]},
+            r"table.methods: nerf is neither in the table \(3dgs, .* nor in conf/method",
+        ),
+        ("ti3dgs_i", (), {"settings": ["8k"]}, r"table.settings: 8k is not in the table; there are '', 7k, 30k"),
+        ("etgs_1", (), {"scenes": ["bench"]}, r"table.scenes: bench is not in the table; there are cooling_checkboard"),
+        ("ti3dgs_i", (), {"protocols": {}}, r"setting 7k is in none of table.protocols"),
+    ],
+)
+def test_what_does_not_exist_is_named_with_what_does(name, given, changes, message):
+    with pytest.raises(SceneError, match=message):
+        plan_of(name, None, given, **changes)
+
+
+def results(scene: str, row: str, **values: float | list[float]) -> dict:
+    lists = {key: value if isinstance(value, list) else [value] for key, value in values.items()}
+    return {(row, scene): Row(row, scene, lists, max(len(value) for value in lists.values()))}
+
+
+def test_ours_stands_beside_the_printed_value_with_the_difference_and_its_cost(tmp_path):
+    plan = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench", "cooling_ebike"))
+    found = results("cooling_bench", "etgs", psnr=[38.0, 39.0], ssim=0.98, train_seconds=100.0, gaussians=1000.0)
+    found |= results("cooling_ebike", "etgs", psnr=[40.0, 41.0], ssim=0.99, train_seconds=200.0, gaussians=3000.0)
+    lines = {(line.scene, line.method): line for line in compare(plan, found)}
+    bench = lines["cooling_bench", "etgs"]
+    assert bench.printed["psnr"].printed == "38.25" and bench.difference("psnr") == pytest.approx(0.25)
+    assert bench.seeds == 2 and bench.spread["psnr"] == pytest.approx(0.5**0.5)
+    assert lines["average", "etgs"].ours == {}  # two of ten scenes are not the paper's average
+    ran = lines["mean of the scenes that ran", "etgs"]
+    assert ran.ours["psnr"] == 39.5 and ran.theirs["psnr"] == pytest.approx((38.25 + 41.67) / 2)
+    assert ran.cost == {"train_seconds": 150.0, "gaussians": 2000.0} and ran.label.endswith("(2 of 10)")
+    text = markdown(plan, list(lines.values()))
+    assert (
+        "| cooling_bench | etgs | 38.50 ± 0.71 / 38.25 (+0.25) | 0.9800 / 0.983 (-0.0030) | – / 0.050 | 100.0 | 1,000 |"
+        in text
+    )
+    assert "| cooling_bench | mip_splatting | – / " in text
+
+
+def test_an_average_over_all_scenes_is_their_mean(tmp_path):
+    plan = plan_of("etgs_1", everything(tmp_path, "etgs_1"))
+    found = {}
+    for i, scene in enumerate(plan.source.scenes):
+        found |= results(scene, "3dgs", psnr=30.0 + i)
+    lines = [line for line in compare(plan, found) if line.method == "3dgs"]
+    average = next(line for line in lines if line.scene == "average")
+    assert average.ours["psnr"] == 34.5 and average.difference("psnr") == pytest.approx(34.5 - 32.16)
+    assert not any(line.scene == "mean of the scenes that ran" for line in lines)
+
+
+def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
+    root = put(tmp_path, "images", "apples", "wall", "UAV1")
+    plan = plan_of("supirgs_3", root)
+    found = results("apples", "3dgs", train_seconds=600.0, render_fps=10.0) | results(
+        "wall", "3dgs", train_seconds=1200.0, render_fps=30.0
+    )
+    line = next(line for line in compare(plan, found) if line.method == "3dgs")
+    assert line.ours == {"train_min": 15.0, "fps": 20.0} and line.label == "(scenes not named) (2 of 20)"
+    direct = [run for run in plan.runs if run.method == "3dgs"]
+    assert len(direct) == 3 and direct[0].overrides[0] == "method=direct_3dgs"
+    tones = plan_of("supirgs_1", root)
+    found = (
+        results("apples", "supirgs", psnr=30.0)
+        | results("wall", "supirgs", psnr=32.0)
+        | results("uav1", "supirgs", psnr=9.0)
+    )
+    by_scene = {line.scene: line for line in compare(tones, found) if line.method == "supirgs"}
+    assert by_scene["ti_nsd_indoor"].ours["psnr"] == 31.0 and by_scene["ti_nsd_uav"].ours["psnr"] == 9.0
+    assert by_scene["ti_nsd_outdoor"].ours == {}
+
+
+def write_fake_rhd(root: Path, *scenes: str) -> Path:
+    """RHD with scenes that are the synthetic one."""
+    from dataclasses import replace
+
+    from datamodules.synthetic_scene.film import SIZES, film
+    from datamodules.synthetic_scene.presets import PRESETS
+    from datamodules.synthetic_scene.scene import Scene
+    from datamodules.synthetic_scene.writers import write_rhd
+
+    recording = film(Scene(PRESETS["cooling"]), replace(SIZES["tiny"], frames=12, points=200))
+    for scene in scenes:
+        write_rhd(recording, root / scene)
+    return root
+
+
+def command(*overrides: str, code: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "src" / "train.py"), *overrides],
+        capture_output=True, text=True, timeout=300, env={**os.environ, "COLUMNS": "200"},
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+SHORT = (
+    "max_steps=4", "threads=1", "data.downscale=2", "trainer.val_check_interval=4", "trainer.limit_val_batches=1",
+    "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
+)  # fmt: skip
+
+
+def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path):
+    root = write_fake_rhd(tmp_path / "RHD", "cooling_dumbbels")
+    output = command(
+        "experiment=table_etgs_7",
+        f"data.root={root}",
+        "table.methods=[etgs]",
+        *SHORT,
+        f"hydra.sweep.dir={tmp_path}/sweep",
+    )
+    assert "Missing: 9 scenes" in output and "ETGS, Tab. 7: ours beside the paper's" in output
+    with open(tmp_path / "sweep" / "comparison.csv", newline="") as file:
+        rows = {(row["scene"], row["method"], row["metric"]): row for row in csv.DictReader(file)}
+    ours = rows["cooling_dumbbells", "etgs", "train_s"]
+    assert 0 < float(ours["ours"]) == float(ours["train_seconds"]) and float(ours["gaussians"]) > 0
+    assert float(ours["difference"]) == pytest.approx(float(ours["ours"]) - float(ours["printed"]))
+    assert (
+        rows["cooling_dumbbells", "3dgs", "train_s"]["ours"] == ""
+        and rows["cooling_bench", "etgs", "train_s"]["printed"]
+    )
+    assert (tmp_path / "sweep" / "table.md").exists()
+    (folder,) = (path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert folder.name.startswith("etgs_cooling_dumbbels_") and (folder / "metrics.json").exists()
+
+
+@pytest.mark.slow
+def test_a_table_goes_on_when_more_scenes_come_and_with_several_seeds(tmp_path):
+    root = write_fake_rhd(tmp_path / "RHD", "cooling_dumbbels")
+    base = ("experiment=table_etgs_1", f"data.root={root}", "table.methods=[3dgs,etgs]", *SHORT, "seed=0,1")
+    sweep = f"hydra.sweep.dir={tmp_path}/sweep"
+    command(*base, sweep)
+    write_fake_rhd(root, "cooling_bench")
+    output = command(*base, "table.scenes=[cooling_bench,cooling_dumbbells]", sweep)
+    assert output.count("has results already; skipped") == 4 and "Missing" not in output
+    text = (tmp_path / "sweep" / "comparison.md").read_text()
+    for scene in ("cooling_bench", "cooling_dumbbells"):
+        for method in ("3dgs", "etgs"):
+            assert re.search(rf"\| {scene} \| {method} \| \d+\.\d+ ± \d+\.\d+ / \d+\.\d+ \([-+]\d+\.\d+\) \|", text)
+    assert "LPIPS" in text and "mean of the scenes that ran (2 of 10)" in text
+
+
+@pytest.mark.slow
+def test_without_data_nothing_trains_and_dry_runs_tell_only(tmp_path):
+    folder = f"hydra.sweep.dir={tmp_path}/sweep"
+    output = command("experiment=table_ti3dgs_ii", f"data.root={tmp_path}/none", folder, code=1)
+    assert "Missing: 7 scenes of TI-NSD" in output and "Traceback" not in output
+    root = put(tmp_path / "TI-NSD", "images", "chair")
+    output = command("experiment=table_ti3dgs_ii", f"data.root={root}", "table.dry=true", folder)
+    assert "4 runs (4 rows x 1 of 7 scenes)" in output and not (tmp_path / "sweep" / "table.md").exists()
+    output = command("experiment=table_ti3dgs_ii", f"data.root={root}", "method=etgs", folder, code=1)
+    assert "choose among them with table.methods" in output and "Traceback" not in output
+
+
+def test_a_run_that_failed_is_named_in_the_comparison(tmp_path):
+    plan = plan_of("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
+    job = tmp_path / "sweep" / "etgs_cooling_bench_" / ".hydra"
+    job.mkdir(parents=True)
+    (job / "overrides.yaml").write_text(yaml.safe_dump(["row='etgs'", "data.scene='cooling_bench'"]))
+    (job / "config.yaml").write_text(yaml.safe_dump({"data": {"scene": "cooling_bench"}}))
+    (job.parent / "FAILED").write_text("Traceback\nSceneError: no points\n")
+    write_comparison(tmp_path / "sweep", plan)
+    text = (tmp_path / "sweep" / "comparison.md").read_text()
+    assert "## Jobs without a result\n\n- etgs on cooling_bench: SceneError: no points" in text
