@@ -6,6 +6,7 @@ The name begins with an underscore because Hydra executes every other file of a 
 from __future__ import annotations
 
 import logging
+import os
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -88,6 +89,12 @@ class JobLauncher(Launcher):
     def arguments(self, job: Job) -> tuple[Any, ...]:
         """The arguments with which ``execute`` runs the job in any process; cloudpickle can pickle them."""
         return job, self.hydra_context, self.config, self.task_function, Singleton.get_state()
+
+
+def python_path() -> str:
+    """PYTHONPATH with which other processes import what this one did, installed or not."""
+    root = Path(__file__).resolve().parents[3]
+    return os.pathsep.join(filter(None, [str(root / "src"), str(root), os.environ.get("PYTHONPATH")]))
 
 
 def execute(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
 
-from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute_contained
+from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute_contained, python_path
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Ray(JobLauncher):
         except ImportError as error:
             raise ImportError("launcher=ray needs Ray: pip install -e '.[ray]'") from error
 
-        ray.init(address=self.address, log_to_driver=False)
+        ray.init(address=self.address, log_to_driver=False, runtime_env={"env_vars": {"PYTHONPATH": python_path()}})
         try:
             # One call per process: a job's memory is given back, and its peak is its own.
             options = {"num_cpus": self.num_cpus, "num_gpus": self.num_gpus, "max_calls": 1}

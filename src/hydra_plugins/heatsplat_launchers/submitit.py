@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import time
@@ -10,7 +11,7 @@ from typing import Any
 
 from hydra.core.utils import JobReturn
 
-from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute
+from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute, python_path
 
 try:
     from hydra_plugins.hydra_submitit_launcher.config import BaseQueueConf
@@ -61,6 +62,7 @@ class SubmititLauncher(JobLauncher):
         executor.update_parameters(
             **{name if name in common else f"{self.cluster}_{name}": value for name, value in params.items()}
         )
+        os.environ["PYTHONPATH"] = python_path()  # jobs inherit the environment
         arguments = zip(*(self.arguments(job) for job in jobs), strict=True)
         for waiting in executor.map_array(Requeued(), *arguments):
             yield attempt(lambda waiting=waiting: self.wait(waiting))

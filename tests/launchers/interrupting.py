@@ -1,0 +1,34 @@
+"""A callback for jobs of other processes: tells the threads that the job uses, and interrupts it once."""
+
+import json
+import os
+import signal
+
+import numba
+import pytorch_lightning as pl
+import torch
+
+
+class Interrupt(pl.Callback):
+    """Sends the job's own process a signal after a step, the first time that it gets there.
+
+    Writes threads.json beside the results: what torch and the kernels run on, and what the libraries were told.
+
+    Args:
+        step: after which the signal comes; None for never.
+        name: of the signal.
+    """
+
+    def __init__(self, step: int | None = None, name: str = "SIGKILL") -> None:
+        self.step, self.signal = step, signal.Signals[name]
+
+    def on_train_start(self, trainer, module):
+        used = {"torch": torch.get_num_threads(), "kernels": numba.get_num_threads()}
+        told = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
+        (module.output_dir / "threads.json").write_text(json.dumps(used | told | {"from_step": trainer.global_step}))
+
+    def on_train_batch_end(self, trainer, module, *_):
+        marker = module.output_dir / "interrupted"
+        if trainer.global_step == self.step and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), self.signal)

@@ -1,0 +1,104 @@
+"""Sweeps in many processes: the same bits as in one, whatever is killed; all results in one table."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+from running import run
+
+from heatsplat.cli import cores
+
+ROOT = Path(__file__).resolve().parents[2]
+SHORT = (
+    "method=3dgs", "data.size=tiny", "data.downscale=4", "max_steps=8", "callbacks.images=null", "callbacks.probes=null",
+    "callbacks.costs.fps_repeats=1", "callbacks.costs.warmup_steps=1", "callbacks.statistics=null",
+    "trainer.limit_val_batches=1", "trainer.limit_test_batches=1", "trainer.val_check_interval=8",
+)  # fmt: skip
+SPY = "+callbacks.spy._target_=interrupting.Interrupt"
+# A job that is left alone, one whose process is killed after step 4 of 8, and one that cannot be built.
+ROWS = (
+    f"{{whole:{{set:['{SPY}']}},"
+    f"cut:{{set:['{SPY}','+callbacks.spy.step=4','+callbacks.spy.name=%s']}},"
+    "broken:{set:['init.opacity=2.0']}}"
+)
+
+
+def sweep(folder: Path, launcher: str, name: str, *settings: str) -> subprocess.CompletedProcess:
+    """A finished sweep of the three rows under a launcher, with ``name`` as the signal that cuts the second."""
+    command = [
+        sys.executable, str(ROOT / "src" / "train.py"), "-m", *SHORT, "seed=0", f"launcher={launcher}", *settings,
+        f"hydra.sweeper.rows={ROWS % name}", f"hydra.sweep.dir={folder}",
+    ]  # fmt: skip
+    paths = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=280, env={**os.environ, "PYTHONPATH": paths}
+    )  # fmt: skip
+
+
+def job(folder: Path, number: int) -> Path:
+    (path,) = folder.glob(f"3dgs_static_{number}_*")
+    return path
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def check(done: subprocess.CompletedProcess, folder: Path, alone: Path, threads: int, goes_on_from: int) -> None:
+    """One job failed and says why, the others have the bits of a run ``alone``, and the table has all three."""
+    said = done.stdout + done.stderr
+    assert done.returncode == 1 and "init.opacity must lie in (0, 1)" in said, said
+    assert "init.opacity" in (job(folder, 2) / "FAILED").read_text()
+    expected = weights(alone)
+    for number in (0, 1):
+        assert not (job(folder, number) / "FAILED").exists()
+        found = weights(job(folder, number))
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[name], expected[name]) for name in expected), f"job {number} differs"
+        used = json.loads((job(folder, number) / "threads.json").read_text())
+        assert used["torch"] == used["kernels"] == threads
+        assert used["from_step"] == (goes_on_from if number else 0)
+    assert (job(folder, 1) / "interrupted").exists()
+    table = (folder / "table.md").read_text()
+    assert "| whole | 1 |" in table and "| cut | 1 |" in table and "- broken on static: " in table
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> Path:
+    """Folder of the same run, in this process and without a sweep."""
+    folder = tmp_path_factory.mktemp("alone")
+    run(folder, *SHORT, "seed=0", "test=false", "threads=2")
+    return folder
+
+
+@pytest.mark.skipif(find_spec("joblib") is None, reason="joblib is not installed: pip install -e '.[sweep]'")
+def test_jobs_side_by_side_share_the_cores_and_survive_a_killed_process(tmp_path, alone):
+    folder = tmp_path / "sweep"
+    done = sweep(folder, "joblib", "SIGKILL", "hydra.launcher.n_jobs=2")
+    check(done, folder, alone, threads=max(1, cores() // 2), goes_on_from=2)
+    told = json.loads((job(folder, 0) / "threads.json").read_text())
+    assert told["OMP_NUM_THREADS"] == told["NUMBA_NUM_THREADS"] == str(max(1, cores() // 2))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed: pip install -e '.[slurm]'"
+)
+def test_a_job_whose_time_is_over_goes_back_into_the_queue_and_on_from_its_checkpoint(tmp_path, alone):
+    """SIGUSR2 is what SLURM sends before the time limit; checkpoints come every two steps, and one more now."""
+    folder = tmp_path / "sweep"
+    done = sweep(folder, "submitit_local", "SIGUSR2")
+    check(done, folder, alone, threads=1, goes_on_from=5)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install -e '.[ray]'")
+def test_ray_starts_a_killed_job_again(tmp_path, alone):
+    folder = tmp_path / "sweep"
+    done = sweep(folder, "ray", "SIGKILL", "hydra.launcher.address=local")
+    check(done, folder, alone, threads=1, goes_on_from=2)
