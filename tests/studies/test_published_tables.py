@@ -12,6 +12,7 @@ import pytest
 import yaml
 from running import compose_run
 
+from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.studies.published import Plan, make_plan
 from heatsplat.studies.published.comparison import compare, markdown, write_comparison
@@ -280,20 +281,19 @@ def command(*overrides: str, code: int = 0) -> str:
 
 SHORT = (
     "max_steps=4", "threads=1", "data.downscale=2", "trainer.val_check_interval=4", "trainer.limit_val_batches=1",
-    "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
+    "trainer.limit_test_batches=2", "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
 )  # fmt: skip
 
 
-def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path):
+def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path, monkeypatch, caplog):
+    """In this process, to save its start; the slow tests give the command as a user does."""
     root = write_fake_rhd(tmp_path / "RHD", "cooling_dumbbels")
-    output = command(
-        "experiment=table_etgs_7",
-        f"data.root={root}",
-        "table.methods=[etgs]",
-        *SHORT,
-        f"hydra.sweep.dir={tmp_path}/sweep",
-    )
-    assert "Missing: 9 scenes" in output and "ETGS, Tab. 7: ours beside the paper's" in output
+    quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none")  # as this process has it
+    overrides = ("experiment=table_etgs_7", f"data.root={root}", "table.methods=[etgs]", *SHORT, *quiet)
+    monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.sweep.dir={tmp_path}/sweep"])
+    with caplog.at_level("INFO", logger="heatsplat"):
+        cli.train()
+    assert "Missing: 9 scenes" in caplog.text and "ETGS, Tab. 7: ours beside the paper's" in caplog.text
     with open(tmp_path / "sweep" / "comparison.csv", newline="") as file:
         rows = {(row["scene"], row["method"], row["metric"]): row for row in csv.DictReader(file)}
     ours = rows["cooling_dumbbells", "etgs", "train_s"]
