@@ -255,18 +255,18 @@ def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
     assert by_scene["ti_nsd_outdoor"].ours == {}
 
 
-def write_fake_rhd(root: Path, *scenes: str) -> Path:
-    """RHD with scenes that are the synthetic one."""
+def write_fake(layout: str, root: Path, *scenes: str) -> Path:
+    """A data set with scenes that are the synthetic one."""
     from dataclasses import replace
 
     from datamodules.synthetic_scene.film import SIZES, film
     from datamodules.synthetic_scene.presets import PRESETS
     from datamodules.synthetic_scene.scene import Scene
-    from datamodules.synthetic_scene.writers import write_rhd
+    from datamodules.synthetic_scene.writers import LAYOUTS
 
     recording = film(Scene(PRESETS["cooling"]), replace(SIZES["tiny"], frames=12, points=200))
     for scene in scenes:
-        write_rhd(recording, root / scene)
+        LAYOUTS[layout](recording, root / scene)
     return root
 
 
@@ -287,7 +287,7 @@ SHORT = (
 
 def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path, monkeypatch, caplog):
     """In this process, to save its start; the slow tests give the command as a user does."""
-    root = write_fake_rhd(tmp_path / "RHD", "cooling_dumbbels")
+    root = write_fake("rhd", tmp_path / "RHD", "cooling_dumbbels")
     quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none")  # as this process has it
     overrides = ("experiment=table_etgs_7", f"data.root={root}", "table.methods=[etgs]", *SHORT, *quiet)
     monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.sweep.dir={tmp_path}/sweep"])
@@ -310,11 +310,11 @@ def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path, 
 
 @pytest.mark.slow
 def test_a_table_goes_on_when_more_scenes_come_and_with_several_seeds(tmp_path):
-    root = write_fake_rhd(tmp_path / "RHD", "cooling_dumbbels")
+    root = write_fake("rhd", tmp_path / "RHD", "cooling_dumbbels")
     base = ("experiment=table_etgs_1", f"data.root={root}", "table.methods=[3dgs,etgs]", *SHORT, "seed=0,1")
     sweep = f"hydra.sweep.dir={tmp_path}/sweep"
     command(*base, sweep)
-    write_fake_rhd(root, "cooling_bench")
+    write_fake("rhd", root, "cooling_bench")
     output = command(*base, "table.scenes=[cooling_bench,cooling_dumbbells]", sweep)
     assert output.count("has results already; skipped") == 4 and "Missing" not in output
     text = (tmp_path / "sweep" / "comparison.md").read_text()
@@ -346,3 +346,28 @@ def test_a_run_that_failed_is_named_in_the_comparison(tmp_path):
     write_comparison(tmp_path / "sweep", plan)
     text = (tmp_path / "sweep" / "comparison.md").read_text()
     assert "## Jobs without a result\n\n- etgs on cooling_bench: SceneError: no points" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "layout", "scene", "metrics"),
+    [
+        ("ravigs_1", "thermoscenes", "double_robot", {"psnr", "ssim", "mae_c", "mae_roi_c"}),
+        ("ravigs_2", "thermoscenes", "buildingA_spring", {"rgb_psnr", "rgb_ssim"}),
+        ("supirgs_2", "thermoscenes", "trees", {"psnr", "ssim", "mae_c", "mae_roi_c"}),
+        ("supirgs_3", "ti_nsd", "UAV1", {"train_min", "memory_mb", "fps"}),
+        ("ti3dgs_iv", "ti_nsd", "Tall_Building", {"psnr", "ssim"}),
+        ("thermogs_2", "thermo", "S1", {"psnr", "ssim", "mae_c"}),
+        ("thermogs_9", "thermo", "S2", {"memory_gb", "fps"}),
+    ],
+)
+def test_tables_of_every_data_set_are_filled(name, layout, scene, metrics, tmp_path):
+    """One scene on disk: every row that is not the paper's alone has every metric but LPIPS."""
+    root = write_fake(layout, tmp_path / "data", scene)
+    short = [text for text in SHORT if "downscale" not in text]  # 4 divides the images' sides
+    output = command(f"experiment=table_{name}", f"data.root={root}", *short, f"hydra.sweep.dir={tmp_path}/sweep")
+    plan = plan_of(name, root, have=ALL_METHODS)
+    assert len({run.folder for run in plan.runs}) == 1 and "Jobs without a result" not in output
+    with open(tmp_path / "sweep" / "comparison.csv", newline="") as file:
+        ours = {(row["method"], row["setting"], row["metric"]) for row in csv.DictReader(file) if row["ours"]}
+    assert {(run.method, run.setting, metric) for run in plan.runs for metric in metrics} <= ours
