@@ -1,4 +1,4 @@
-"""What a camera does to a clean image: a chain of small parts, each the identity at first and bounded always."""
+"""What a camera does: what adds up in its pixels, and a chain of small parts, each the identity at first and bounded always."""
 
 from __future__ import annotations
 
@@ -68,3 +68,24 @@ class SensorChain(nn.Module):
     def effects(self) -> dict[str, dict[str, Any]]:
         """The effects that the parts simulate: catalogue name -> settings."""
         return {name: settings for part in self.parts.values() for name, settings in part.effects().items()}
+
+
+class Composite(nn.Module):
+    """Blends image values as they are, which are linear in temperature, as the papers do: nothing is computed.
+
+    A detector adds what it receives. Where a pixel is half a cold and half a warm surface, it records the mean radiance,
+    whose temperature lies above the mean temperature. A variant carries values over to a quantity that does add up, and
+    what is blended back; the renderer sees the former.
+    """
+
+    def prepare(self, scene: SceneData, modality: str) -> None:
+        """Takes what it needs from a scene. Called once, before anything else."""
+        return
+
+    def carried(self, values: Tensor, channels: int) -> Tensor:
+        """What is blended of image values [..., C], of which the first ``channels`` are the thermal image's."""
+        return values
+
+    def shown(self, blended: Tensor, channels: int) -> Tensor:
+        """The image values of what was blended, [..., C]."""
+        return blended

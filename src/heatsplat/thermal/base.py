@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from heatsplat.contracts import Camera, Environment, SceneData, SceneError
 from heatsplat.splats import Splats
 
-
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
 
 

@@ -17,7 +17,7 @@ from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs
 from heatsplat.renderers.settings import Renderer
-from heatsplat.sensors.base import SensorChain
+from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
@@ -44,6 +44,7 @@ class SplatTraining(pl.LightningModule):
         init: how splats start.
         optim: learning rates and schedule.
         stages: which parameters stand still at which steps; None: all train throughout.
+        composite: in which quantity splats are blended; None: in image values, as they are.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
         output_dir: folder of the run.
@@ -59,6 +60,7 @@ class SplatTraining(pl.LightningModule):
         init: Initialisation,
         optim: Optimisation,
         stages: Stages | None = None,
+        composite: Composite | None = None,
         seed: int = 0,
         supersample: int = 1,
         output_dir: Path | str = ".",
@@ -67,6 +69,7 @@ class SplatTraining(pl.LightningModule):
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
         self.stages = stages or Stages({})
+        self.composite = composite or Composite()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -93,11 +96,12 @@ class SplatTraining(pl.LightningModule):
         self.scene = scene
         self.thermal.prepare(scene)
         self.sensor.prepare(scene)
+        self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
-        self.register_buffer("background", torch.cat(behind))
+        self.register_buffer("background", self.composite.carried(torch.cat(behind), self.thermal.modality_channels[0]))
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -136,10 +140,12 @@ class SplatTraining(pl.LightningModule):
     def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
 
-        def emitted(ids: Tensor) -> Tensor:
-            return self.thermal.features(self.splats, _query(frame, ids)).features
+        channels = self.thermal.modality_channels[0]
 
-        return self.renderer(
+        def emitted(ids: Tensor) -> Tensor:
+            return self.composite.carried(self.thermal.features(self.splats, _query(frame, ids)).features, channels)
+
+        output = self.renderer(
             *self._geometry(frame),
             self.splats.opacities,
             emitted,
@@ -149,6 +155,7 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
         )
+        return replace(output, features=self.composite.shown(output.features, channels))
 
     def _geometry(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         """Means, rotations and scales of all Gaussians at the time of ``frame``."""
