@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 
 import numba
 import pytorch_lightning as pl
@@ -17,10 +18,11 @@ class Interrupt(pl.Callback):
     Args:
         step: after which the signal comes; None for never.
         name: of the signal.
+        pause_s: seconds to wait after every step, for a run that outlasts its time limit without a busy core.
     """
 
-    def __init__(self, step: int | None = None, name: str = "SIGKILL") -> None:
-        self.step, self.signal = step, signal.Signals[name]
+    def __init__(self, step: int | None = None, name: str = "SIGKILL", pause_s: float = 0.0) -> None:
+        self.step, self.signal, self.pause_s = step, signal.Signals[name], pause_s
 
     def on_train_start(self, trainer, module):
         used = {"torch": torch.get_num_threads(), "kernels": numba.get_num_threads()}
@@ -28,6 +30,7 @@ class Interrupt(pl.Callback):
         (module.output_dir / "threads.json").write_text(json.dumps(used | told | {"from_step": trainer.global_step}))
 
     def on_train_batch_end(self, trainer, module, *_):
+        time.sleep(self.pause_s)
         marker = module.output_dir / "interrupted"
         if trainer.global_step == self.step and not marker.exists():
             marker.touch()

@@ -14,7 +14,11 @@ MEMORY=$(awk '/MemTotal/ {print int($2 / 1024 * 0.9)}' /proc/meminfo)
 chmod 755 "$STATE"
 
 finish() {
-    scancel --user=root 2>/dev/null || true
+    scancel --partition=all 2>/dev/null || true
+    for _ in $(seq 20); do
+        [ -z "$(squeue --noheader 2>/dev/null)" ] && break
+        sleep 1
+    done
     for name in slurmd slurmctld munged; do
         [ -f "$STATE/$name.pid" ] && kill "$(cat "$STATE/$name.pid")" 2>/dev/null || true
     done
@@ -31,13 +35,13 @@ chmod 755 "$STATE/munge"
 munged --key-file="$STATE/munge/munge.key" --socket="$STATE/munge/socket" --pid-file="$STATE/munged.pid" \
     --log-file="$STATE/munge/log" --seed-file="$STATE/munge/seed" --force
 
-# No accounting and no cgroups: daemons and jobs are plain processes.
+# No accounting and no cgroups: daemons and jobs are plain processes. A requeued job waits for cred_expire (120 s by default).
 cat > "$STATE/slurm.conf" <<CONF
 ClusterName=single
 SlurmctldHost=$HOST(127.0.0.1)
 SlurmUser=root
 AuthType=auth/munge
-AuthInfo=socket=$STATE/munge/socket
+AuthInfo=socket=$STATE/munge/socket,cred_expire=20
 CredType=cred/munge
 MpiDefault=none
 ProctrackType=proctrack/linuxproc
@@ -72,11 +76,11 @@ sinfo --version
 sinfo
 
 # Rows: a job left alone, one whose time is over after step 4 (SIGUSR2, which SLURM sends before the limit), one that runs
-# into a real limit of a minute, one that is killed, one that cannot be built. Two jobs at a time.
+# into a real limit of two minutes, one that is killed, one that cannot be built. Two jobs at a time.
 SPY=+callbacks.spy._target_=interrupting.Interrupt
 ROWS="{whole:{set:['$SPY']},\
 preempted:{set:['$SPY','+callbacks.spy.step=4','+callbacks.spy.name=SIGUSR2']},\
-long:{set:['$SPY','max_steps=${LONG_STEPS:-20000}','callbacks.metrics=null']},\
+long:{set:['$SPY','+callbacks.spy.pause_s=1.5','max_steps=60']},\
 killed:{set:['$SPY','+callbacks.spy.step=4','+callbacks.spy.name=SIGKILL']},\
 broken:{set:['init.opacity=2.0']}}"
 export PYTHONPATH="$ROOT/tests/launchers"
@@ -84,7 +88,7 @@ sweep() {
     "$PYTHON" "$ROOT/src/train.py" -m method=3dgs data.size=tiny data.downscale=4 max_steps=8 callbacks.images=null \
         callbacks.probes=null callbacks.costs.fps_repeats=1 trainer.limit_val_batches=1 trainer.limit_test_batches=1 \
         seed=0 launcher=slurm hydra.launcher.gpus_per_node=null hydra.launcher.cpus_per_task=1 \
-        hydra.launcher.array_parallelism=2 hydra.launcher.timeout_min=1 hydra.launcher.signal_delay_s=15 \
+        hydra.launcher.array_parallelism=2 hydra.launcher.timeout_min=2 hydra.launcher.signal_delay_s=30 \
         hydra.launcher.max_num_timeout=10 "hydra.sweeper.rows=$ROWS" "hydra.sweep.dir=$STATE/sweep" "$@" 2>&1
 }
 report() {
@@ -98,7 +102,7 @@ report() {
 }
 
 # What the queue looks like meanwhile.
-( for _ in $(seq 4); do sleep 15; squeue --array --format='%.8i %.10T %.6M %.9l'; done ) &
+( for _ in $(seq 5); do sleep 50; squeue --array --format='%.8i %.10T %.6M %.9l'; done ) &
 echo "== the sweep" && sweep | grep -v '^$' | tail -n 12 || true
 wait
 report

@@ -65,7 +65,11 @@ def check(done: subprocess.CompletedProcess, folder: Path, alone: Path, threads:
         assert used["from_step"] == (goes_on_from if number else 0)
     assert (job(folder, 1) / "interrupted").exists()
     table = (folder / "table.md").read_text()
-    assert "| whole | 1 |" in table and "| cut | 1 |" in table and "- broken on static: " in table
+    assert (
+        "| whole | 1 |" in table
+        and "| cut | 1 |" in table
+        and "- broken on static: ValueError('init.opacity must" in table
+    )
 
 
 @pytest.fixture(scope="module")

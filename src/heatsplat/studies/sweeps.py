@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -139,11 +140,12 @@ def _number(job: Path) -> tuple[int, str]:
 
 
 def _reason(job: Path) -> str:
-    """Why a job has no result: the last line of its FAILED file."""
+    """Why a job has no result: the last line of its FAILED file that names an error, since Hydra adds lines of its own."""
     if not (job / FAILED).exists():
         return "not finished"
-    lines = [line for line in (job / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
-    return lines[-1].strip() if lines else "failed"
+    lines = [line.strip() for line in (job / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
+    named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
+    return (named or lines or ["failed"])[-1]
 
 
 def _columns(rows: Iterable[Row]) -> dict[str, tuple[str, int]]:
