@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from heatsplat.geometry.resampling import resampled
-from heatsplat.physics import relaxation
+from heatsplat.physics import energy_balance, planck, relaxation
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface
 from heatsplat.physics.relaxation import temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
 from heatsplat.sensors import tone
+from heatsplat.splats import Splats
+from heatsplat.thermal.conduction import _ImplicitStep, laplacian
+from heatsplat.thermal.ntr_gaussian import NtrGaussian
 
 DOUBLE = torch.float64
 
@@ -144,3 +147,93 @@ def test_enlarging_an_image():
 
     assert order([16, 32, 64], lambda n: error(n, "bilinear")) == pytest.approx(2.0, abs=0.2)
     assert order([16, 32, 64], lambda n: error(n, "bicubic")) > 2.7
+
+
+def test_nodes_of_the_cooling_integral():
+    """NTR-Gaussian's trapezoid rule over the window: the second order in the spacing of its nodes."""
+    generator = torch.Generator().manual_seed(0)
+    model = NtrGaussian(width=16, time_frequencies=1).double().eval()
+    for parameter in model.parameters():
+        parameter.data = torch.randn(parameter.shape, generator=generator, dtype=DOUBLE) * 0.3
+    model.bounds_k.copy_(torch.tensor([283.0, 20.0]))
+    model.clock.copy_(torch.tensor([0.0, 3600.0]))
+    means = torch.rand(20, 3, generator=generator, dtype=DOUBLE)
+    feature = torch.rand(20, 8, generator=generator, dtype=DOUBLE)
+    shapes = {"log_scales": torch.zeros(20, 3), "quats": torch.ones(20, 4), "opacity_logits": torch.zeros(20, 1)}
+    cloud = Splats({"means": means, "feature": feature, **shapes})
+
+    @torch.no_grad()
+    def solved(intervals: float) -> torch.Tensor:
+        model.nodes = int(intervals) + 1
+        return model._units(cloud, None, 3600.0)
+
+    fine = solved(4096)
+    assert order([8, 16, 32, 64], lambda n: (solved(n) - fine).norm().item()) == pytest.approx(2.0, abs=0.3)
+
+
+def test_nodes_of_a_band():
+    """Gauss and Legendre's rule on an analytic function: digits grow with the nodes, faster than any order."""
+    cold = torch.tensor([20.0], dtype=DOUBLE)
+    exact = planck.Band(nodes=64).radiance(cold)
+    errors = [abs(planck.Band(nodes=n).radiance(cold) / exact - 1).item() for n in (6, 9, 12, 15)]
+    assert errors[0] < 1
+    for before, after in zip(errors, errors[1:], strict=False):
+        assert after < 0.05 * before
+    falls = [math.log(b / a) for b, a in zip(errors, errors[1:], strict=False)]
+    assert falls == sorted(falls)
+
+
+def quadratic(errors: Sequence[float]) -> bool:
+    """Whether every error above rounding is that before it squared, times some number that stays alike."""
+    factors = [after / before**2 for before, after in zip(errors, errors[1:], strict=False) if after > 1e-13]
+    return len(factors) >= 2 and max(factors) < 10 * min(factors)
+
+
+def test_corrections_of_a_temperature_found_in_a_table(monkeypatch):
+    """Newton's steps square the error of the table they start from."""
+    monkeypatch.setattr(planck, "ENTRIES", 6)
+    kelvins = torch.tensor([260.0], dtype=DOUBLE)
+    sent = planck.Band().radiance(kelvins)
+
+    def error(steps: int) -> float:
+        monkeypatch.setattr(planck, "POLISH", steps)
+        return abs(planck.Band().temperature(sent) / kelvins - 1).item()
+
+    assert quadratic([error(steps) for steps in range(5)])
+
+
+def test_corrections_of_the_mean_balance(monkeypatch):
+    """Newton's steps towards the temperature at which the mean balance is even, one more of which gives the result."""
+    level = torch.zeros(2, dtype=DOUBLE)
+    climate = Climate(Drivers(torch.tensor([0.0, 3600.0], dtype=DOUBLE), 288.0, level, sky=level - 60, light=level + 1))
+    one = torch.ones(1, dtype=DOUBLE)
+    surface = Surface(0 * one, 0 * one, 150 * one, 0.98 * one)
+
+    def solved(steps: int) -> float:
+        monkeypatch.setattr(energy_balance, "NEWTON_STEPS", steps)
+        return climate.mean_temperature(surface).item()
+
+    exact = solved(12)
+    errors = [abs(solved(steps) - exact) / 288.0 for steps in range(5)]
+    assert errors[-1] < 1e-9 and quadratic(errors)
+
+
+def chain(count: int = 24) -> torch.Tensor:
+    """Laplacian of Gaussians in a row."""
+    edges = torch.stack([torch.arange(count - 1), torch.arange(1, count)])
+    return laplacian(edges, count).double()
+
+
+def test_steps_of_conduction():
+    """Backward Euler: one step errs by the second power of its length, and so many over a time by the first."""
+    matrix, start = chain(), torch.sin(torch.arange(24, dtype=DOUBLE) / 4)[:, None]
+
+    def error(steps: int, time: float) -> float:
+        values = start
+        for _ in range(steps):
+            values = _ImplicitStep.apply(values, torch.tensor(time / steps, dtype=DOUBLE), matrix)
+        exact = torch.matrix_exp(-time * matrix.to_dense()) @ start
+        return (values - exact).abs().max().item()
+
+    assert order([4, 8, 16, 32], lambda n: error(int(n), 2.0)) == pytest.approx(1.0, abs=0.15)
+    assert order([8, 16, 32, 64], lambda n: error(1, 2.0 / n)) == pytest.approx(2.0, abs=0.2)

@@ -9,10 +9,12 @@ from draws import logarithmic
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from physics.harmonic_reference import exact, joint_error, own_error
+from physics.planck_reference import band_radiance, band_slope
 
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.frequencies import LOWEST_HZ, NARROWEST_BAND, frequency_grid
 from heatsplat.physics.fused import SMALLEST_OMEGA, visible_temperature
+from heatsplat.physics.planck import Band
 from heatsplat.physics.relaxation import harmonic_response, relax, response_slope, temperature
 from heatsplat.physics.responses import step_weights
 
@@ -191,3 +193,52 @@ def test_the_frequency_grid_lies_between_its_bounds(values, count, tau_min, gain
             followed = float(mpmath.sqrt(1 / mpmath.mpf(gain) ** 2 - 1) / tau_min)
         highest = max(min(sampled, followed), NARROWEST_BAND * lowest)
         assert count == 1 or omega[-1].item() == pytest.approx(highest, rel=1e-12)
+
+
+BANDS = Band(), Band(3.0, 5.0), Band(8.0, 8.1), Band(10.0, 1000.0)
+SENT = {
+    torch.float32: 2e-7,
+    torch.float64: 5e-14,
+}  # relative, down to 1e-30 W/(m² sr); e^{-x} multiplies an error of x by x
+
+
+@pytest.mark.parametrize("dtype", SENT, ids=str)
+@settings(max_examples=40)
+@given(logarithmic(1.0, 1e4, 300.0), logarithmic(1.0, 1000.0, 7.5))
+@example(1e4, 1000.0)
+@example(1.0, 1.0)
+def test_what_a_black_body_sends_keeps_its_digits(dtype, temperature, wavelength):
+    """Bands from 1 .. 1000 µm to twice that, on which x is anything between 7e-4 and 1.4e4."""
+    kelvins = double(temperature).to(dtype).requires_grad_()
+    sent = Band(wavelength, 2 * wavelength).radiance(kelvins)
+    sent.sum().backward()
+    with mpmath.workdps(30):
+        band = mpmath.mpf(temperature), mpmath.mpf(wavelength), 2 * mpmath.mpf(wavelength)
+        truth, slope = float(band_radiance(*band)), float(band_slope(*band))
+    assert abs(sent.item() - truth) <= SENT[dtype] * (truth + 1e-30)
+    assert abs(kelvins.grad.item() - slope) <= SENT[dtype] * (slope + 1e-30)
+
+
+@pytest.mark.parametrize("dtype", SENT, ids=str)
+@settings(max_examples=40)
+@given(logarithmic(12.0, 9.9e3, 300.0), st.sampled_from(BANDS))
+def test_a_temperature_is_found_again_in_what_it_sends(dtype, temperature, band):
+    radiance = band.radiance(double(temperature).to(dtype)).requires_grad_()
+    if radiance.item() <= torch.finfo(dtype).tiny:
+        return
+    found = band.temperature(radiance)
+    found.sum().backward()
+    assert found.item() == pytest.approx(temperature, rel=SENT[dtype])
+    kelvins = double(temperature).to(dtype).requires_grad_()
+    band.radiance(kelvins).sum().backward()
+    assert radiance.grad.item() * kelvins.grad.item() == pytest.approx(1, rel=50 * SENT[dtype])
+
+
+@settings(max_examples=100)
+@given(st.lists(st.one_of(logarithmic(1e-45, 3e38, 0.0), st.floats(-1e3, 0)), min_size=2, max_size=8))
+def test_temperatures_rise_with_radiance_whatever_it_is(values):
+    radiances = double(*sorted(values)).requires_grad_()
+    found = BANDS[0].temperature(radiances)
+    found.sum().backward()
+    assert (found.diff() >= -1e-9).all() and found.min() >= 1 and found.max() <= 1e4
+    assert radiances.grad.isfinite().all() and (radiances.grad >= 0).all()

@@ -121,6 +121,11 @@ MUTATIONS = (
         f"{HEAT}::test_radiation_near_the_reference_keeps_its_digits",
     ),
     Mutation(
+        "1/(e^x - 1) of Planck's law", "physics.planck",
+        "sent = weights * decay / -torch.expm1(-x)", "sent = weights / (torch.exp(x) - 1)",
+        f"tests/physics/test_planck.py {HEAT}::test_what_a_black_body_sends_keeps_its_digits",
+    ),
+    Mutation(
         "1 - e^{-y} of slow bodies", "physics.responses",
         "-torch.expm1(-y) / torch.where(y > 0, y, 1.0)", "(1 - decay) / torch.where(y > 0, y, 1.0)",
         f"{HEAT}::test_weights_of_a_step_keep_their_digits",

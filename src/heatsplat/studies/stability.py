@@ -23,6 +23,7 @@ log = logging.getLogger("heatsplat")
 FAMILIES = {
     "closed_form": "Heat in closed form",
     "balance": "Balance of heat",
+    "black_bodies": "Black bodies",
     "splatting": "Splatting",
     "sensing": "Sensor and field",
     "images": "Losses",
