@@ -256,15 +256,17 @@ def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
 
 
 def write_fake(layout: str, root: Path, *scenes: str) -> Path:
-    """A data set with scenes that are the synthetic one."""
+    """A data set with scenes that are the synthetic room, or the yard with its weather for Thermo."""
     from dataclasses import replace
 
     from datamodules.synthetic_scene.film import SIZES, film
+    from datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
     from datamodules.synthetic_scene.presets import PRESETS
     from datamodules.synthetic_scene.scene import Scene
     from datamodules.synthetic_scene.writers import LAYOUTS
 
-    recording = film(Scene(PRESETS["cooling"]), replace(SIZES["tiny"], frames=12, points=200))
+    world = OutdoorScene(OUTDOOR["outdoor"]) if layout == "thermo" else Scene(PRESETS["cooling"])
+    recording = film(world, replace(SIZES["tiny"], frames=12, points=200))
     for scene in scenes:
         LAYOUTS[layout](recording, root / scene)
     return root
