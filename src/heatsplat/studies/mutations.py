@@ -123,7 +123,7 @@ MUTATIONS = (
     Mutation(
         "1/(e^x - 1) of Planck's law", "physics.planck",
         "sent = weights * decay / -torch.expm1(-x)", "sent = weights / (torch.exp(x) - 1)",
-        f"tests/physics/test_planck.py {HEAT}::test_what_a_black_body_sends_keeps_its_digits",
+        f"{HEAT}::test_what_a_black_body_sends_keeps_its_digits",
     ),
     Mutation(
         "1 - e^{-y} of slow bodies", "physics.responses",
