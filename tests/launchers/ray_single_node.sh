@@ -35,12 +35,12 @@ sweep() {
 report() {
     for job in "$STATE"/sweep/3dgs_*; do
         printf '%s  metrics.json: %s  FAILED: %s\n' "$(sed -n 's/.*row=//p' "$job/.hydra/overrides.yaml" | tr -d "'\"")" \
-            "$([ -f "$job/metrics.json" ] && echo yes || echo no)" "$(tail -n 1 "$job/FAILED" 2>/dev/null || echo no)"
+            "$([ -f "$job/metrics.json" ] && echo yes || echo no)" "$(grep -E '^[A-Za-z_.]*(Error|Exception)' "$job/FAILED" 2>/dev/null | tail -n 1 | grep . || echo no)"
         grep -h 'going on from step' "$job/run.log" | sed 's/.*\(going on from step [0-9]*\).*/    \1/' || true
     done
     cat "$STATE/sweep/table.md"
 }
-echo "== the sweep" && sweep | grep '#' || true
+echo "== the sweep" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
 report
-echo "== the same command once more" && sweep | grep '#' || true
+echo "== the same command once more" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
 report

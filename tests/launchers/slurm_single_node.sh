@@ -94,17 +94,17 @@ sweep() {
 report() {
     for job in "$STATE"/sweep/3dgs_*; do
         printf '%s  metrics.json: %s  FAILED: %s\n' "$(sed -n 's/.*row=//p' "$job/.hydra/overrides.yaml" | tr -d "'\"")" \
-            "$([ -f "$job/metrics.json" ] && echo yes || echo no)" "$(tail -n 1 "$job/FAILED" 2>/dev/null || echo no)"
+            "$([ -f "$job/metrics.json" ] && echo yes || echo no)" "$(grep -E '^[A-Za-z_.]*(Error|Exception)' "$job/FAILED" 2>/dev/null | tail -n 1 | grep . || echo no)"
         grep -h 'going on from step' "$job/run.log" | sed 's/.*\(going on from step [0-9]*\).*/    \1/' || true
     done
-    grep -h -E 'timed-out|preempted|Requeued' "$STATE"/sweep/.submitit/*/*.{out,err} | sed 's/.*\(Caught\|Requeued\)/\1/' || true
+    grep -h -E 'timed-out|preempted|Requeued' "$STATE"/sweep/.submitit/*/*.out | sed 's/.*\(Caught\|Requeued\)/\1/' || true
     cat "$STATE/sweep/table.md"
 }
 
 # What the queue looks like meanwhile.
-( for _ in $(seq 5); do sleep 50; squeue --array --format='%.8i %.10T %.6M %.9l'; done ) &
-echo "== the sweep" && sweep | grep -v '^$' | tail -n 12 || true
+( for _ in $(seq 4); do sleep 45; squeue --array --format='%.8i %.10T %.6M %.9l'; done ) &
+echo "== the sweep" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
 wait
 report
-echo "== the same command once more" && sweep | tail -n 8 || true
+echo "== the same command once more" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
 report

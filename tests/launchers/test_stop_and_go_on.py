@@ -1,0 +1,89 @@
+"""What a job does when it is told to stop, and where it goes on when it is started again."""
+
+import os
+import signal
+
+import pytest
+import torch
+from hydra.core.utils import JobStatus
+from omegaconf import OmegaConf
+from running import TINY, compose_run
+
+from heatsplat import cli
+from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR2"])
+def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name):
+    heard, number = [], signal.Signals[name]
+    before = signal.signal(number, lambda got, _: heard.append(got))
+    try:
+        with pytest.raises(KeyboardInterrupt), cli.stoppable():
+            os.kill(os.getpid(), number)
+            assert heard == [], "heard before the job had stopped"
+            signal.pause()
+        assert heard == [number]
+        os.kill(os.getpid(), number)
+        assert heard == [number, number], "the listener was not put back"
+    finally:
+        signal.signal(number, before)
+
+
+def test_ctrl_c_is_nobody_elses():
+    heard = []
+    before = signal.signal(signal.SIGTERM, lambda got, _: heard.append(got))
+    try:
+        with pytest.raises(KeyboardInterrupt), cli.stoppable():
+            raise KeyboardInterrupt
+        assert heard == []
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize(("jobs", "expected"), [(1, 6), (2, 3), (4, 1), (9, 1), (-1, 1)])
+def test_jobs_side_by_side_get_fair_shares_of_the_cores(jobs, expected, tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "cores", lambda: 6)
+    sweep = ("method=3dgs", "launcher=joblib", f"hydra.launcher.n_jobs={jobs}")
+    assert compose_run(tmp_path, *sweep).threads is None, "a single run has all cores"
+    assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN").threads == expected
+    assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN", "threads=5").threads == 5
+
+
+def configured(folder, *overrides):
+    return OmegaConf.to_container(compose_run(folder, *TINY, "method=3dgs", "max_steps=8", *overrides), resolve=True)
+
+
+def stored(folder, name, step, recipe):
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    path = folder / "checkpoints" / name
+    torch.save({"global_step": step, "heatsplat": {"recipe": recipe}}, path)
+    os.utime(path, (step, step))
+
+
+def test_a_run_goes_on_from_the_newest_checkpoint_that_can_be_read_and_is_not_the_last(tmp_path):
+    plain = configured(tmp_path)
+    assert cli.begun(plain, None, tmp_path) is None
+    stored(tmp_path, "step_000002.ckpt", 2, plain)
+    stored(tmp_path, "step_000004.ckpt", 4, plain | {"threads": 1, "ckpt": "elsewhere"})
+    stored(tmp_path, "last.ckpt", 8, plain)
+    broken = tmp_path / "checkpoints" / "step_000006.ckpt"
+    broken.write_bytes(b"half a file")
+    os.utime(broken, (6, 6))
+    assert cli.begun(plain, None, tmp_path) == plain | {"ckpt": str(tmp_path / "checkpoints" / "step_000004.ckpt")}
+    assert cli.begun(plain | {"ckpt": "given.ckpt"}, None, tmp_path) is None
+
+
+def test_a_run_with_other_settings_starts_from_the_beginning_and_says_so(tmp_path, caplog):
+    stored(tmp_path, "last.ckpt", 4, configured(tmp_path, "optim.means=1e-3"))
+    assert cli.begun(configured(tmp_path), None, tmp_path) is None
+    assert "has other settings (module, optim); starting from the beginning" in caplog.text
+
+
+def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):
+    job = Job(3, ("seed=1",), tmp_path / "job", None)
+    failed = _died(job, DiedError("its process was\nkilled"))
+    assert failed.status == JobStatus.FAILED
+    assert (job.folder / "FAILED").read_text() == "DiedError: its process was killed\n"
+    (job.folder / "FAILED").write_text("what the job said itself")
+    _died(job, DiedError("later"))
+    assert (job.folder / "FAILED").read_text() == "what the job said itself"
