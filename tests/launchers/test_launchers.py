@@ -36,7 +36,7 @@ def sweep(folder: Path, launcher: str, name: str, *settings: str) -> subprocess.
     ]  # fmt: skip
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=280, env={**os.environ, "PYTHONPATH": paths}
+        command, capture_output=True, text=True, timeout=600, env={**os.environ, "PYTHONPATH": paths}
     )  # fmt: skip
 
 
