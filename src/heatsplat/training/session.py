@@ -38,7 +38,8 @@ NOISE = (
 def prepare_machine(threads: int | None) -> None:
     """Fixes the number of CPU threads (None takes all cores) and quietens messages that no user can act on."""
     threads = threads or os.cpu_count() or 1
-    use_threads(threads)  # first: starting the kernels' threads sets OpenMP's number, which is torch's too, to all cores
+    # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
+    use_threads(threads)
     torch.set_num_threads(threads)
     for pattern in NOISE:
         warnings.filterwarnings("ignore", message=pattern)
