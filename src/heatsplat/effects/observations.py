@@ -18,7 +18,8 @@ from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
 from heatsplat.geometry.projection import to_camera, to_pixels
 
 MOST_FRAMES = 64
-MOST_POINTS = 500  # points whose tracks are fitted; all of them, up to MOST_IN_FRONT, hide each other
+# Points whose tracks are fitted, and their observations, by which time goes; all points, up to MOST_IN_FRONT, hide each other.
+MOST_POINTS, MOST_OBSERVATIONS = 500, 16_000
 MOST_CANDIDATES = 1500
 MOST_IN_FRONT = 20000
 LEAST_PX = 8  # along the shorter side of an image
@@ -208,11 +209,12 @@ def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> 
     if not often.any():
         return None
     tracks = tracks.of(often.nonzero()[:, 0])
-    if len(tracks.points) <= MOST_POINTS:
+    most = min(MOST_POINTS, MOST_OBSERVATIONS // count)
+    if len(tracks.points) <= most:
         return tracks
     # The points of even surroundings: a point at an edge shows how well it is placed and little else.
     mean = (tracks.slopes * tracks.weights).sum(1) / tracks.weights.sum(1)
-    return tracks.of(mean.argsort()[:MOST_POINTS].sort().values)
+    return tracks.of(mean.argsort()[:most].sort().values)
 
 
 def _steepest(images: Tensor, noise: float) -> Tensor:

@@ -32,7 +32,9 @@ DECAYS_FEW = (0.7, 3.0, 12.0)
 COURSES = (1, 2, 3)
 STRENGTHS = 12  # iterations for the strength of a random pattern
 SWEEPS = 4  # of alternating least squares for them
-NODES = 5  # of the grids on which a fixed pattern is looked for
+NODES, NODES_FEW = 7, 5  # along the sides of the grids on which a fixed pattern is looked for
+MANY = 10_000  # observations from which the finer grid pays
+FINE_NODES = 9  # where the pattern is a random field, which more nodes than it needs do no harm
 OUTLIER = 5.0  # an observation this many times the usual residual away counts nothing (Tukey's weights)
 DISTRUSTED = 0.15  # share of the points, those that are fitted worst, that is left out: edges and hidden points
 # No fit is taken to be better than this, in squares of the expected error: a value between four pixels is less noisy.
@@ -41,6 +43,7 @@ FLOOR = 0.1
 LEAST_ASTRAY_PX, MOST_ASTRAY_PX = 0.05, 0.4
 MEDIAN_OF_CHI2 = 0.455  # of one degree of freedom
 FEW = 4.0  # how many observations the usual residual counts for beside a point's own
+WELL_SEEN = 2.5  # observations of a point for each of its own numbers before a driven scene is taken for granted
 LEAST_FREE = 4  # observations of a point that its own parameters must leave free
 RIDGE = 1e-9
 
@@ -204,16 +207,25 @@ class Joint:
     def selected(self) -> Model:
         """The model that explains most with least.
 
-        Effects are taken in one at a time, in two orders: whichever explains most, and those of the sensor first. A change
-        of all points in common is cheap as an offset and dear as courses of every point, but the courses explain more at
-        once: only the ends of the two ways tell which was right.
+        Effects are taken in one at a time, from three starts: from nothing, whichever explains most; those of the sensor
+        first; and from a driven scene before an uneven camera. A change of all points in common is cheap as an offset and
+        dear as courses of every point, but the courses explain more at once; and where a source and a pattern are at work,
+        neither explains much alone: only the ends of the ways tell which was right.
         """
         start = (self.weights, self.trust)
+        starts = [(Model(), SENSOR_FIRST), (Model(), ())]
+        known = 2 + self._decays.shape[1] if self._span > 0 else 0  # numbers of a point of a driven scene
+        if self._moves and "harmonic_source" in self.rich.own and self._usual_length >= WELL_SEEN * known:
+            starts.append((replace(self.rich, shared=frozenset({"fixed_pattern"})), ()))
         ends = []
-        for first in (SENSOR_FIRST, ()):
+        for begin, first in starts:
             self._restart(start)
-            model = self._grown(Model(), first) if first else Model()
-            model = self._grown(model, (*SHARED, *OWN, "attenuation"))
+            if begin.names():
+                self._accept(begin)
+                self._accept(begin)
+                if not begin.names() <= self._pruned(begin).names():
+                    continue
+            model = self._grown(self._grown(begin, first), (*SHARED, *OWN, "attenuation"))
             if model not in ends:
                 ends.append(model)
         model = min(ends, key=lambda one: self._compared(one, start))
@@ -335,7 +347,7 @@ class Joint:
     def _rank(self, model: Model) -> int:
         """How many independent numbers the shared effects of a model have."""
         sizes = {"frame_offset": self.frames - 1, "agc": self.frames - 1, "vignetting": 2, "reflection": 8, "tone": 2}
-        return sum(sizes.get(name, 2 * NODES**2 - 2) for name in model.shared)
+        return sum(sizes.get(name, 2 * self._nodes**2 - 2) for name in model.shared)
 
     def _own(self, model: Model) -> tuple[Tensor, Tensor, int]:
         """Values [P, F], basis [P, F, k] of a point's own part, and the number of parameters of the path."""
@@ -417,7 +429,12 @@ class Joint:
         inner = scale[:, None] * gram[1:, 1:] * scale + RIDGE * torch.eye(len(scale), dtype=gram.dtype)
         weights = scale * torch.linalg.solve(inner, scale * gram[1:, 0])
         parts = weights.split([block.shape[2] for block in blocks.values()])
-        return {name: block @ part for (name, block), part in zip(blocks.items(), parts, strict=True)}
+        numbers = dict(zip(blocks, parts, strict=True))
+        added = {name: block @ _settled(name, numbers[name]) for name, block in blocks.items()}
+        if "agc" in added:  # what a gain that all images share makes of what earlier stages added is theirs
+            for name in added.keys() & self._known.keys() & {"reflection", "fixed_pattern", "vignetting"}:
+                added[name] = added[name] + numbers["agc"].mean() * self._known[name]
+        return added
 
     def _accept(self, model: Model) -> None:
         """Makes a model the one about which products of effects are linearised."""
@@ -565,17 +582,19 @@ class Joint:
         cost = costs[1] - costs[0]
         return (criteria[0] - criteria[1]) / cost if cost > 0 else 0.0
 
-    def radial_gain(self, model: Model) -> float:
-        """What a falloff gains when the rest of the pattern is a random field as strong as it turns out to be.
+    def falloff(self, model: Model) -> tuple[float, float]:
+        """By what share the image is brighter in its corners than in its middle (negative where it fades), and what such
+        a falloff gains when the rest of the pattern is a random field as strong as it turns out to be.
 
         A random field has a radial part, too; a falloff is there when that part stands out of what its other parts lead
-        one to expect. The strength of the field is found by expectation and maximisation.
+        one to expect. The strength of the field is found by expectation and maximisation, and the falloff has to earn its
+        two numbers against the field's nodes, of which each is about one observation of it.
         """
         none = replace(model, shared=model.shared - {"vignetting", "fixed_pattern"})
         shared = self._shared(none)
         image = self._scenes[replace(model, shared=frozenset())]
         values, basis, _ = self._own(none)
-        radial, field = self._vignetting(image), self._fixed_pattern(image)
+        radial, field = self._vignetting(image), self._fixed_pattern(image, FINE_NODES)
         columns = torch.cat([values[..., None], field, radial, *shared.values()], dim=2)
         gram = self._gram(basis, columns)
         scale = gram.diagonal()[1:].clamp_min(1e-150).rsqrt()
@@ -589,19 +608,11 @@ class Joint:
             found = ((inverse @ right) ** 2 + inverse.diagonal()) * scale**2
             for part in (slice(0, half), slice(half, n)):
                 loose[part] = 1.0 / (found[part].mean().clamp_min(1e-12) * scale[part] ** -2)
-        kept = torch.ones(len(inner), dtype=torch.bool)
-        kept[n : n + radial.shape[2]] = False
-        penalised = inner + loose.diag()
-        whole = right @ torch.linalg.solve(penalised, right)
-        less = right[kept] @ torch.linalg.solve(penalised[kept][:, kept], right[kept])
-        return float(whole - less) / (radial.shape[2] * math.log(max(self.observations, 3)))
-
-    def falloff(self, model: Model) -> float:
-        """By what share the image is brighter in its corners than in its middle; negative where it fades."""
-        r2 = self.tracks.radii
-        added, scene = self.contributions(model)["vignetting"], self._scenes[replace(model, shared=frozenset())]
-        outer = (self.weights > 0) & (r2 > 0.5 * float(r2[self.weights > 0].max()))
-        return float(added[outer].sum() / scene[outer].abs().sum().clamp_min(1e-12))
+        inverse = torch.linalg.inv(inner + loose.diag())
+        two = slice(n, n + radial.shape[2])
+        numbers = (inverse @ right)[two]
+        stands_out = float(numbers @ torch.linalg.solve(inverse[two, two], numbers))
+        return float((numbers * scale[two]).sum()), stands_out / (radial.shape[2] * math.log(n))
 
     def why_not(self, name: str) -> str:
         """Why no model has an effect."""
@@ -628,11 +639,16 @@ class Joint:
         r2 = self.tracks.radii
         return torch.stack([r2, r2**2], 2) * scene[..., None]
 
-    def _fixed_pattern(self, scene: Tensor) -> Tensor:
-        along = (self.tracks.positions.clamp(-1, 1) + 1) * (0.5 * (NODES - 1))
-        hats = (1.0 - (along[..., None] - torch.arange(NODES, dtype=scene.dtype)).abs()).clamp_min(0.0)
-        nodes = (hats[..., 0, :, None] * hats[..., 1, None, :]).flatten(2)
-        return torch.cat([nodes, nodes * scene[..., None]], 2)
+    @property
+    def _nodes(self) -> int:
+        return NODES if self.tracks.weights.sum() > MANY else NODES_FEW
+
+    def _fixed_pattern(self, scene: Tensor, nodes: int | None = None) -> Tensor:
+        nodes = nodes or self._nodes
+        along = (self.tracks.positions.clamp(-1, 1) + 1) * (0.5 * (nodes - 1))
+        hats = (1.0 - (along[..., None] - torch.arange(nodes, dtype=scene.dtype)).abs()).clamp_min(0.0)
+        places = (hats[..., 0, :, None] * hats[..., 1, None, :]).flatten(2)
+        return torch.cat([places, places * scene[..., None]], 2)
 
     def _reflection(self, scene: Tensor) -> Tensor:
         out, normals = self.tracks.directions, self.normals[:, None]
@@ -643,6 +659,16 @@ class Joint:
         """A curve T turns an offset o of the level x into T'(x) o: what it bends goes with o times x and x²."""
         known = self._known.get("frame_offset", torch.zeros_like(scene))[..., None]
         return torch.cat([known * scene[..., None], known * scene[..., None] ** 2], 2)
+
+
+def _settled(name: str, numbers: Tensor) -> Tensor:
+    """The numbers of a shared effect without the part that only renames the scene's own levels and their scale, which
+    otherwise wander off from one linearisation to the next."""
+    if name in ("frame_offset", "agc"):
+        return numbers - numbers.mean()
+    if name == "fixed_pattern":
+        return torch.cat([half - half.mean() for half in numbers.chunk(2)])
+    return numbers
 
 
 def _median(values: Tensor, keep: Tensor) -> Tensor:

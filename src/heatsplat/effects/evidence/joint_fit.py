@@ -13,6 +13,9 @@ from heatsplat.effects.observations import Observations
 
 __all__ = ["OWN_HURDLE", "SHARED_HURDLE"]
 
+WELL_OUTDONE = 1.0  # share of others' size below which an effect makes up for what they lack
+LEAST_FALLOFF = -0.04  # in the corners; blur at the border of an image passes for half of that
+
 
 def joint(obs: Observations) -> tuple[Joint, Model] | None:
     """The joint fit of a scene and what it selects; made once. None where there are no tracks."""
@@ -40,7 +43,12 @@ def harmonic_source(obs: Observations) -> Evidence:
 
 
 def view_dependence(obs: Observations) -> Evidence:
-    """Whether points look different from different sides."""
+    """Whether points look different from different sides.
+
+    Beside mirrors it only makes up for their normals, which are known roughly.
+    """
+    if _outdone(obs, "view_dependence", {"reflection"}):
+        return Evidence(0.0, "what depends on direction is mirrors, as far as their normals are known")
     return _evidence(obs, "view_dependence", "points change with the direction of view by")
 
 
@@ -67,13 +75,19 @@ def attenuation(obs: Observations) -> Evidence:
 def frame_offset(obs: Observations) -> Evidence:
     """Whether each image has an offset that all its points share. Where gains change, their shift takes it."""
     found = joint(obs)
-    if found is not None and {"agc", "frame_offset"} <= found[1].shared:
+    if (
+        found is not None
+        and {"agc", "frame_offset"} <= found[1].shared
+        and not _outdone(obs, "agc", {"frame_offset", "tone"})
+    ):
         return Evidence(0.0, "gains change from image to image, and their shift takes what offsets there are")
     return _evidence(obs, "frame_offset", "images differ from each other by an offset of")
 
 
 def agc(obs: Observations) -> Evidence:
-    """Whether each image has a gain of its own."""
+    """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent."""
+    if _outdone(obs, "agc", {"frame_offset", "tone"}):
+        return Evidence(0.0, "what looks like gains of single images is a bent curve along which they shift")
     return _evidence(obs, "agc", "gains of single images change values by")
 
 
@@ -96,6 +110,20 @@ def vignetting(obs: Observations) -> Evidence:
     return _pattern(obs, "vignetting", "distance from the middle of the image changes values by")
 
 
+def _outdone(obs: Observations, name: str, others: set[str]) -> bool:
+    """Whether an effect was only taken in beside others that explain the same kind of change, and more of it."""
+    found = joint(obs)
+    if found is None or not {name, *others} <= found[1].names():
+        return False
+    fit, model = found
+    beside = model.without(name)
+    return all(_size(fit, model, name) < WELL_OUTDONE * _size(fit, beside, other) for other in others)
+
+
+def _size(fit: Joint, model: Model, name: str) -> float:
+    return fit.effect_size(model, model.without(name))
+
+
 def _pattern(obs: Observations, name: str, sentence: str) -> Evidence:
     """A pattern can be radial as well: the radial part is left to vignetting where it is a good part of the whole."""
     found = joint(obs)
@@ -109,13 +137,13 @@ def _pattern(obs: Observations, name: str, sentence: str) -> Evidence:
     radial = replace(none, shared=none.shared | {"vignetting"})
     uneven = replace(none, shared=none.shared | {"fixed_pattern"})
     whole = replace(none, shared=none.shared | both)
-    falloff, radially = fit.falloff(radial), fit.radial_gain(model)
-    fades = falloff < 0 and radially > SHARED_HURDLE
+    falloff, radially = fit.falloff(model)
+    fades = falloff < LEAST_FALLOFF and radially > SHARED_HURDLE
     if name == "vignetting":
         size = fit.effect_size(radial, none)
         why = f"{sentence} {_beside(size)} ({100 * falloff:+.0f} % in the corners)"
-        if falloff >= 0:
-            return Evidence(min(radially, 0.0), f"{why}, which is no falloff")
+        if falloff >= LEAST_FALLOFF:
+            return Evidence(0.0, f"{why}, which is no falloff")
         return Evidence(radially if fit.worthwhile(radial, none, name) else 0.0, why)
     more, less = (whole, radial) if fades else (uneven, none)
     size = fit.effect_size(more, less)
