@@ -160,16 +160,91 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
         return RunResults.read(output_dir / METRICS_FILE).test.get("psnr")
 
     prepare_machine(config.threads)
-    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    if plain["data"].get("root") is not None:
-        plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
+    plain = resolved(config)
     data = build(plain["data"])
+    if plain["budget"] is not None:
+        plain = budgeted(config, data, output_dir)
     plain = begun(plain, data, output_dir) or with_effects(plain, data)
     trainer = build(plain["trainer"], callbacks=build_callbacks(plain["callbacks"]), logger=build(plain["logger"]))
     module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain  # set, not passed: Hydra would build every part in it once more
     results = fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
     return results.test.get("psnr")
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """A run's configuration as plain containers, with the data's folder as it is called from anywhere."""
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    if plain["data"].get("root") is not None:
+        plain["data"]["root"] = str(Path(plain["data"]["root"]).expanduser().resolve())
+    return plain
+
+
+def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
+    """The configuration of a run that makes the most of ``budget`` seconds; a run that goes on keeps its plan.
+
+    "budget" then holds the plan. The trainer has room for more steps than planned, which ``BudgetClock`` may use.
+    """
+    from heatsplat.contracts import SceneError
+    from heatsplat.studies import budget
+
+    seconds = budget.seconds_of(config.budget)
+    given = HydraConfig.get().overrides.task or []
+    if any(text.lstrip("+").startswith("max_steps=") for text in given):
+        raise SceneError("budget chooses the number of steps, and max_steps gives it: leave out one of them")
+    plain = resolved(config)
+    stored = stored_recipe(plain["ckpt"], output_dir)
+    if plain["ckpt"] is not None and not isinstance(stored.get("budget"), dict):
+        raise SceneError(f"{plain['ckpt']} was trained without a budget and keeps its schedule: leave budget out")
+    keys = [key for key in ("density.cap_max", "density.recipe.cap_max") if OmegaConf.select(config, key) is not None]
+    if isinstance(stored.get("budget"), dict) and (plain["ckpt"] or stored["budget"]["asked_s"] == seconds):
+        plan = budget.Plan.from_dict(stored["budget"])
+        if plan.asked_s != seconds:
+            raise SceneError(f"{plain['ckpt']} was planned for budget={plan.asked_s:g}s and keeps its plan: give that")
+    else:
+        log.info("measuring what a step costs here")
+        choosing = with_effects(plain | {"effects": plain["effects"] | {"price": False}}, data)
+        pace = budget.calibrate(
+            lambda: build(choosing["module"]), data.scene, plain["max_steps"], seconds, device_of(plain)
+        )
+        cap_max = OmegaConf.select(config, keys[0]) if keys else None
+        plan = budget.plan(budget.read_points(), plain["name"], pace, seconds, cap_max)
+        for line in plan.lines():
+            log.info("%s", line)
+    config = config.copy()
+    config.max_steps = plan.steps
+    for key in keys:
+        OmegaConf.update(config, key, plan.cap)
+    plain = resolved(config)
+    plain["trainer"]["max_steps"] = budget.HEADROOM * plan.steps
+    plain["budget"] = plan.as_dict()
+    clock = {"_target_": "heatsplat.callbacks.budget.BudgetClock", "plan": plain["budget"], "twice": plan.twice()}
+    plain["callbacks"]["budget"] = clock
+    return plain
+
+
+def device_of(plain: dict[str, Any]) -> str:
+    """Where a run trains: "cpu" or "cuda"."""
+    import torch
+
+    return "cpu" if plain["trainer"]["accelerator"] == "cpu" or not torch.cuda.is_available() else "cuda"
+
+
+def stored_recipe(ckpt: str | None, output_dir: Path) -> dict[str, Any]:
+    """The recipe in a checkpoint, or in the newest one of the run's folder that can be read; empty without."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.training.module import CHECKPOINT_KEY
+    from heatsplat.training.session import load_checkpoint
+
+    if ckpt is not None:
+        return load_checkpoint(ckpt).get(CHECKPOINT_KEY, {}).get("recipe", {})
+    found = sorted((output_dir / "checkpoints").glob("*.ckpt"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in found:
+        try:
+            return load_checkpoint(path).get(CHECKPOINT_KEY, {}).get("recipe", {})
+        except SceneError:  # a disk that was full; begun() says so
+            continue
+    return {}
 
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
@@ -243,13 +318,10 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
         def maker(chosen: dict[str, Any]) -> Callable[[], Any]:
             return lambda: build(configured(chosen)["module"])
 
-        import torch
-
-        on_cpu = plain["trainer"]["accelerator"] == "cpu" or not torch.cuda.is_available()
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
         log.info("measuring what each of %d effects costs", len(on))
-        found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"], "cpu" if on_cpu else "cuda")
+        found |= prices(maker(verdicts), leaving, data.scene, plain["max_steps"], device_of(plain))
     for line in assembly.lines(assembly.told(verdicts, found)):
         log.info("%s", line)
     return configured(verdicts)

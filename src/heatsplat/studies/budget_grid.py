@@ -1,0 +1,225 @@
+"""The curves behind budget=SECONDS: an exhaustive grid of run lengths and caps on Gaussians, and planned runs beside it.
+
+Rules: every run is whole, its schedule as long as it is, so a grid point is what a user would get; scores are those of the
+test views at full resolution. The curves hold no seconds, so they may be measured on a busy machine; the comparison of
+planned runs with the grid holds seconds, so it may not.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.budget import Curve, Point, curves_of, read_points, write_points
+from heatsplat.studies.frontier import CURVE_FILE
+
+log = logging.getLogger("heatsplat")
+
+TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run of the grid.
+
+    Args:
+        method, scene, steps, cap, seed: which; ``cap`` None is that of the method.
+        results: what it found.
+        mean_gaussians: over its steps.
+    """
+
+    method: str
+    scene: str
+    steps: int
+    cap: int | None
+    seed: int
+    results: RunResults
+    mean_gaussians: float
+
+    @property
+    def growth(self) -> float:
+        """Its cap in Gaussians of the start."""
+        return math.inf if self.cap is None else self.cap / self.results.data["points"]
+
+
+def run(
+    output_dir: Path | str,
+    train: str,
+    scenes: Mapping[str, Sequence[str]],
+    steps: Sequence[int],
+    caps: Sequence[int | None],
+    seeds: Sequence[int],
+    budgets: Sequence[float],
+    overrides: Sequence[str],
+    curves: str | None,
+) -> None:
+    """Trains the grid and the planned runs; writes the curves, budget.md and budget.png.
+
+    Args:
+        output_dir: of the study; runs that have results there are not run again.
+        train: path of train.py.
+        scenes: method -> synthetic scenes.
+        steps: lengths of a run.
+        caps: most Gaussians; None is the method's own cap.
+        seeds: of every run of the grid.
+        budgets: seconds for which a planned run is set beside the grid; these runs use the curves just measured.
+        overrides: of every run.
+        curves: curves file in which the points of these methods are replaced; None: only the study's folder has them.
+    """
+    folder = Path(output_dir)
+    grid = []
+    for method, names in scenes.items():
+        for scene in names:
+            for length in steps:
+                for cap in caps:
+                    for seed in seeds:
+                        place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}" / str(seed)
+                        wanted = [f"max_steps={length}", *([f"density.cap_max={cap}"] if cap else [])]
+                        results = _trained(place, train, [*overrides, *_of(method, scene, seed), *wanted])
+                        mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
+                        grid.append(Trained(method, scene, length, cap, seed, results, mean))
+    points = means(grid)
+    write_points(points, folder / POINTS_FILE)
+    if curves is not None:
+        kept = (
+            [point for point in read_points(Path(curves)) if point.method not in scenes]
+            if Path(curves).exists()
+            else []
+        )
+        write_points([*kept, *points], Path(curves))
+    planned = [
+        (method, scene, budget, _trained(
+            folder / "planned" / f"{method}_{scene}_{budget:g}s" / "0", train,
+            [*overrides, *_of(method, scene, 0), f"budget={budget:g}s"],
+        ))
+        for method, names in scenes.items() for scene in names for budget in budgets
+    ]  # fmt: skip
+    write_atomically(folder / TABLE_FILE, tables(grid, planned))
+    write_png(folder / PICTURE_FILE, figure_picture(picture(points)))
+
+
+def _of(method: str, scene: str, seed: int) -> list[str]:
+    return [f"method={method}", "data=synthetic", f"data.scene={scene}", f"data.scene_seed={seed}", f"seed={seed}"]
+
+
+def _trained(place: Path, train: str, overrides: Sequence[str]) -> RunResults:
+    if not (place / METRICS_FILE).exists():
+        log.info("training %s", place)
+        command = [sys.executable, train, *overrides, f"hydra.run.dir={place}"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"{' '.join(command)} failed:\n{(done.stderr or done.stdout)[-2000:]}")
+    return RunResults.read(place / METRICS_FILE)
+
+
+def mean_gaussians(curve: Path, start: int) -> float:
+    """Gaussians in the mean over the steps of a run, straight between its validations."""
+    before, total, last = (0.0, float(start)), 0.0, 0.0
+    with open(curve, newline="", encoding="utf-8") as file:
+        rows = [(float(row["step"]), float(row["gaussians"])) for row in csv.DictReader(file)]
+    for step, count in rows:
+        total += 0.5 * (before[1] + count) * (step - before[0])
+        before, last = (step, count), step
+    return total / last
+
+
+def means(grid: Iterable[Trained]) -> list[Point]:
+    """The points of the curves: means over the seeds."""
+    groups: dict[tuple, list[Trained]] = {}
+    for one in grid:
+        groups.setdefault((one.method, one.scene, one.steps, one.cap), []).append(one)
+    return [
+        Point(
+            method=own[0].method,
+            scene=own[0].scene,
+            steps=own[0].steps,
+            growth=own[0].growth,
+            mean_growth=statistics.fmean(one.mean_gaussians / one.results.data["points"] for one in own),
+            psnr=statistics.fmean(one.results.test["psnr"] for one in own),
+            seeds=len(own),
+        )
+        for own in groups.values()
+    ]
+
+
+def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, RunResults]]) -> str:
+    """The grid, and each planned run beside the best run of the grid that was no slower."""
+    lines = ["# Accuracy against steps and Gaussians, and planned runs", ""]
+    lines += ["| method | scene | steps | Gaussians at most | seed | train (s) | Gaussians | PSNR (dB) |"]
+    lines += ["|---|---|---:|---:|---:|---:|---:|---:|"]
+    for one in grid:
+        cost = one.results.cost
+        lines.append(
+            f"| {one.method} | {one.scene} | {one.steps:,} | {_cap(one.cap)} | {one.seed} "
+            f"| {cost['train_seconds']:.1f} | {cost['gaussians']:,.0f} | {one.results.test['psnr']:.2f} |"
+        )
+    if not planned:
+        return "\n".join([*lines, ""])
+    lines += ["", "## Planned runs beside the grid", ""]
+    lines += [
+        "The best of the grid is the highest PSNR among its runs (all seeds) that took at most 1.1 times the budget.",
+        "",
+    ]
+    lines += [
+        "| method | scene | budget (s) | spent (s) | off | steps | PSNR (dB) | best of the grid | its PSNR | its seconds |"
+    ]
+    lines += ["|---|---|---:|---:|---:|---:|---:|---|---:|---:|"]
+    for method, scene, budget, results in planned:
+        found = results.run["budget"]
+        rivals = [
+            one for one in grid
+            if (one.method, one.scene) == (method, scene) and one.results.cost["train_seconds"] <= 1.1 * budget
+        ]  # fmt: skip
+        best = max(rivals, key=lambda one: one.results.test["psnr"], default=None)
+        rival = "none | – | –"
+        if best is not None:
+            rival = (
+                f"{best.steps:,} steps, {_cap(best.cap)} | {best.results.test['psnr']:.2f} "
+                f"| {best.results.cost['train_seconds']:.1f}"
+            )
+        spent = found["train_s"] + found["calibration_s"]
+        lines.append(
+            f"| {method} | {scene} | {budget:g} | {spent:.1f} | {found['off_percent']:+.1f} % "
+            f"| {found['steps']:,} | {results.test['psnr']:.2f} | {rival} |"
+        )
+    return "\n".join([*lines, ""])
+
+
+def _cap(cap: int | None) -> str:
+    return "free" if cap is None else f"{cap:,}"
+
+
+def picture(points: Sequence[Point]) -> Figure:
+    """PSNR and Gaussians against steps, a row for each method and scene, a line for each cap."""
+    pairs = list(dict.fromkeys((point.method, point.scene) for point in points))
+    figure = Figure(figsize=(9, 3.2 * len(pairs)), dpi=110, layout="constrained")
+    for row, (method, scene) in enumerate(pairs):
+        own = [point for point in points if (point.method, point.scene) == (method, scene)]
+        for column, (name, label) in enumerate(
+            (("psnr", "PSNR (dB)"), ("mean_growth", "mean Gaussians / those of the start"))
+        ):
+            axes = figure.add_subplot(len(pairs), 2, 2 * row + column + 1)
+            for i, (growth, curves) in enumerate(curves_of(own).items()):
+                _line(axes, curves[0], name, i, "free" if math.isinf(growth) else f"at most {growth:g} times the start")
+            axes.set(xscale="log", xlabel="steps", ylabel=label, title=f"{method} on {scene}")
+            axes.grid(alpha=0.25, which="both")
+            axes.legend(fontsize=7)
+    return figure
+
+
+def _line(axes, curve: Curve, name: str, color: int, label: str) -> None:
+    steps = [point.steps for point in curve.points]
+    axes.plot(steps, [getattr(point, name) for point in curve.points], "o", color=f"C{color}", label=label)
+    course = [steps[0] * (2 * steps[-1] / steps[0]) ** (i / 60) for i in range(61)]
+    axes.plot(course, [getattr(curve, name)(at) for at in course], color=f"C{color}", linewidth=0.8)
