@@ -22,7 +22,6 @@ def test_the_drift_of_a_flight_is_the_sensors_and_not_the_heaths():
         assert not verdicts[name].on, verdicts[name]
 
 
-@pytest.mark.xfail(reason="without points to follow, the drift of a still camera is still taken for heat", strict=True)
 @pytest.mark.skipif(not REPEATS.is_dir(), reason=f"needs the still frames in {REPEATS}")
 def test_a_still_scene_by_a_still_camera_calls_for_nothing_but_the_sensor():
     files = sorted(REPEATS.glob("*.png"))

@@ -56,6 +56,7 @@ OWN_HURDLE, SHARED_HURDLE = 2.5, 1.3
 SMALLEST, SMALLEST_PATH = 0.1, 0.2
 # In a scene that changes: share of its changes that a sensor's effect must exceed.
 BESIDE_CHANGES = {"harmonic_source": 0.15, "agc": 0.1, "frame_offset": 0.03, "reflection": 0.04, "tone": 0.01}
+BESIDE_DRIFT = 0.25  # share of a common offset that other changes must exceed before a still camera
 IN_COMMON = 0.15  # share of what half of the points leave that the other half has to explain
 BESIDE_WEATHER = 0.2  # of any effect, where a weather record, whose answers are rough, explains the changes
 # In the order in which they act on an image.
@@ -207,14 +208,16 @@ class Joint:
     def selected(self) -> Model:
         """The model that explains most with least.
 
-        Effects are taken in one at a time, from three starts: from nothing, whichever explains most; those of the sensor
-        first; and from a driven scene before an uneven camera. A change of all points in common is cheap as an offset and
+        Effects are taken in one at a time, from several starts: from nothing, whichever explains most; those of the sensor
+        first; and from a driven scene before an uneven camera, or a cooling one before a still camera that drifts. A change of all points in common is cheap as an offset and
         dear as courses of every point, but the courses explain more at once; and where a source and a pattern are at work,
         neither explains much alone: only the ends of the ways tell which was right.
         """
         start = (self.weights, self.trust)
         starts = [(Model(), SENSOR_FIRST), (Model(), ())]
         known = 2 + self._decays.shape[1] if self._span > 0 else 0  # numbers of a point of a driven scene
+        if not self._moves and "relaxation" in self.rich.own:
+            starts.append((Model(frozenset({"relaxation"}), frozenset({"frame_offset"})), ()))
         if self._moves and "harmonic_source" in self.rich.own and self._usual_length >= WELL_SEEN * known:
             starts.append((replace(self.rich, shared=frozenset({"fixed_pattern"})), ()))
         ends = []
@@ -275,6 +278,8 @@ class Joint:
         size = self.effect_size(more, less)
         if size < (SMALLEST_PATH if name in ("attenuation", "reflection") else SMALLEST):
             return False
+        if name in ("relaxation", "harmonic_source") and not self._moves and not self._beyond_drift(more):
+            return False
         if name in ("agc", "frame_offset") and self._may_change(less) and not self._in_common(more, less):
             return False
         if "relaxation" not in less.own:
@@ -284,6 +289,13 @@ class Joint:
 
     def _may_change(self, model: Model) -> bool:
         return self.drivers is not None or "relaxation" in model.own
+
+    def _beyond_drift(self, model: Model) -> bool:
+        """Whether a still camera sees more than its own drift. Surfaces do not all change alike; a drift is one offset of
+        the whole image, and leaves a pattern of its own that is small beside it."""
+        drift = Model(shared=frozenset({"frame_offset"}))
+        beyond = self.effect_size(replace(model, shared=model.shared | drift.shared), drift)
+        return beyond > BESIDE_DRIFT * self.effect_size(drift, Model())
 
     def _in_common(self, more: Model, less: Model) -> bool:
         """Whether what the points that change most say of every image holds for those that change least, and conversely.
