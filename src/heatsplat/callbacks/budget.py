@@ -15,7 +15,8 @@ from heatsplat.contracts import SceneError
 log = logging.getLogger("heatsplat")
 
 SETTLED = 0.5  # share of the schedule after which no Gaussian is added and the rest may be stretched (density.stop)
-PRESSED = 0.7  # share of the time after which it is shrunk, settled or not
+GROWING = 0.6  # share of the time that the schedule up to there may take; else no more Gaussians come
+PRESSED = 0.7  # share of the time after which the schedule is shrunk, settled or not
 WINDOW = 40  # looks at the clock over which the pace is measured
 LOOKS = 400  # looks at the clock in a run of the planned length
 
@@ -26,8 +27,11 @@ class BudgetClock(pl.Callback):
     The plan says how many steps fit. While Gaussians grow it is followed, since the growth was planned in steps. After that
     the steps that are left are those for which there is time at the pace of the last steps, more or fewer than planned,
     and what is left of the schedule (learning rates) is spread over them: with progress p after step s of an end S, each
-    step adds (1 - p) / (S - s), which is 1 / S as long as all goes as planned. Where seven tenths of the time are gone
-    before, the schedule is shrunk at once.
+    step adds (1 - p) / (S - s), which is 1 / S as long as all goes as planned.
+
+    Where a scene calls for more Gaussians than expected, or the machine is slower, growing would eat the time in which they
+    settle: as long as the growing half would take more than six tenths of the time, no more Gaussians come
+    (``density.cap_max``). Where seven tenths of the time are gone before it ends, the schedule is shrunk at once.
 
     Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its clock.
@@ -44,6 +48,8 @@ class BudgetClock(pl.Callback):
         self._end = float(plan["steps"])
         self._seen: deque[tuple[int, float]] = deque(maxlen=WINDOW)
         self._meter: CostMeter | None = None
+        self._policies: list[tuple[Any, int]] = []  # what adds Gaussians, and how many it may have by the plan
+        self._held: int | None = None  # step at which growing was first held back
         self._every = max(1, int(plan["steps"]) // LOOKS)
 
     # The schedule ----------------------------------------------------------------------------------------------------
@@ -72,6 +78,8 @@ class BudgetClock(pl.Callback):
         for config in trainer.lr_scheduler_configs:
             factors = getattr(config.scheduler, "lr_lambdas", [])
             config.scheduler.lr_lambdas = [self._rate(factor, trainer.max_steps) for factor in factors]
+        parts = (module.density, getattr(module.density, "recipe", None))
+        self._policies = [(part, part.cap_max) for part in parts if hasattr(part, "cap_max")]
         self._set_length(trainer)
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
@@ -82,6 +90,8 @@ class BudgetClock(pl.Callback):
             if self.progress(step) >= SETTLED or spent >= PRESSED * self.seconds:
                 self._retime(step, spent)
                 self._set_length(trainer)
+            else:
+                self._hold(step, spent, len(module.splats))
         if step >= round(self._end):
             trainer.should_stop = True
 
@@ -90,18 +100,38 @@ class BudgetClock(pl.Callback):
 
     def _retime(self, step: int, spent: float) -> None:
         """Sets the end to where the time will be over at the pace of the last steps."""
-        left = self.seconds - spent
-        (first, then), (last, now) = self._seen[0], self._seen[-1]
+        left, step_s = self.seconds - spent, self._step_s()
         if left <= 0:
             self.end_at(step, step)
-        elif last > first and now > then and len(self._seen) > 1:
-            self.end_at(step, step + left * (last - first) / (now - then))
+        elif step_s is not None:
+            self.end_at(step, step + left / step_s)
+
+    def _hold(self, step: int, spent: float, count: int) -> None:
+        """Lets no Gaussian come beyond ``count`` as long as growing takes too much of the time; see the class."""
+        step_s = self._step_s()
+        if step_s is None or not self._policies:
+            return
+        growing = spent + step_s * (SETTLED - self.progress(step)) * self._end
+        held = growing > GROWING * self.seconds
+        for policy, planned in self._policies:
+            policy.cap_max = min(planned, count) if held else planned
+        if held and self._held is None:
+            self._held = step
+
+    def _step_s(self) -> float | None:
+        """Seconds of one of the last steps; None before it is known."""
+        if len(self._seen) < 2:
+            return None
+        (first, then), (last, now) = self._seen[0], self._seen[-1]
+        return (now - then) / (last - first) if last > first and now > then else None
 
     def _set_length(self, trainer: pl.Trainer) -> None:
         """Tells the trainer how long the run is: losses and the line on the screen ask it."""
         trainer.fit_loop.epoch_loop.max_steps = max(round(self._end), 1)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.global_step < round(self._end):  # stopped by hand; the rest of the time is for the run that goes on
+            return
         spent, done = self._spent(), self.progress(trainer.global_step)
         whole = spent + self.plan["calibration_s"]
         found = {
@@ -112,6 +142,7 @@ class BudgetClock(pl.Callback):
             "planned_steps": self.plan["steps"],
             "steps": trainer.global_step,
             "max_gaussians": self.plan["cap"],
+            "growth_held_at_step": self._held,
             "schedule_done": round(done, 4),
             "expected_psnr_on_demo_scenes": self.plan["expected_psnr"],
             "twice_gain_db": self.plan["twice_gain_db"],
@@ -132,7 +163,8 @@ class BudgetClock(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"from": list(self._from), "end": self._end}
+        return {"from": list(self._from), "end": self._end, "held": self._held}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._from, self._end = tuple(state["from"]), state["end"]
+        self._held = state["held"]

@@ -31,7 +31,7 @@ UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 MIN_STEPS = 100  # below, the schedule loses its shape: growth, which comes every 50 steps or more, has no time
 CALIBRATION_SHARE = 0.05  # of the budget at most
 CALIBRATION_SECONDS = 4.0  # and at most this long
-CALIBRATION_ROUNDS = 20  # and at most so many timed steps of each size
+CALIBRATION_ROUNDS = (3, 20)  # fewest and most timed steps of each size; fewer than three have no middle
 WARM_UP = 2  # steps before them: kernels compile and memory is found
 HEADROOM = 20  # a run has room for so many times its planned steps: where the pace was misjudged, it may need them
 DENSER = 4  # the second size of the calibration, in Gaussians of the start
@@ -191,8 +191,8 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
     """What a step costs: whole steps (render, loss, backward, optimiser) with the scene's points, and with four times them.
 
     The two sizes take turns on the same views; the median of each counts, because a run will live with what else the
-    machine does. It takes a twentieth of the budget at most. Building the models and the first steps, in which kernels
-    compile, are not counted: they belong to the start-up.
+    machine does. It takes a twentieth of the budget at most, or three steps of each. Building the models and the first
+    steps, in which kernels compile, are not counted: they belong to the start-up.
 
     Args:
         make: makes the training module.
@@ -203,16 +203,18 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
     """
     steppers = [_Stepper(make(), _denser(scene, factor), max_steps, device) for factor in (1, DENSER)]
     times: list[list[float]] = [[] for _ in steppers]
-    views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_ROUNDS))]
+    views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_ROUNDS[1]))]
     for turn in range(WARM_UP):
         for stepper in steppers:
             stepper.step(views[turn % len(views)])
     limit, start = min(CALIBRATION_SHARE * budget_s, CALIBRATION_SECONDS), time.perf_counter()
-    for turn in range(CALIBRATION_ROUNDS):
+    for turn in range(CALIBRATION_ROUNDS[1]):
         for stepper, own in zip(steppers, times, strict=True):
             own.append(stepper.step(views[turn % len(views)]))
         spent = time.perf_counter() - start
-        if spent * (turn + 2) / (turn + 1) > limit:  # the next round would pass the limit
+        if (
+            turn + 1 >= CALIBRATION_ROUNDS[0] and spent * (turn + 2) / (turn + 1) > limit
+        ):  # the next round would pass the limit
             break
     few, many = (statistics.median(own) for own in times)
     count, more = (stepper.count for stepper in steppers)
@@ -279,6 +281,7 @@ class Plan:
         expected_psnr: of the demo scenes on which the curves were measured, dB; None where the method has none.
         twice_steps, twice_growth: what would be chosen in twice the time.
         twice_gain_db: and what it would gain.
+        step_ms: milliseconds of a step with the Gaussians of the start, by the calibration.
         reasons: sentences: where the numbers come from and how far they reach.
     """
 
@@ -292,6 +295,7 @@ class Plan:
     twice_steps: int
     twice_growth: float | None
     twice_gain_db: float
+    step_ms: float
     reasons: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
@@ -306,7 +310,7 @@ class Plan:
     def lines(self) -> list[str]:
         """What the log says."""
         cap = "no Gaussians are added" if self.cap is None else f"at most {self.cap:,} Gaussians"
-        left = f"{self.asked_s:g} s less {self.calibration_s:.1f} s of calibration"
+        left = f"{self.asked_s:g} s less {self.calibration_s:.1f} s of calibration (a step takes {self.step_ms:.1f} ms at first)"
         first = f"budget: {self.steps:,} steps and {cap} for {left}"
         if self.expected_psnr is not None:
             first += f"; such runs reach {self.expected_psnr:.1f} dB on the demo scenes"
@@ -402,5 +406,6 @@ def plan(points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_m
         twice_steps=longer,
         twice_growth=None if cap_max is None or math.isinf(more) else more,
         twice_gain_db=round(max(better - score, 0.0), 2),
+        step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),
     )

@@ -1,0 +1,361 @@
+"""Budget in, recipe out: what is understood, planned, kept while training, measured and written."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import running
+import torch
+
+from heatsplat import cli
+from heatsplat.callbacks.budget import BudgetClock
+from heatsplat.callbacks.timing import CostMeter
+from heatsplat.contracts import SceneData, SceneError
+from heatsplat.io.results import RunResults
+from heatsplat.studies.budget import (
+    CALIBRATION_SHARE,
+    CURVES_FILE,
+    Curve,
+    Pace,
+    Plan,
+    Point,
+    _denser,
+    curves_of,
+    plan,
+    read_points,
+    seconds_of,
+    write_points,
+)
+from heatsplat.studies.budget_grid import Trained, mean_gaussians, means, picture, tables
+
+FREE = math.inf
+# With many Gaussians a run is better in the end and worse at first, and each of its steps costs more.
+POINTS = [
+    Point("etgs", "heated", steps, growth, mean_growth, psnr)
+    for growth, mean_growth, scores in ((1.0, 1.0, (20, 24, 26)), (FREE, 4.0, (18, 26, 32)))
+    for steps, psnr in zip((250, 1000, 4000), scores, strict=True)
+]
+PACE = Pace(base_s=0.004, per_gaussian_s=1e-6, points=4000, spent_s=1.0)  # 8 ms with the points of the start
+
+
+# Asking ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [(120, 120), ("120s", 120), ("2min", 120), ("1.5 h", 5400), (".5m", 30), ("90 sec", 90)]
+)
+def test_a_budget_is_read_as_people_write_it(text, seconds):
+    assert seconds_of(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["soon", "0s", "-5s", "12 parsecs", "s", "1:30", "nan"])
+def test_what_is_no_time_is_refused_with_the_remedy(text):
+    with pytest.raises(SceneError, match=r"is no time; write seconds, or a number with s, min or h"):
+        seconds_of(text)
+
+
+# Curves ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_curve_passes_through_its_points_and_gains_less_and_less_beyond_them():
+    curve = Curve(tuple(point for point in POINTS if point.growth == FREE))
+    assert [curve.psnr(steps) for steps in (250, 1000, 4000)] == [18, 26, 32]
+    assert curve.psnr(500) == pytest.approx(22)  # log steps
+    gains = [curve.psnr(4000 * 2 ** (i + 1)) - curve.psnr(4000 * 2**i) for i in range(8)]
+    assert all(0 < later < earlier for earlier, later in zip(gains, gains[1:], strict=False))
+    slope = 3.0  # dB per doubling between the last two
+    assert gains[0] < slope and sum(gains) < slope / math.log(2)
+    assert (curve.psnr(4001) - 32) / math.log2(4001 / 4000) == pytest.approx(slope, rel=1e-3)
+
+
+def test_points_survive_their_file_and_a_bad_one_is_named(tmp_path):
+    write_points(reversed(POINTS), tmp_path / "curves.csv")
+    assert sorted(read_points(tmp_path / "curves.csv"), key=str) == sorted(POINTS, key=str)
+    (tmp_path / "bad.csv").write_text("method,steps\netgs,ten\n")
+    with pytest.raises(SceneError, match="bad.csv holds no curves.*study=budget"):
+        read_points(tmp_path / "bad.csv")
+
+
+def test_the_curves_of_the_repository_rise_with_the_steps():
+    points = read_points(CURVES_FILE)
+    assert {"etgs", "3dgs"} <= {point.method for point in points}
+    for method in ("etgs", "3dgs"):
+        for curve in [one for found in curves_of(p for p in points if p.method == method).values() for one in found]:
+            scores = [point.psnr for point in curve.points]
+            assert scores == sorted(scores) and all(point.mean_growth >= 0.5 for point in curve.points)
+
+
+# Planning --------------------------------------------------------------------------------------------------------------
+
+
+def seconds_for(found: Plan) -> float:
+    """What a plan's steps take at PACE by its curve."""
+    curve = next(iter(curves_of(POINTS)[found.growth or FREE]))
+    return found.steps * PACE.step_s(PACE.points * curve.mean_growth(found.steps))
+
+
+@pytest.mark.parametrize("asked", [5.0, 10.0, 30.0, 120.0, 1000.0])
+def test_the_steps_of_a_plan_take_the_time(asked):
+    found = plan(POINTS, "etgs", PACE, asked, cap_max=100_000)
+    assert found.train_s == asked - 1.0
+    assert seconds_for(found) == pytest.approx(found.train_s, rel=0.01)
+
+
+def test_the_plan_is_the_best_of_all_choices_in_the_time():
+    for asked in (5.0, 10.0, 20.0, 60.0):
+        found = plan(POINTS, "etgs", PACE, asked, cap_max=100_000)
+        rivals = [
+            curve.psnr(steps)
+            for own in curves_of(POINTS).values()
+            for curve in own
+            for steps in range(100, 20_000, 50)
+            if steps * PACE.step_s(4000 * curve.mean_growth(steps)) <= found.train_s
+        ]
+        assert found.expected_psnr == pytest.approx(max(rivals), abs=0.05)
+
+
+def test_little_time_takes_few_gaussians_and_much_time_many():
+    short, long = (plan(POINTS, "etgs", PACE, asked, cap_max=100_000) for asked in (5.0, 120.0))
+    assert (short.cap, short.growth) == (4000, 1.0)
+    assert (long.cap, long.growth) == (100_000, None) and long.steps > short.steps
+    assert plan(POINTS, "etgs", PACE, 120.0, cap_max=9000).cap == 9000  # what the configuration allows
+
+
+def test_twice_the_time_is_what_a_plan_for_it_would_choose():
+    found = plan(POINTS, "etgs", replace(PACE, spent_s=0.0), 20.0, cap_max=100_000)
+    twice = plan(POINTS, "etgs", replace(PACE, spent_s=0.0), 40.0, cap_max=100_000)
+    assert found.twice_steps == twice.steps
+    assert (
+        found.twice_gain_db == pytest.approx(twice.expected_psnr - found.expected_psnr, abs=0.011)
+        and found.twice_gain_db > 0
+    )
+    assert f"{found.twice_gain_db:+.2f} dB" in found.twice() and "40 s" in found.twice()
+
+
+def test_too_little_time_is_refused_with_the_least():
+    with pytest.raises(SceneError, match=r"budget=1.5s is too short here: 100 steps .* take (\S+) s") as caught:
+        plan(POINTS, "etgs", PACE, 1.5, cap_max=100_000)
+    least = float(str(caught.value).split("take ")[1].split(" s")[0])
+    enough = replace(PACE, spent_s=CALIBRATION_SHARE * least)
+    assert plan(POINTS, "etgs", enough, least, cap_max=100_000).steps >= 100
+
+
+def test_what_was_not_measured_is_said():
+    other = plan(POINTS, "ravigs", PACE, 30.0, cap_max=100_000)
+    assert other.expected_psnr is None and "ravigs has no measured curves; those of etgs stand in" in other.reasons[0]
+    assert other.steps == plan(POINTS, "etgs", PACE, 30.0, cap_max=100_000).steps
+    fixed = plan(POINTS, "etgs", PACE, 30.0, cap_max=None)
+    assert fixed.cap is None and fixed.steps == round(29.0 / PACE.step_s(4000))
+    assert any("no Gaussians" in reason for reason in fixed.reasons)
+    assert any("were not measured" in reason for reason in plan(POINTS, "etgs", PACE, 3000.0, cap_max=10**6).reasons)
+    with pytest.raises(SceneError, match="no measured curves to plan from; run python src/study.py study=budget"):
+        plan([], "etgs", PACE, 30.0, cap_max=None)
+
+
+def test_a_plan_survives_a_checkpoint():
+    found = plan(POINTS, "ravigs", PACE, 30.0, cap_max=100_000)
+    assert Plan.from_dict(json.loads(json.dumps(found.as_dict()))) == found
+
+
+# Keeping it ------------------------------------------------------------------------------------------------------------
+
+
+class Clock(CostMeter):
+    """A cost meter whose seconds the test sets."""
+
+    now = 0.0
+
+    def state_dict(self):
+        return {"seconds": {"train": self.now}}
+
+
+def simulate(clock: BudgetClock, step_s, meter: Clock | None = None, module=None, until: int = 10**6):
+    """Runs a trainer's loop without training; ``step_s(step)`` is what a step takes. Returns (trainer, module)."""
+    meter = meter or Clock()
+    module = module or SimpleNamespace(density=SimpleNamespace(cap_max=9000), splats=range(4000), results=RunResults())
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    ceiling = 20 * clock.plan["steps"]
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.01 ** min(step / ceiling, 1.0))
+    loop = SimpleNamespace(max_steps=ceiling)
+    trainer = SimpleNamespace(
+        callbacks=[meter, clock], fit_loop=SimpleNamespace(epoch_loop=loop), should_stop=False, max_steps=ceiling,
+        global_step=clock._from[0], lr_scheduler_configs=[SimpleNamespace(scheduler=scheduler)], rates=[],
+    )  # fmt: skip
+    clock.on_train_start(trainer, module)
+    while not trainer.should_stop and trainer.global_step < until:
+        meter.now += step_s(trainer.global_step)
+        trainer.global_step += 1
+        optimizer.step()
+        scheduler.step(trainer.global_step)
+        trainer.rates.append(optimizer.param_groups[0]["lr"])
+        clock.on_train_batch_end(trainer, module)
+    clock.on_train_end(trainer, module)
+    return trainer, module
+
+
+def a_clock(seconds: float = 9.0, steps: int = 1000) -> BudgetClock:
+    found = plan(POINTS, "etgs", replace(PACE, spent_s=0.5), seconds + 0.5, cap_max=100_000)
+    return BudgetClock(replace(found, steps=steps).as_dict(), found.twice())
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
+@pytest.mark.parametrize("factor", [0.2, 0.7, 1.0, 1.3, 1.8])
+def test_a_misjudged_pace_still_ends_in_time_with_its_schedule_done(factor):
+    clock = a_clock()
+    trainer, module = simulate(clock, lambda step: factor * 9.0 / 1000)
+    found = module.results.run["budget"]
+    assert abs(found["off_percent"]) < 2 and found["schedule_done"] > 0.99
+    assert found["steps"] == pytest.approx(1000 / factor, rel=0.02)
+    assert trainer.rates[-1] == pytest.approx(0.01, rel=0.1)
+    assert all(later <= earlier for earlier, later in zip(trainer.rates, trainer.rates[1:], strict=False))
+    falls = [earlier / later for earlier, later in zip(trainer.rates, trainer.rates[1:], strict=False)]
+    assert max(falls) < 1.05  # no jump
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
+def test_a_well_judged_pace_changes_nothing():
+    trainer, _ = simulate(a_clock(), lambda step: 9.0 / 1000)
+    assert trainer.global_step == 1000
+    assert trainer.rates == pytest.approx([0.01 ** (step / 1000) for step in range(1, 1001)], rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
+def test_growing_is_held_back_while_it_takes_too_much_of_the_time_and_no_longer():
+    module = SimpleNamespace(density=SimpleNamespace(cap_max=9000), splats=range(4000), results=RunResults())
+    caps = []
+
+    def step_s(step: int) -> float:
+        caps.append(module.density.cap_max)
+        return (1.6 if 100 <= step < 200 else 0.9) * 9.0 / 1000
+
+    simulate(a_clock(), step_s, module=module)
+    assert caps[50] == 9000 and caps[190] == 4000 and caps[450] == 9000
+    assert 100 < module.results.run["budget"]["growth_held_at_step"] < 200
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
+def test_a_pace_that_leaves_no_time_stops_the_run_and_says_so(caplog):
+    clock = a_clock()
+    _, module = simulate(clock, lambda step: 9.0 / 1000 if step < 100 else 20.0)
+    assert module.results.run["budget"]["schedule_done"] < 0.2 and "of its schedule was done" in caplog.text
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
+def test_a_resumed_run_keeps_its_clock():
+    whole, _ = simulate(a_clock(), lambda step: 6.0 / 1000)
+    first, meter = a_clock(), Clock()
+    stopped, module = simulate(first, lambda step: 6.0 / 1000, meter, until=700)
+    assert "budget" not in module.results.run  # it is not over
+    second = a_clock()
+    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+    second._from = (700, first.progress(700))
+    resumed, module = simulate(second, lambda step: 6.0 / 1000, meter)
+    assert resumed.global_step == pytest.approx(whole.global_step, rel=0.01)
+    assert abs(module.results.run["budget"]["off_percent"]) < 2
+    assert resumed.rates[0] == pytest.approx(stopped.rates[-1], rel=0.02)
+
+
+def test_a_budget_needs_the_clock_of_the_costs():
+    trainer = SimpleNamespace(callbacks=[])
+    with pytest.raises(SceneError, match="budget needs the clock of callbacks.costs"):
+        a_clock().on_train_start(trainer, None)
+
+
+# The study -------------------------------------------------------------------------------------------------------------
+
+
+def a_run(steps: int, cap: int | None, seed: int, psnr: float, seconds: float) -> Trained:
+    results = RunResults(data={"points": 4000})
+    results.put("test", "psnr", psnr)
+    results.put("cost", "train_seconds", seconds)
+    results.put("cost", "gaussians", 5000)
+    return Trained("etgs", "heated", steps, cap, seed, results, 6000.0)
+
+
+def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
+    grid = [
+        a_run(250, None, 0, 20, 5),
+        a_run(250, None, 1, 22, 5),
+        a_run(1000, 8000, 0, 25, 32),
+        a_run(1000, None, 0, 29, 60),
+    ]
+    points = means(grid)
+    assert [(p.steps, p.growth, p.psnr, p.mean_growth, p.seeds) for p in points] == [
+        (250, FREE, 21, 1.5, 2), (1000, 2.0, 25, 1.5, 1), (1000, FREE, 29, 1.5, 1),
+    ]  # fmt: skip
+    planned = RunResults(run={"budget": {"train_s": 29.0, "calibration_s": 0.7, "off_percent": -1.0, "steps": 900}})
+    planned.put("test", "psnr", 26.0)
+    text = tables(grid, [("etgs", "heated", 30.0, planned)])
+    assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000 | 25.00 | 32.0 |" in text
+    assert len(picture(points).axes) == 2
+
+
+def test_mean_gaussians_weigh_the_steps(tmp_path):
+    (tmp_path / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,200\n100,2,200\n")
+    assert mean_gaussians(tmp_path / "curve.csv", 100) == pytest.approx(0.5 * 150 + 0.5 * 200)
+
+
+def test_a_denser_scene_has_new_points_between_neighbours():
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
+    scene = SceneData("cloud", None, None, None, points, point_colors=points.clone())
+    denser = _denser(scene, 4)
+    assert len(denser.points) == len(denser.point_colors) == 1200 and torch.equal(denser.points[:300], points)
+    spacing = torch.cdist(points, points).sort().values[:, 3].mean()
+    assert 0 < torch.cdist(denser.points[300:], points).amin(1).mean() < spacing
+    assert torch.equal(denser.point_colors[300:600], points)  # a new point has what its neighbour has
+
+
+# Runs ------------------------------------------------------------------------------------------------------------------
+
+
+def budget_run(folder: Path, *overrides: str):
+    """(module, plain) of a whole run as the command line makes it, in this process."""
+    from heatsplat.training.session import fit, prepare_machine
+
+    config = running.compose_run(folder, "method=etgs", *running.TINY, "callbacks.metrics.lpips_net=null", *overrides)
+    prepare_machine(config.threads)
+    data = cli.build(cli.resolved(config)["data"])
+    plain = cli.budgeted(config, data, folder)
+    trainer = cli.build(
+        plain["trainer"], callbacks=cli.build_callbacks(plain["callbacks"]), logger=cli.build(plain["logger"])
+    )
+    module = cli.build(plain["module"], output_dir=str(folder))
+    module.recipe = plain
+    fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
+    return module, plain
+
+
+@pytest.mark.slow
+def test_a_run_ends_in_its_time_and_says_what_twice_would_buy(tmp_path):
+    module, plain = budget_run(tmp_path, "budget=6s", "threads=1", "callbacks.costs.fps_repeats=1")
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    told = found["run"]["budget"]
+    spent = found["cost"]["train_seconds"] + told["calibration_s"]
+    assert spent == pytest.approx(6.0, rel=0.25)  # a tenth on an idle machine
+    assert told["calibration_s"] < 1.0 and told["steps"] == module.trainer.global_step
+    assert plain["density"]["stop"] == round(0.5 * plain["max_steps"])  # the schedule is that of the planned steps
+    report = (tmp_path / "report.md").read_text()
+    assert "twice the time (12 s) would buy" in report and "twice_gain_db" in report
+    assert (tmp_path / "checkpoints" / "last.ckpt").exists()
+
+
+@pytest.mark.slow
+def test_a_resumed_run_keeps_its_plan(tmp_path):
+    first, plain = budget_run(tmp_path, "budget=6s", "threads=1", "test=false")
+    middle = tmp_path / "checkpoints" / f"step_{2 * round(0.25 * plain['max_steps']):06d}.ckpt"
+    again, resumed = budget_run(tmp_path / "again", "budget=6s", "threads=1", "test=false", f"ckpt={middle}")
+    assert resumed["budget"] == plain["budget"] and resumed["max_steps"] == plain["max_steps"]
+    told = again.results.run["budget"]
+    assert told["train_s"] + told["calibration_s"] == pytest.approx(6.0, rel=0.25)
+    assert again.trainer.global_step > plain["max_steps"] // 2
+    with pytest.raises(SceneError, match="was planned for budget=6s and keeps its plan"):
+        budget_run(tmp_path / "other", "budget=8s", "threads=1", f"ckpt={middle}")
+
+
+def test_a_budget_and_a_number_of_steps_contradict_each_other(tmp_path):
+    config = running.compose_run(tmp_path, "method=etgs", *running.TINY, "budget=30s", "max_steps=100")
+    with pytest.raises(SceneError, match="budget chooses the number of steps, and max_steps gives it"):
+        cli.budgeted(config, None, tmp_path)
