@@ -17,6 +17,10 @@ class Splats(nn.Module):
     remove rows in one place. Geometry: ``means`` [N, 3] in world units, ``log_scales`` [N, 3], ``quats`` [N, 4] wxyz
     (need not have unit length), ``opacity_logits`` [N, M], one column per modality. A thermal model adds its own names.
 
+    A tensor that few Gaussians need may become sparse: ``release`` gives up rows for good. It then has a row for each
+    Gaussian that kept one, in the order of the Gaussians, and ``places`` says which. A row that was given up counts as
+    zeros, and a new Gaussian whose row is zeros gets none. Until something is released, there is no such thing.
+
     Args:
         tensors: name -> [N, ...] float tensor; must hold the four geometry names.
 
@@ -33,12 +37,14 @@ class Splats(nn.Module):
         if len(set(counts.values())) > 1:
             raise ValueError(f"splats need one row per Gaussian in every tensor, got {counts}")
         self.raw = nn.ParameterDict({name: nn.Parameter(tensor.detach().clone()) for name, tensor in tensors.items()})
+        self._places = nn.Module()  # a buffer [N] for each sparse tensor
+        self.released: dict[str, tuple[Tensor, dict[str, Tensor]]] = {}  # what the owner of the optimiser is to remove
 
     def __len__(self) -> int:
         return self.raw["means"].shape[0]
 
     def __getitem__(self, name: str) -> Tensor:
-        """The raw tensor of that name, [N, ...]."""
+        """The raw tensor of that name, [N, ...]; a sparse one has fewer rows."""
         return self.raw[name]
 
     def __contains__(self, name: str) -> bool:
@@ -68,9 +74,53 @@ class Splats(nn.Module):
         """Opacity in (0, 1), [M, N]."""
         return self.raw["opacity_logits"].sigmoid().T
 
+    def places(self, name: str) -> Tensor | None:
+        """Row of a sparse tensor that belongs to each Gaussian, [N] int64, -1 for none; None where each has its own."""
+        return self._places._buffers.get(name)
+
+    def place(self, name: str, kept: Tensor) -> None:
+        """Says which Gaussians have a row of a tensor: ``kept`` [N] bool. Its rows must follow."""
+        places = torch.where(kept, kept.cumsum(0) - 1, -1)
+        self._places.register_buffer(name, places)
+
+    def dense(self, name: str, rows: Tensor, ids: Tensor) -> Tensor:
+        """One row for each of the Gaussians ``ids`` out of ``rows``, which are those of a tensor; zeros where it has none."""
+        places = self.places(name)
+        if places is None:
+            return rows[ids]
+        found = places[ids]
+        result = rows.new_zeros(len(ids), *rows.shape[1:])
+        result[found >= 0] = rows[found[found >= 0]]
+        return result
+
+    def release(self, name: str, gone: Tensor, instead: Mapping[str, Tensor]) -> None:
+        """Gives up the rows of a tensor that belong to some Gaussians, for other values of their other tensors.
+
+        They leave with their moments after the step that is under way, when density control gets the Gaussians (a
+        ``density.ops.Cloud``): the optimiser must first finish with the tensors that have gradients.
+
+        Args:
+            name: of the tensor.
+            gone: [N] bool; Gaussians that have no row are passed over.
+            instead: name -> values [N, ...], which Gaussians that lose their row take.
+        """
+        self.released[name] = gone, dict(instead)
+
     def resize(self, count: int) -> None:
         """Gives every tensor ``count`` rows of zeros; for loading a checkpoint of another size, whose values follow."""
-        for name, parameter in self.raw.items():
-            self.raw[name] = nn.Parameter(
-                torch.zeros(count, *parameter.shape[1:], dtype=parameter.dtype, device=parameter.device)
-            )
+        self._places, self.released = nn.Module(), {}
+        for name in self.names:
+            self._resize(name, count)
+
+    def _resize(self, name: str, count: int) -> None:
+        old = self.raw[name]
+        self.raw[name] = nn.Parameter(torch.zeros(count, *old.shape[1:], dtype=old.dtype, device=old.device))
+
+    def _load_from_state_dict(self, state_dict: Mapping[str, Tensor], prefix: str, *rest) -> None:
+        """Makes tensors sparse that are so in the checkpoint; what torch does follows."""
+        start = f"{prefix}_places."
+        for key in [key for key in state_dict if key.startswith(start)]:
+            name = key.removeprefix(start)
+            self._places.register_buffer(name, state_dict[key].to(self.means.device, copy=True))
+            self._resize(name, state_dict[f"{prefix}raw.{name}"].shape[0])
+        super()._load_from_state_dict(state_dict, prefix, *rest)

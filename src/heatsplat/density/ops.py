@@ -15,6 +15,8 @@ from heatsplat.splats import Splats
 class Cloud:
     """Gaussians with everything that has a row per Gaussian: parameters, Adam moments, density statistics.
 
+    Rows of tensors that a model released (``Splats.release``) are removed here, as soon as a Cloud is made.
+
     Args:
         splats: the parameters.
         optimizer: the optimiser, whose groups carry "name"; groups named like a tensor of ``splats`` hold just that
@@ -26,41 +28,80 @@ class Cloud:
     optimizer: torch.optim.Optimizer | None = None
     state: dict[str, Tensor] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for name, (gone, instead) in self.splats.released.items():
+            self.drop(name, gone, instead)
+        self.splats.released.clear()
+
     def __len__(self) -> int:
         return len(self.splats)
 
+    @torch.no_grad()
+    def drop(self, name: str, gone: Tensor, instead: Mapping[str, Tensor]) -> None:
+        """Removes the rows of one tensor that belong to some Gaussians, with their moments.
+
+        Args:
+            name: of the tensor, which is sparse from now on.
+            gone: [N] bool; Gaussians that have no row are passed over.
+            instead: name -> values [N, ...] that those which lose their row take. Moments there stay: they are of the size
+                of the gradients to come, and without them the next steps would be the largest.
+        """
+        places = self.splats.places(name)
+        before = torch.arange(len(self), device=gone.device) if places is None else places
+        kept, lost = ~gone & (before >= 0), gone & (before >= 0)
+        for other, values in instead.items():
+            self.splats[other][lost] = values[lost].to(self.splats[other])
+        rows = before[kept]
+        self._replace(name, lambda tensor: tensor[rows], lambda moment: moment[rows])
+        self.splats.place(name, kept)
+
     def keep(self, mask: Tensor) -> None:
         """Removes the Gaussians where ``mask`` [N] bool is False, with their moments and statistics."""
-        rows = mask.nonzero().squeeze(1)
+        ids = mask.nonzero().squeeze(1)
         for name in self.splats.names:
-            self._replace(name, lambda tensor: tensor[rows], lambda moment: moment[rows])
+            places, rows = self.splats.places(name), ids
+            if places is not None:
+                rows = places[ids]
+                self.splats.place(name, rows >= 0)
+                rows = rows[rows >= 0]
+            self._replace(name, lambda tensor, rows=rows: tensor[rows], lambda moment, rows=rows: moment[rows])
         for name, tensor in self.state.items():
-            self.state[name] = tensor[rows]
+            self.state[name] = tensor[ids]
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Adds Gaussians: name -> [n, ...] for every tensor of the splats. Their moments and statistics start at zero.
+
+        A sparse tensor takes no row that is all zeros.
 
         Raises:
             KeyError: a tensor of the splats is missing in ``rows``.
         """
         count = rows["means"].shape[0]
         for name in self.splats.names:
-            new = rows[name]
+            new, places = rows[name], self.splats.places(name)
+            if places is not None:
+                wanted = new.flatten(1).any(1)
+                self.splats.place(name, torch.cat([places >= 0, wanted]))
+                new = new[wanted]
             self._replace(
                 name,
                 lambda tensor, new=new: torch.cat([tensor, new.to(tensor)]),
-                lambda moment: torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])]),
+                lambda moment, new=new: torch.cat([moment, moment.new_zeros(new.shape)]),
             )
         for name, tensor in self.state.items():
             self.state[name] = torch.cat([tensor, tensor.new_zeros(count, *tensor.shape[1:])])
 
     def overwrite(self, name: str, values: Tensor) -> None:
-        """Gives one tensor new values [N, ...] and forgets its moments."""
+        """Gives one tensor new values [N, ...] and forgets its moments; a sparse one takes the rows that it has."""
+        places = self.splats.places(name)
+        if places is not None:
+            values = values[places >= 0]
         self._replace(name, lambda tensor: values.to(tensor), torch.zeros_like)
 
     def rows(self, ids: Tensor) -> dict[str, Tensor]:
         """Copies of the raw tensors of some Gaussians, to be changed and appended: name -> [n, ...]."""
-        return {name: self.splats[name].detach()[ids].clone() for name in self.splats.names}
+        splats = self.splats
+        return {name: splats.dense(name, splats[name].detach(), ids).clone() for name in splats.names}
 
     @torch.no_grad()
     def _replace(

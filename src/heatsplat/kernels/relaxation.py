@@ -153,13 +153,16 @@ def _responses(table, k, width, a, phi, offset, difference_row):
 
 
 @kernel
-def forward(rate, initial, ambient, gains, scale, ids, time, limit, table, values):
+def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, table, values):
     """Fills ``values`` [n] with the temperatures of the Gaussians ``ids``.
+
+    Gaussians without a row of gains only relax: their frequencies are passed over.
 
     Args:
         rate, initial: [N] float32.
         ambient: float32.
-        gains: [N, 2, K] float32.
+        gains: [M, 2, K] float32.
+        places: [N] int64 row of ``gains`` of every Gaussian, -1 for none; or empty, M = N: each has its own.
         scale: [N] float32 factors on the sources, or empty for 1.
         ids: [n] int64.
         time: float32.
@@ -177,8 +180,12 @@ def forward(rate, initial, ambient, gains, scale, ids, time, limit, table, value
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
             difference_row = NEAR if y < _f(1.0) else FAR
+            place = places[row] if places.shape[0] > 0 else row
+            if place < 0:
+                values[start + j] = scratch[RELAXED, j]
+                continue
             source = splat(_f(0.0))
-            first = row * (2 * frequencies)
+            first = place * (2 * frequencies)
             for k in range(0, frequencies, LANES):
                 sine, cosine, _ = _responses(table, k, width, a, phi, offset, difference_row)
                 sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
@@ -192,11 +199,11 @@ def forward(rate, initial, ambient, gains, scale, ids, time, limit, table, value
 
 @kernel
 def clear_others(ids, written, v_gains):
-    """Writes zeros into the rows of ``v_gains`` [N, 2, K] that are not among ``ids``, which ``backward`` leaves alone.
+    """Writes zeros into the rows of ``v_gains`` [M, 2, K] that are not among ``ids``, which ``backward`` leaves alone.
 
     Args:
-        ids: [n] int64.
-        written: [N] bool, scratch.
+        ids: [n] int64 rows of gains.
+        written: [M] bool, scratch.
         v_gains: output.
     """
     count = v_gains.shape[0]
@@ -215,6 +222,7 @@ def backward(
     initial,
     ambient,
     gains,
+    places,
     scale,
     ids,
     time,
@@ -230,7 +238,7 @@ def backward(
     """Writes the rows ``ids`` of the gradients; ids must not repeat.
 
     Args:
-        rate, initial, ambient, gains, scale, ids, time, limit, table: as in ``forward``.
+        rate, initial, ambient, gains, places, scale, ids, time, limit, table: as in ``forward``.
         v_values: [n] gradient of the values.
         v_rate, v_initial, v_gains, v_scale: outputs, shaped as what they are gradients of.
         v_ambient: [blocks] output, a sum for each block of Gaussians.
@@ -252,8 +260,9 @@ def backward(
             if scale.shape[0] > 0:
                 v_gain = v_gain * scale[row]
             source, slope = splat(_f(0.0)), splat(_f(0.0))
-            first = row * (2 * frequencies)
-            for k in range(0, frequencies, LANES):
+            place = places[row] if places.shape[0] > 0 else row
+            first = place * (2 * frequencies)
+            for k in range(0, frequencies if place >= 0 else 0, LANES):
                 sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
                 sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
                 cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from heatsplat.kernels import relaxation as kernels
 from heatsplat.kernels.compilation import announced
 from heatsplat.kernels.simd import LANES
-from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, temperature
+from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, harmonic_response, relax
 
 SMALLEST_OMEGA = 1e-15  # below it the kernel's a² + ω² could vanish in float32
 CACHE_LINE = 16  # float32 numbers; rows of gains are read by whole lines
@@ -32,8 +32,11 @@ def visible_temperature(
     gains: Tensor | None = None,
     inverse_capacity: Tensor | None = None,
     ids: Tensor | None = None,
+    places: Tensor | None = None,
 ) -> Tensor:
     """Temperature at a time of the Gaussians ``ids``, [n]; only their rows are read.
+
+    Not every Gaussian needs a source: with ``places``, those without a row of gains relax, and cost no more than that.
 
     **Convention:** units as in ``relaxation.temperature``.
 
@@ -42,16 +45,24 @@ def visible_temperature(
         ambient: [].
         initial, rate: [N].
         omega: [K] float64.
-        gains: [N, 2, K] strengths of the sources sin ωt and cos ωt, one row of memory per Gaussian; None is no source.
+        gains: [M, 2, K] strengths of the sources sin ωt and cos ωt, one row of memory per Gaussian; None is no source.
         inverse_capacity: [N] multiplies the sources of a Gaussian; None is 1.
-        ids: [n] int64 rows, each at most once; None is all of them.
+        ids: [n] int64 Gaussians, each at most once; None is all of them.
+        places: [N] int64, the row of ``gains`` of every Gaussian, -1 for one that has no source; None is M = N, a row each.
 
     Raises:
-        ValueError: the shape of the gains does not fit.
+        ValueError: the shape of the gains or of the places does not fit.
     """
-    if gains is not None and gains.shape != (rate.shape[0], 2, omega.shape[0]):
-        raise ValueError(f"gains must have shape {[rate.shape[0], 2, omega.shape[0]]}, got {list(gains.shape)}")
-    arguments = (time, ambient, initial, rate, omega, gains, inverse_capacity, ids)
+    count = rate.shape[0]
+    if gains is not None:
+        rows = gains.shape[0] if places is not None else count
+        if gains.shape != (rows, 2, omega.shape[0]):
+            raise ValueError(f"gains must have shape {[rows, 2, omega.shape[0]]}, got {list(gains.shape)}")
+        if places is not None and (places.shape != (count,) or places.dtype != torch.int64):
+            raise ValueError(f"places must be int64 of shape {[count]}, got {places.dtype} of {list(places.shape)}")
+        if places is not None and rows == 0:
+            gains = places = inverse_capacity = None
+    arguments = (time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
     if _fits_kernel(rate, omega):
         return _VisibleTemperature.apply(*arguments)
     return _reference(*arguments)
@@ -64,16 +75,27 @@ def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
     return omega.numel() == 0 or omega.abs().min().item() >= SMALLEST_OMEGA
 
 
-def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids) -> Tensor:
+def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places) -> Tensor:
     """The plain form and the oracle of the kernel."""
-    rows = [None if x is None else x if ids is None else x.index_select(0, ids) for x in (initial, rate, gains)]
-    initial, rate, gains = rows
+
+    def rows(tensor: Tensor | None, ids: Tensor | None) -> Tensor | None:
+        return tensor if tensor is None or ids is None else tensor.index_select(0, ids)
+
+    initial, rate, scale, places = (rows(x, ids) for x in (initial, rate, inverse_capacity, places))
     if gains is None:
-        gains, omega = rate.new_zeros(rate.shape[0], 2, 0), omega[:0]
-    if inverse_capacity is not None:
-        scale = inverse_capacity if ids is None else inverse_capacity.index_select(0, ids)
-        gains = gains * scale[:, None, None]
-    return temperature(time, ambient, initial, rate, omega, gains[:, 0], gains[:, 1])
+        return relax(time, ambient, initial, rate)
+    if places is None:
+        return relax(time, ambient, initial, rate) + _heat(time, rate, omega, rows(gains, ids), scale)
+    heated = (places >= 0).nonzero().squeeze(1)
+    heat = _heat(time, rows(rate, heated), omega, rows(gains, rows(places, heated)), rows(scale, heated))
+    return relax(time, ambient, initial, rate).index_add(0, heated, heat)
+
+
+def _heat(time: Tensor, rate: Tensor, omega: Tensor, gains: Tensor, scale: Tensor | None) -> Tensor:
+    """What the sources add to the temperature, [n]."""
+    sine, cosine = harmonic_response(rate, omega, time)
+    heat = (gains[:, 0] * sine + gains[:, 1] * cosine).sum(1)
+    return heat if scale is None else heat * scale
 
 
 class _SpareMemory:
@@ -104,15 +126,16 @@ _gain_gradients = _SpareMemory()
 
 
 class _VisibleTemperature(torch.autograd.Function):
-    """The kernel. Gradients are dense [N, ...], zero in rows out of view: that is what the optimiser reads."""
+    """The kernel. Gradients have all rows, zero in those out of view: that is what the optimiser reads."""
 
     @staticmethod
-    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids) -> Tensor:
+    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places) -> Tensor:
         count = rate.shape[0]
         ids = torch.arange(count) if ids is None else ids
         gains = rate.new_empty(count, 2, 0) if gains is None else gains
         scale = rate.new_empty(0) if inverse_capacity is None else inverse_capacity
-        tensors = rate.contiguous(), initial.contiguous(), gains.contiguous(), scale.contiguous(), ids.contiguous()
+        places = ids.new_empty(0) if places is None else places
+        tensors = tuple(x.contiguous() for x in (rate, initial, gains, places, scale, ids))
         ctx.save_for_backward(*tensors)
         seconds, frequencies = time.item(), gains.shape[2]
         limit = BACKWARD_TIME_CONSTANTS / -seconds if seconds < 0 else math.inf
@@ -128,24 +151,28 @@ class _VisibleTemperature(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, v_values: Tensor):
         tensors = ctx.saved_tensors
-        rate, initial, gains, scale, ids = tensors
+        rate, initial, gains, places, scale, ids = tensors
         v_rate, v_initial, v_scale = (torch.zeros(x.shape) for x in (rate, initial, scale))
         v_gains = _gain_gradients.take(gains.shape)
         v_ambient = torch.empty(-(-ids.shape[0] // kernels.BLOCK))
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
-            if ids.shape[0] < rate.shape[0]:  # clearing all of it would double the memory traffic
-                kernels.clear_others(ids.numpy(), np.empty(rate.shape[0], np.bool_), v_gains.numpy())
+            rows = ids
+            if places.shape[0] > 0:
+                rows = places[ids]
+                rows = rows[rows >= 0]
+            if rows.shape[0] < gains.shape[0]:  # clearing all of it would double the memory traffic
+                kernels.clear_others(rows.numpy(), np.empty(gains.shape[0], np.bool_), v_gains.numpy())
             gradient = v_values.contiguous().numpy()
             kernels.backward(*_kernel_arguments(ctx, tensors), gradient, *(x.numpy() for x in outputs))
         v_ambient = v_ambient.sum() if ctx.needs_input_grad[1] else None
         v_gains = v_gains if ctx.needs_input_grad[5] else None
         v_scale = v_scale if ctx.needs_input_grad[6] else None
-        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None
+        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None
 
 
 def _kernel_arguments(ctx, tensors: tuple[Tensor, ...]) -> tuple:
     """What both kernels take first, in their order."""
-    rate, initial, gains, scale, ids = (x.detach().numpy() for x in tensors)
+    rate, initial, gains, places, scale, ids = (x.detach().numpy() for x in tensors)
     ambient, time, limit = ctx.numbers
-    return rate, initial, ambient, gains, scale, ids, time, limit, ctx.table
+    return rate, initial, ambient, gains, places, scale, ids, time, limit, ctx.table

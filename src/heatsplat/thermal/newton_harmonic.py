@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -16,6 +17,7 @@ from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
+from heatsplat.thermal.sparse_sources import SparseSources
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +39,8 @@ class NewtonHarmonic(ThermalModel):
     temperature in kelvin.
 
     Tensors: "initial_state" [N], "source_gains" [N, 2, K] (sin, cos; absent without frequencies) and "log_rate" [N], or
-    "log_capacity" [N] and "log_conductance" [N] in faithful form.
+    "log_capacity" [N] and "log_conductance" [N] in faithful form. With ``drop_sources_at``, "source_gains" becomes sparse
+    (see Splats) at those steps: what has no row only relaxes, and costs neither its harmonics nor their memory.
 
     Args:
         frequencies: harmonics asked for; the grid may hold fewer. 0 is pure relaxation, without any tensor of a source.
@@ -53,6 +56,9 @@ class NewtonHarmonic(ThermalModel):
             a Gaussian outside comes back; "hard" stops its gradient (the paper's Eq. 9); "none" shows them as they are.
         lr_initial, lr_gain, lr_rate, lr_ambient: learning rates.
         lr_end: factor on them at the last step, log-linear in between.
+        drop_sources_at: steps at which Gaussians lose a source that they do not need (see SparseSources); none by default.
+        source_floor: how closely relaxation alone must tell their temperature, in standard deviations of the noise.
+        source_noise: that standard deviation in image units; None estimates it from training images.
 
     Raises:
         ValueError: an option is unknown.
@@ -76,6 +82,9 @@ class NewtonHarmonic(ThermalModel):
         lr_rate: float = 5e-3,
         lr_ambient: float = 1e-3,
         lr_end: float = 0.1,
+        drop_sources_at: Sequence[int] = (),
+        source_floor: float = 2.0,
+        source_noise: float | None = None,
     ) -> None:
         super().__init__()
         for name, value, known in (
@@ -93,6 +102,8 @@ class NewtonHarmonic(ThermalModel):
         self.clip = clip
         self.lr_initial, self.lr_gain, self.lr_rate = lr_initial, lr_gain, lr_rate
         self.lr, self.lr_end = lr_ambient, lr_end
+        self.sources = SparseSources(drop_sources_at, source_floor, source_noise) if drop_sources_at else None
+        self._due = False  # whether sources are to be dropped in this step
         self._ambient_from = ambient
         self._ambient_unknown = False
         self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
@@ -116,6 +127,34 @@ class NewtonHarmonic(ThermalModel):
             bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
             self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._set_ambient(scene)
+        if self.sources is not None and self.omega.numel() > 0:
+            self.sources.prepare(scene, self.modality)
+
+    def on_step(self, step: int) -> None:
+        self._due = self.sources is not None and self.omega.numel() > 0 and step in self.sources.drop_at
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        """None; at the steps of ``drop_sources_at`` it is here that sources are given up: it is called once a step."""
+        if self._due:
+            self._due = False
+            self._drop_sources(splats)
+        return {}
+
+    @torch.no_grad()
+    def _drop_sources(self, splats: Splats) -> None:
+        gone, initial, log_rate = self.sources.needless(
+            lambda time_s: self._state(splats, time_s, None), self.ambient, self.span_s.item()
+        )
+        instead = {"initial_state": initial}
+        if self.param == "rate":
+            instead["log_rate"] = log_rate
+        else:
+            instead["log_conductance"] = log_rate + splats["log_capacity"]
+        splats.release("source_gains", gone, instead)
+        places = splats.places("source_gains")
+        before = len(gone) if places is None else int((places >= 0).sum())
+        left = ~gone if places is None else ~gone & (places >= 0)
+        log.info("%d of %d heat sources stay, for %d Gaussians", int(left.sum()), before, len(gone))
 
     def _set_ambient(self, scene: SceneData) -> None:
         celsius = scene.ambient_c if isinstance(self._ambient_from, str) else self._ambient_from
@@ -180,6 +219,7 @@ class NewtonHarmonic(ThermalModel):
             splats["source_gains"] if source else None,
             torch.exp(-splats["log_capacity"]) if faithful and source else None,
             ids,
+            splats.places("source_gains") if source else None,
         )
 
     def effects(self) -> dict[str, dict]:
