@@ -19,7 +19,7 @@ from heatsplat.geometry.projection import to_camera, to_pixels
 
 MOST_FRAMES = 64
 # Points whose tracks are fitted, and their observations, by which time goes; all points, up to MOST_IN_FRONT, hide each other.
-MOST_POINTS, MOST_OBSERVATIONS = 500, 16_000
+MOST_POINTS, MOST_OBSERVATIONS = 500, 24_000
 MOST_CANDIDATES = 1500
 MOST_IN_FRONT = 20000
 LEAST_PX = 8  # along the shorter side of an image

@@ -10,10 +10,9 @@ from heatsplat.effects.observations import Observations
 
 HURDLE = 1.0
 NEIGHBOURS = 6
-FEWEST = 40  # points
-FASTER = (
-    1.25  # how much faster than levels contrasts must fade: bodies of one level but two rates look a little like it
-)
+FEWEST, FEWEST_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
+# How much faster than levels contrasts must fade: bodies of one level but two rates look a little like it.
+FASTER = 1.35
 LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 
 
@@ -42,7 +41,7 @@ def conduction(obs: Observations) -> Evidence:
     kept = ((last[near].mean(1) - ambient) / level).median()
     contrast, remains = first - first[near].mean(1), last - last[near].mean(1)
     strong = contrast.abs() > 5.0 * obs.noise
-    if int(strong.sum()) < FEWEST or kept < LEFT:
+    if int(strong.sum()) < FEWEST_STRONG or kept < LEFT:
         return Evidence(0.0, "neighbours are too much alike, or all is cold in the end, to tell how contrasts fade")
     still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
     rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
