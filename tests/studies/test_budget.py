@@ -216,6 +216,13 @@ def test_a_misjudged_pace_still_ends_in_time_with_its_schedule_done(factor):
 
 
 @pytest.mark.filterwarnings("ignore:The epoch parameter")
+def test_a_machine_that_becomes_ten_times_slower_late_is_noticed_at_once():
+    _, module = simulate(a_clock(), lambda step: (0.9 if step < 750 else 9.0) * 9.0 / 1000)
+    found = module.results.run["budget"]
+    assert abs(found["off_percent"]) < 2 and found["schedule_done"] > 0.97 and 750 < found["steps"] < 800
+
+
+@pytest.mark.filterwarnings("ignore:The epoch parameter")
 def test_a_well_judged_pace_changes_nothing():
     trainer, _ = simulate(a_clock(), lambda step: 9.0 / 1000)
     assert trainer.global_step == 1000

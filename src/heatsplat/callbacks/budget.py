@@ -17,7 +17,7 @@ log = logging.getLogger("heatsplat")
 SETTLED = 0.5  # share of the schedule after which no Gaussian is added and the rest may be stretched (density.stop)
 GROWING = 0.6  # share of the time that the schedule up to there may take; else no more Gaussians come
 PRESSED = 0.7  # share of the time after which the schedule is shrunk, settled or not
-WINDOW = 40  # looks at the clock over which the pace is measured
+WINDOW = 0.05  # share of the time over which the pace is measured: a machine may become slower at any moment
 LOOKS = 400  # looks at the clock in a run of the planned length
 
 
@@ -46,7 +46,7 @@ class BudgetClock(pl.Callback):
         self.seconds = float(plan["train_s"])
         self._from = (0, 0.0)  # step and progress at which the end was last set
         self._end = float(plan["steps"])
-        self._seen: deque[tuple[int, float]] = deque(maxlen=WINDOW)
+        self._seen: deque[tuple[int, float]] = deque()
         self._meter: CostMeter | None = None
         self._policies: list[tuple[Any, int]] = []  # what adds Gaussians, and how many it may have by the plan
         self._held: int | None = None  # step at which growing was first held back
@@ -87,6 +87,8 @@ class BudgetClock(pl.Callback):
         if step % self._every == 0 or step >= self._end - self._every:
             spent = self._spent()
             self._seen.append((step, spent))
+            while len(self._seen) > 2 and spent - self._seen[1][1] > WINDOW * self.seconds:
+                self._seen.popleft()
             if self.progress(step) >= SETTLED or spent >= PRESSED * self.seconds:
                 self._retime(step, spent)
                 self._set_length(trainer)
