@@ -45,6 +45,19 @@ def test_a_new_part_is_the_identity_and_can_leave_it(channels):
     assert part.raw_spread.grad < -1e-2  # a descent makes it wider
 
 
+@pytest.mark.parametrize("shape", [(9, 7, 1), (5, 12, 3)])
+@pytest.mark.parametrize("raw", [0.05, 0.4])
+def test_gradients_are_those_of_finite_differences(shape, raw):
+    part = ready(raw, width_max=1.0).double()
+    image = noise(*shape).double().requires_grad_()
+    weights = noise(*shape, seed=1).double()
+
+    def blurred(image, raw_spread):
+        return torch.func.functional_call(part, {"raw_spread": raw_spread}, (image, FRAME)) * weights
+
+    assert torch.autograd.gradcheck(blurred, (image, torch.tensor(raw, dtype=torch.float64, requires_grad=True)))
+
+
 def test_an_even_image_stays_even_and_blurs_add_in_variance():
     part = ready(0.4)
     assert torch.allclose(part(torch.full((HEIGHT, WIDTH, 1), 0.7), FRAME), torch.tensor(0.7), atol=1e-6)

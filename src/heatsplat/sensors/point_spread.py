@@ -48,14 +48,8 @@ class PointSpread(SensorPart):
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         zoom = image.shape[1] / self.trained_width.item()
         radius = math.ceil(REACH * self.width_max * zoom)
-        taps = discrete_gaussian(self.variance() * zoom**2, radius).to(image)
-        channels = image.shape[2]
-        planes = image.permute(2, 0, 1)[None]
-        planes = functional.pad(planes, (radius, radius, radius, radius), mode="replicate")
-        kernel = taps.expand(channels, 1, 1, -1)
-        planes = functional.conv2d(planes, kernel, groups=channels)
-        planes = functional.conv2d(planes, kernel.transpose(2, 3), groups=channels)
-        return planes[0].permute(1, 2, 0)
+        variance = self.variance() * zoom**2
+        return _Blur.apply(image, variance, radius)
 
     def variance(self) -> Tensor:
         """t in squared pixels of a training image, [] in [0, width_max²]; below zero only the gradient goes on."""
@@ -67,6 +61,57 @@ class PointSpread(SensorPart):
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"point_spread": {"width_px": self.variance().item() ** 0.5}}
+
+
+class _Blur(torch.autograd.Function):
+    """The blur of an image [H, W, C] with a discrete Gaussian of a variance [] and a radius.
+
+    torch differentiates a convolution ten times as slowly as it convolves. Here the adjoint is a convolution, too, and the
+    slope in the variance is known: weights change by the heat equation on the grid.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, variance: Tensor, radius: int) -> Tensor:
+        weights = discrete_gaussian(variance, radius)
+        ctx.save_for_backward(image, weights)
+        ctx.variance_type = variance.dtype
+        return _convolved(_convolved(image, weights, 0), weights, 1)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        image, weights = ctx.saved_tensors
+        grad_image = grad_variance = None
+        if ctx.needs_input_grad[0]:
+            grad_image = _gathered(_gathered(grad, weights, 1), weights, 0)
+        if ctx.needs_input_grad[1]:
+            slopes = 0.5 * (weights.roll(1) + weights.roll(-1)) - weights
+            down = _convolved(_convolved(image, slopes, 0), weights, 1)
+            across = _convolved(_convolved(image, weights, 0), slopes, 1)
+            grad_variance = (grad * (down + across)).sum().to(ctx.variance_type)
+        return grad_image, grad_variance, None
+
+
+def _convolved(image: Tensor, weights: Tensor, axis: int) -> Tensor:
+    """An image [H, W, C] convolved with symmetric weights [2r + 1] along an axis; beyond the border lies the border."""
+    radius = len(weights) // 2
+    return _slid(image, weights, axis, radius, "replicate")
+
+
+def _gathered(grad: Tensor, weights: Tensor, axis: int) -> Tensor:
+    """The adjoint of ``_convolved``: what went beyond the border comes back to it."""
+    radius, count = len(weights) // 2, grad.shape[axis]
+    spread = _slid(grad, weights, axis, 2 * radius, "constant")
+    inner = spread.narrow(axis, radius, count).clone()
+    inner.narrow(axis, 0, 1).add_(spread.narrow(axis, 0, radius).sum(axis, keepdim=True))
+    inner.narrow(axis, count - 1, 1).add_(spread.narrow(axis, radius + count, radius).sum(axis, keepdim=True))
+    return inner
+
+
+def _slid(image: Tensor, weights: Tensor, axis: int, padding: int, mode: str) -> Tensor:
+    planes = image.permute(2, 0, 1)[:, None]
+    sides = (0, 0, padding, padding) if axis == 0 else (padding, padding, 0, 0)
+    kernel = weights.to(image).reshape((1, 1, -1, 1) if axis == 0 else (1, 1, 1, -1))
+    return functional.conv2d(functional.pad(planes, sides, mode=mode), kernel)[:, 0].permute(1, 2, 0)
 
 
 def discrete_gaussian(variance: Tensor, radius: int) -> Tensor:
