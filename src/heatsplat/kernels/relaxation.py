@@ -42,8 +42,8 @@ OMEGA, OMEGA_SQUARED, OMEGA_COSC, OMEGA_SQUARED_SINC, NEAR, FAR, X, SINC2, COSC1
 TABLE_ROWS = 10
 
 # Rows of a block's scratch: functions of y = at for its Gaussians.
-RATE, INITIAL, Y, PHI, OFFSET, FALL, CHI, THETA, THETA2, CHI2, RELAXED = range(11)
-SCRATCH_ROWS = 11
+RATE, INITIAL, Y, PHI, OFFSET, FALL, CHI, THETA, THETA2, CHI2, RELAXED, SOURCE, SLOPE = range(13)
+SCRATCH_ROWS = 13
 
 _f = np.float32
 _LARGEST_RATE = _f(1e18)  # its square still fits
@@ -143,6 +143,19 @@ def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch
 
 
 @inline
+def _heated(places, ids, start, stop, heated):
+    """Fills ``heated`` with the numbers in the block of the Gaussians that have a row of gains; how many these are.
+
+    A list, as branches that some Gaussians take and others do not cost as much as the harmonics that they save.
+    """
+    count = 0
+    for j in range(stop - start):
+        heated[count] = j
+        count += places[ids[start + j]] >= 0 if places.shape[0] > 0 else 1
+    return count
+
+
+@inline
 def _responses(table, k, width, a, phi, offset, difference_row):
     """Responses to sin and to cos over time, for sixteen frequencies from ``k``; and 1/(a² + ω²)."""
     inverse = _f(1.0) / (load(table, OMEGA_SQUARED * width + k) + a * a)
@@ -176,14 +189,15 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
         stop = min(start + BLOCK, count)
         scratch = np.empty((SCRATCH_ROWS, BLOCK), np.float32)
         _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
+        heated = np.empty(BLOCK, np.int64)
         for j in range(stop - start):
+            values[start + j] = scratch[RELAXED, j]
+        for i in range(_heated(places, ids, start, stop, heated)):
+            j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
             difference_row = NEAR if y < _f(1.0) else FAR
             place = places[row] if places.shape[0] > 0 else row
-            if place < 0:
-                values[start + j] = scratch[RELAXED, j]
-                continue
             source = splat(_f(0.0))
             first = place * (2 * frequencies)
             for k in range(0, frequencies, LANES):
@@ -249,20 +263,22 @@ def backward(
         stop = min(start + BLOCK, count)
         scratch = np.empty((SCRATCH_ROWS, BLOCK), np.float32)
         _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
-        ambient_sum = _f(0.0)
-        for j in range(stop - start):
+        scratch[SOURCE] = _f(0.0)
+        scratch[SLOPE] = _f(0.0)
+        heated = np.empty(BLOCK, np.int64)
+        for i in range(_heated(places, ids, start, stop, heated)):
+            j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
             fall, small = scratch[FALL, j], scratch[Y, j] < _f(1.0)
             difference_row = NEAR if small else FAR
-            v = v_values[start + j]
-            v_gain = v * time
+            v_gain = v_values[start + j] * time
             if scale.shape[0] > 0:
                 v_gain = v_gain * scale[row]
             source, slope = splat(_f(0.0)), splat(_f(0.0))
             place = places[row] if places.shape[0] > 0 else row
             first = place * (2 * frequencies)
-            for k in range(0, frequencies if place >= 0 else 0, LANES):
+            for k in range(0, frequencies, LANES):
                 sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
                 sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
                 cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
@@ -284,13 +300,18 @@ def backward(
                     slope = (
                         slope + (cos_gain * (a * rest - omega * sine) - sin_gain * (a * sine + omega * rest)) * inverse
                     )
+            scratch[SOURCE, j] = sum_of_lanes(source)
+            scratch[SLOPE, j] = v_gain * sum_of_lanes(slope)
+        ambient_sum = _f(0.0)
+        for j in range(stop - start):
+            row, v, fall = ids[start + j], v_values[start + j], scratch[FALL, j]
             above = scratch[INITIAL, j] - ambient
             v_initial[row] = v * fall
-            ambient_sum += v * (y * phi)
+            ambient_sum += v * (scratch[Y, j] * scratch[PHI, j])
             if scale.shape[0] > 0:
-                v_scale[row] = v * time * sum_of_lanes(source)
+                v_scale[row] = v * time * scratch[SOURCE, j]
             if rate[row] <= limit:
-                v_rate[row] = v_gain * sum_of_lanes(slope) - v * above * time * fall
+                v_rate[row] = scratch[SLOPE, j] - v * above * time * fall
             else:
                 v_rate[row] = _f(0.0)
         v_ambient[block] = ambient_sum

@@ -48,7 +48,8 @@ def visible_temperature(
         gains: [M, 2, K] strengths of the sources sin ωt and cos ωt, one row of memory per Gaussian; None is no source.
         inverse_capacity: [N] multiplies the sources of a Gaussian; None is 1.
         ids: [n] int64 Gaussians, each at most once; None is all of them.
-        places: [N] int64, the row of ``gains`` of every Gaussian, -1 for one that has no source; None is M = N, a row each.
+        places: [N] int64, the row of ``gains`` of every Gaussian, in their order, -1 for one that has no source; None is
+            M = N, a row each.
 
     Raises:
         ValueError: the shape of the gains or of the places does not fit.
@@ -62,6 +63,8 @@ def visible_temperature(
             raise ValueError(f"places must be int64 of shape {[count]}, got {places.dtype} of {list(places.shape)}")
         if places is not None and rows == 0:
             gains = places = inverse_capacity = None
+        elif rows == count:  # in the order of the Gaussians: each has its own
+            places = None
     arguments = (time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
     if _fits_kernel(rate, omega):
         return _VisibleTemperature.apply(*arguments)
@@ -158,7 +161,7 @@ class _VisibleTemperature(torch.autograd.Function):
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
             rows = ids
-            if places.shape[0] > 0:
+            if places.shape[0] > 0 and ids.shape[0] < rate.shape[0]:
                 rows = places[ids]
                 rows = rows[rows >= 0]
             if rows.shape[0] < gains.shape[0]:  # clearing all of it would double the memory traffic
