@@ -203,7 +203,7 @@ def test_the_noise_is_that_of_the_camera():
 @pytest.mark.parametrize("param", ["rate", "faithful"])
 def test_sources_go_where_relaxation_tells_the_same(param):
     """Three bodies: one driven, one whose source is nothing, one whose source makes up for a wrong rate."""
-    model = NewtonHarmonic(param=param, drop_sources_at=[5], source_noise=0.002)
+    model = NewtonHarmonic(param=param, drop_sources_at=[5], source_noise=0.002, source_floor=2.0)
     model.prepare(scene())
     initial = torch.tensor([0.5, 0.5, 0.9])
     gains = torch.zeros(3, 2, len(model.omega))

@@ -83,7 +83,7 @@ class NewtonHarmonic(ThermalModel):
         lr_ambient: float = 1e-3,
         lr_end: float = 0.1,
         drop_sources_at: Sequence[int] = (),
-        source_floor: float = 2.0,
+        source_floor: float = 30.0,
         source_noise: float | None = None,
     ) -> None:
         super().__init__()

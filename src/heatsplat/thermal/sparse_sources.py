@@ -31,7 +31,10 @@ class SparseSources:
 
     Args:
         drop_at: training steps; late enough that temperatures are learned and the number of Gaussians has settled.
-        floor: in standard deviations of the camera's noise.
+        floor: in standard deviations of the camera's noise. One Gaussian of several in a pixel is known less well than the
+            pixel: after the closest relaxation, a median of 15 is left where a scene only cools and of 49 in a heated one.
+            A floor near 1 so drops nothing; 30 dropped 91 % and 25 % without loss, 60 dropped 66 % of the heated one's for
+            1.3 dB.
         noise: that standard deviation in image units; None estimates it from training images, where detail of the scene
             makes it larger than it is.
 
@@ -39,7 +42,7 @@ class SparseSources:
         ValueError: an option is out of its range.
     """
 
-    def __init__(self, drop_at: Sequence[int], floor: float = 2.0, noise: float | None = None) -> None:
+    def __init__(self, drop_at: Sequence[int], floor: float = 30.0, noise: float | None = None) -> None:
         if any(step < 0 for step in drop_at) or floor < 0 or (noise is not None and noise < 0):
             raise ValueError(
                 "drop_sources_at, source_floor and source_noise must not be negative, "
