@@ -212,7 +212,10 @@ def picture(points: Sequence[Point]) -> Figure:
             axes = figure.add_subplot(len(pairs), 2, 2 * row + column + 1)
             for i, (growth, curves) in enumerate(curves_of(own).items()):
                 _line(axes, curves[0], name, i, "free" if math.isinf(growth) else f"at most {growth:g} times the start")
+            lengths = sorted({point.steps for point in own})
             axes.set(xscale="log", xlabel="steps", ylabel=label, title=f"{method} on {scene}")
+            axes.set_xticks(lengths, [f"{length:,}" for length in lengths])
+            axes.minorticks_off()
             axes.grid(alpha=0.25, which="both")
             axes.legend(fontsize=7)
     return figure
