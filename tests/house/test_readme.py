@@ -60,8 +60,12 @@ def test_python_commands_run(command, trained, data, tmp_path):
     words = command.replace("RUN", f"{trained}").replace("/data/", f"{data}/").split()
     words = [sys.executable, str(ROOT / words[1]), *words[2:]]
     if "train.py" in command:
-        words += SHORT if "data=" not in command else SHORT[1:]
+        words += SHORT if "data=" not in command and "experiment=" not in command else SHORT[1:]
         words += [f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep"]
+        if "budget=" in command:  # which counts the steps itself
+            words = [word for word in words if not word.startswith(("max_steps=", "budget="))] + ["budget=15s"]
+        if "experiment=" in command:  # some of its methods
+            words += ["table.methods=[3dgs,etgs]"]
         if "ablation=" in command:  # one seed
             words += ["hydra.sweeper.params={seed:'0'}"]
     elif "render.py" in command:
@@ -71,9 +75,9 @@ def test_python_commands_run(command, trained, data, tmp_path):
     output = shell(words, tmp_path)
     if "train.py" in command or "evaluate.py" in command:
         assert "psnr" in output
-        assert len(list(tmp_path.rglob("metrics.json"))) == (
-            3 if " -m " in command else 5 if "ablation" in command else 1
-        )
+        jobs = {" -m ": 3, "ablation=": 5, "experiment=": 2}
+        expected = next((count for word, count in jobs.items() if word in command), 1)
+        assert len(list(tmp_path.rglob("metrics.json"))) == expected
     elif "study.py" in command:
         assert (tmp_path / "done" / "frontier.html").exists()
     else:
