@@ -157,7 +157,7 @@ class BudgetClock(pl.Callback):
             "budget: %.1f s of %g s (%+.1f %%), %d steps of %d planned; %s",
             whole, self.plan["asked_s"], found["off_percent"], trainer.global_step, self.plan["steps"], self.twice,
         )  # fmt: skip
-        if done < 0.99:
+        if done < 0.95:
             log.warning(
                 "budget: training stopped when %.0f %% of its schedule was done; the pace was misjudged", 100 * done
             )
