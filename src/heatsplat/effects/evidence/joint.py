@@ -209,9 +209,10 @@ class Joint:
         """The model that explains most with least.
 
         Effects are taken in one at a time, from several starts: from nothing, whichever explains most; those of the sensor
-        first; and from a driven scene before an uneven camera, or a cooling one before a still camera that drifts. A change of all points in common is cheap as an offset and
-        dear as courses of every point, but the courses explain more at once; and where a source and a pattern are at work,
-        neither explains much alone: only the ends of the ways tell which was right.
+        first; and from a driven scene before an uneven camera, or a cooling one before a still camera that drifts. A change
+        of all points in common is cheap as an offset and dear as courses of every point, but the courses explain more at
+        once; and where a source and a pattern are at work, neither explains much alone: only the ends of the ways tell
+        which was right.
         """
         start = (self.weights, self.trust)
         starts = [(Model(), SENSOR_FIRST), (Model(), ())]
