@@ -13,14 +13,14 @@ from datamodules.base import RawFrame, SceneDataModule
 from datamodules.formats.images import ImageIndex, read_image
 from datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from datamodules.points import obj_vertices, random_points
-from datamodules.surroundings import FEATURES_FILE, LABELS_FILE, WEATHER_FILE, Surroundings
+from datamodules.surroundings import OutdoorDataModule
 from datamodules.weather import utc_seconds
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 
 
-class NTR(SceneDataModule):
+class NTR(OutdoorDataModule):
     """root/scene with transforms_train.json, transforms_test.json, the images they name and mesh.obj.
 
     Camera-to-world matrices are in OpenCV axes already, although the files look like Blender's: turning them would
@@ -35,9 +35,7 @@ class NTR(SceneDataModule):
         random_points: number of points to make up where the scene has no mesh.
         metres_per_unit: scale of the world, or None when unknown.
         start_utc: date-time of the frames' second 0, or None; weather in UTC and the sun need it.
-        weather, weather_zone, weather_max_gap_h, latitude, longitude, altitude_m, up, north, labels, features: see
-            ``Surroundings``.
-        shared: options of every loader (``SceneDataModule``).
+        shared: weather, site, classes and features (``OutdoorDataModule``), and options of every loader.
     """
 
     def __init__(
@@ -51,16 +49,6 @@ class NTR(SceneDataModule):
         random_points: int = 20_000,
         metres_per_unit: float | None = None,
         start_utc: str | None = None,
-        weather: str | None = WEATHER_FILE,
-        weather_zone: str | None = None,
-        weather_max_gap_h: float = 3.0,
-        latitude: float | None = None,
-        longitude: float | None = None,
-        altitude_m: float | None = None,
-        up: Sequence[float] | None = None,
-        north: Sequence[float] | None = None,
-        labels: str | None = LABELS_FILE,
-        features: str | None = FEATURES_FILE,
         **shared: Any,
     ) -> None:
         super().__init__(split=split, alpha_mask=alpha_mask, **shared)
@@ -68,9 +56,7 @@ class NTR(SceneDataModule):
         self.ambient_c = ambient_c
         self.random_points = random_points
         self.metres_per_unit = metres_per_unit
-        self.start_s = 0.0 if start_utc is None else utc_seconds(start_utc, weather_zone, "data.start_utc")
-        site = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m, "up": up, "north": north}
-        self.surroundings = Surroundings(weather, weather_zone, weather_max_gap_h, site, labels, features)
+        self.start_s = 0.0 if start_utc is None else utc_seconds(start_utc, self.surroundings.zone, "data.start_utc")
 
     def load(self) -> SceneData:
         def is_scene(path: Any) -> bool:

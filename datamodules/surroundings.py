@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.base import RawFrame
+from datamodules.base import RawFrame, SceneDataModule
 from datamodules.weather import make_weather, read_weather, site_of
 from heatsplat.contracts import WEATHER_COLUMNS, Environment, SceneError, Weather
 
@@ -75,6 +75,35 @@ class Surroundings:
             max_gap_s=3600.0 * self.max_gap_h,
             source="the weather of the single frames",
         )
+
+
+class OutdoorDataModule(SceneDataModule):
+    """A loader whose scenes may have weather, a place on earth, and classes and features of their points.
+
+    Args:
+        weather, weather_zone, weather_max_gap_h, labels, features: see ``Surroundings``; zone, gap and files.
+        latitude, longitude, altitude_m, up, north: its site; None where it is not known, or where the scene says it.
+        shared: options of every loader (``SceneDataModule``).
+    """
+
+    def __init__(
+        self,
+        *,
+        weather: str | None = WEATHER_FILE,
+        weather_zone: str | None = None,
+        weather_max_gap_h: float = 3.0,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        altitude_m: float | None = None,
+        up: Sequence[float] | None = None,
+        north: Sequence[float] | None = None,
+        labels: str | None = LABELS_FILE,
+        features: str | None = FEATURES_FILE,
+        **shared: Any,
+    ) -> None:
+        super().__init__(**shared)
+        site = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m, "up": up, "north": north}
+        self.surroundings = Surroundings(weather, weather_zone, weather_max_gap_h, site, labels, features)
 
 
 def environment_of(values: Mapping[str, Any] | None, where: str) -> Environment | None:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.base import RawFrame, SceneDataModule
+from datamodules.base import RawFrame
 from datamodules.bounds import number_in, range_in, read_json
 from datamodules.colmap import image_index, match_model
 from datamodules.formats.colmap import find_model, read_model
 from datamodules.formats.images import ImageIndex, read_image
 from datamodules.ntr import FILES, listed_frames, mesh_points
-from datamodules.surroundings import FEATURES_FILE, LABELS_FILE, WEATHER_FILE, Surroundings, environment_of
+from datamodules.surroundings import OutdoorDataModule, environment_of
 from datamodules.timestamps import stem_of
 from datamodules.weather import utc_seconds
 from heatsplat.contracts import SceneData, SceneError
@@ -24,7 +24,7 @@ from heatsplat.contracts import SceneData, SceneError
 META_FILE = "meta.json"
 
 
-class Thermo(SceneDataModule):
+class Thermo(OutdoorDataModule):
     """root/scene with meta.json, poses (NTR's two JSON files, or images/ and sparse/0), and what else there is.
 
     meta.json holds min_value and max_value (°C of black and white) and may hold latitude, longitude, altitude_m, up,
@@ -38,9 +38,8 @@ class Thermo(SceneDataModule):
         ambient_c: temperature of the surroundings; None takes meta.json's, or the mean air temperature of the record.
         metres_per_unit: scale of the world; None takes meta.json's.
         random_points: number of points to make up where the scene has neither mesh nor sparse model.
-        weather, weather_zone, weather_max_gap_h, latitude, longitude, altitude_m, up, north, labels, features: see
-            ``Surroundings``; places of meta.json are used where these are None.
-        shared: options of every loader (``SceneDataModule``).
+        shared: weather, site, classes and features (``OutdoorDataModule``), and options of every loader. What meta.json
+            says of the site is used where these give none.
     """
 
     def __init__(
@@ -54,16 +53,6 @@ class Thermo(SceneDataModule):
         ambient_c: float | None = None,
         metres_per_unit: float | None = None,
         random_points: int = 20_000,
-        weather: str | None = WEATHER_FILE,
-        weather_zone: str | None = None,
-        weather_max_gap_h: float = 3.0,
-        latitude: float | None = None,
-        longitude: float | None = None,
-        altitude_m: float | None = None,
-        up: Sequence[float] | None = None,
-        north: Sequence[float] | None = None,
-        labels: str | None = LABELS_FILE,
-        features: str | None = FEATURES_FILE,
         **shared: Any,
     ) -> None:
         super().__init__(split=split, alpha_mask=alpha_mask, **shared)
@@ -76,9 +65,6 @@ class Thermo(SceneDataModule):
         self.ambient_c = ambient_c
         self.metres_per_unit = metres_per_unit
         self.random_points = random_points
-        self.zone = weather_zone
-        site = {"latitude": latitude, "longitude": longitude, "altitude_m": altitude_m, "up": up, "north": north}
-        self.surroundings = Surroundings(weather, weather_zone, weather_max_gap_h, site, labels, features)
 
     def load(self) -> SceneData:
         def is_scene(path: Path) -> bool:
@@ -163,18 +149,18 @@ class Thermo(SceneDataModule):
         where = f"{META_FILE}, frame {file}"
         time = None
         if known.get("utc") is not None:
-            time = utc_seconds(known["utc"], self.zone, where)
+            time = utc_seconds(known["utc"], self.surroundings.zone, where)
         elif known.get("time") is not None:
             start = meta.get("start_utc")
             time = float(known["time"]) + (
-                0.0 if start is None else utc_seconds(start, self.zone, f"{META_FILE}, start_utc")
+                0.0 if start is None else utc_seconds(start, self.surroundings.zone, f"{META_FILE}, start_utc")
             )
         result: dict[str, Any] = {"time_s": time, "environment": environment_of(known.get("env"), where)}
         return {**result, "subset": known["split"]} if "split" in known else result
 
     def _by_period(self, frames: Sequence[RawFrame]) -> list[RawFrame]:
         """The frames, those within ``test_period`` as test and all others as training frames."""
-        first, last = (utc_seconds(moment, self.zone, "data.test_period") for moment in self.test_period)
+        first, last = (utc_seconds(moment, self.surroundings.zone, "data.test_period") for moment in self.test_period)
         if any(frame.time_s is None for frame in frames):
             raise SceneError("data.test_period needs the time of every frame: utc in meta.json or in the JSON files")
         return [replace(f, subset="test" if first <= f.time_s <= last else "train") for f in frames]

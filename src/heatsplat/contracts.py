@@ -308,6 +308,12 @@ class SceneData:
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
     true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
 
+    @property
+    def bulk(self) -> tuple[Tensor, float]:
+        """Centre [3] and longest edge of the box that holds the points but for a hundredth at each end of every axis."""
+        low, high = torch.quantile(self.points.float(), torch.tensor([0.01, 0.99]), dim=0)
+        return (low + high) / 2, max((high - low).max().item(), 1e-12)
+
     @cached_property
     def extent(self) -> float:
         """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""

@@ -21,12 +21,17 @@ def config_of(data, *overrides):
         return compose(overrides=["+seed=7", f"+data={data}", *overrides]).data
 
 
+def loaders(loader):
+    """A loader and those that it is built on, down to the one that all are."""
+    return [owner for owner in loader.__mro__ if issubclass(owner, SceneDataModule)]
+
+
 @pytest.mark.parametrize("data", LOADERS)
 def test_every_option_of_a_loader_has_a_key_and_every_key_an_option(data):
     config = config_of(data)
     loader = get_class(config._target_)
     options = set()
-    for owner in (loader, SceneDataModule):
+    for owner in loaders(loader):
         options |= {k for k, p in inspect.signature(owner.__init__).parameters.items() if p.kind == p.KEYWORD_ONLY}
     assert set(config) - {"_target_"} == options
     assert config.seed == 7
@@ -37,7 +42,7 @@ def test_defaults_of_keys_and_options_agree(data):
     config = config_of(data)
     loader = get_class(config._target_)
     merged = {}
-    for owner in (SceneDataModule, loader):
+    for owner in reversed(loaders(loader)):
         parameters = inspect.signature(owner.__init__).parameters.values()
         merged |= {p.name: p.default for p in parameters if p.kind == p.KEYWORD_ONLY}
     merged.pop("seed")

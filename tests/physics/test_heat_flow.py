@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN, fourth_powers, heating_rate
+from heatsplat.physics.heat_flow import fourth_powers, heating_rate
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 
 STONE = {"emissivity": torch.tensor(0.9), "convection": torch.tensor(8.0), "capacity": torch.tensor(2.4e6)}
 

@@ -12,7 +12,7 @@ from heatsplat.contracts import KELVIN_AT_0_C, SceneError
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.physics.ellipsoids import convecting_area_ratio, projected_area_ratio, radiating_area_ratio
-from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.energy_network import LIMITS, TERMS, EnergyNetwork

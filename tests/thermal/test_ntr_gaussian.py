@@ -7,7 +7,7 @@ import torch
 from weathered import CAMERA, HOUR_S, make_scene
 
 from heatsplat.contracts import KELVIN_AT_0_C, SceneError
-from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.ntr_gaussian import EXCHANGE, STORAGE, NtrGaussian

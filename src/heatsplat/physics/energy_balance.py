@@ -37,7 +37,6 @@ from heatsplat.kernels.compilation import announced
 from heatsplat.physics.responses import ResponseTable, driver_means, grid_position, interpolate
 from heatsplat.physics.sunlight import SunlightTable
 
-STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 COMPILING = "compiling the kernel of heat balances: some seconds, once"
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 LEAST_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴)
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 
 
 def fourth_powers(warm_k: Tensor, cold_k: Tensor | float) -> Tensor:

@@ -7,6 +7,7 @@ from typing import TypeVar
 from torch import Tensor
 
 KELVIN_AT_0_C = 273.15
+STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 
 Temperature = TypeVar("Temperature", float, Tensor)
 

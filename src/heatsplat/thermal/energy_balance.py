@@ -13,9 +13,9 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, Weather
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.physics import sky
-from heatsplat.physics.energy_balance import STEFAN_BOLTZMANN, Climate, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.responses import driver_means
-from heatsplat.physics.units import celsius, kelvin
+from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped

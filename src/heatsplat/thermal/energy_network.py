@@ -269,9 +269,9 @@ class EnergyNetwork(ThermalModel):
         self.weather_scale.copy_(torch.where(there & (spread > 1e-9), 1.0 / spread.clamp(min=1e-9), 0.0))
         if missing := self._missing_columns:
             log.warning("the weather of scene '%s' has no %s: the network does without", scene.name, ", ".join(missing))
-        low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
-        self.center.copy_((low + high) / 2)
-        self.edge.copy_((high - low).max().clamp(min=1e-12))
+        center, edge = scene.bulk
+        self.center.copy_(center)
+        self.edge.fill_(edge)
         lower, width = scene.thermal_range.min_c + KELVIN_AT_0_C, scene.thermal_range.span_k
         bounds = [lower - self.margin * width, (1 + 2 * self.margin) * width]
         self.range_k.copy_(torch.tensor([lower, width], dtype=torch.float64))

@@ -11,6 +11,7 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.layers import draw_uniform
 
 TIMES = ("auto", "seconds", "index", "none")
 EXPONENTS = ("positive", "printed")
@@ -120,9 +121,9 @@ class ImagingField(ThermalModel):
         self.check(scene)
         self.emission.prepare(scene)
         if self.positions == "box":
-            low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
-            self.center.copy_((low + high) / 2)
-            self.edge.copy_((high - low).max().clamp(min=1e-12))
+            center, edge = scene.bulk
+            self.center.copy_(center)
+            self.edge.fill_(edge)
         if self.time == "auto":
             self.by_index.fill_("time" not in scene.metadata)
         if self.by_index:
@@ -134,10 +135,7 @@ class ImagingField(ThermalModel):
             self.clock.copy_(torch.stack([times.min(), span if span > 0 else torch.ones_like(span)]))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
-        for layer in (*self.layers, *self.moment_layers.values()):
-            bound = 1 / math.sqrt(layer.in_features)  # torch's default for linear layers, from the run's own generator
-            for parameter in layer.parameters():
-                nn.init.uniform_(parameter, -bound, bound, generator=seeds.generator)
+        draw_uniform((*self.layers, *self.moment_layers.values()), seeds.generator)
         return self.emission.per_gaussian(seeds)
 
     def features(self, splats: Splats, query: Query) -> Emission:

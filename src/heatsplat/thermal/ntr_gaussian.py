@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from heatsplat.contracts import SceneData
-from heatsplat.physics.heat_flow import STEFAN_BOLTZMANN
-from heatsplat.physics.units import kelvin
+from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
 from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
+from heatsplat.thermal.layers import draw_uniform
 
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
 STORAGE = 1.0e5  # J/m²/K, unit of the heat capacity: 5 cm of ground
@@ -113,9 +111,9 @@ class NtrGaussian(ThermalModel):
         bounds = scene.thermal_range
         self.bounds_k.copy_(torch.tensor([kelvin(bounds.min_c), bounds.span_k], dtype=torch.float64))
         self.ambient.fill_(0.5 if scene.ambient_c is None else bounds.to_unit(scene.ambient_c))
-        low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
-        self.center.copy_((low + high) / 2)
-        self.edge.copy_((high - low).max().clamp(min=1e-12))
+        center, edge = scene.bulk
+        self.center.copy_(center)
+        self.edge.fill_(edge)
         times = torch.tensor(scene.train.times_s, dtype=torch.float64)
         self.clock.copy_(torch.stack([times.min(), (times.max() - times.min()).clamp(min=1e-3)]))
         # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
@@ -123,10 +121,7 @@ class NtrGaussian(ThermalModel):
         self._storage = max(STORAGE, sent / (FIRST_COOLING * bounds.span_k))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
-        for layer in [module for module in self.modules() if isinstance(module, nn.Linear)]:
-            bound = 1 / math.sqrt(layer.in_features)  # torch's default for linear layers, from the run's own generator
-            for parameter in layer.parameters():
-                nn.init.uniform_(parameter, -bound, bound, generator=seeds.generator)
+        draw_uniform((module for module in self.modules() if isinstance(module, nn.Linear)), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
         tensors = {"feature": PerGaussian(feature, self.lr_feature)}
         if self.first_steps > 0:

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
+from heatsplat.thermal.layers import draw_uniform
+
 
 class ResidualNetwork(nn.Module):
     """Hidden values of ``blocks`` residual blocks (two layers each), and heads on them.
@@ -38,13 +40,12 @@ class ResidualNetwork(nn.Module):
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
         """Gives all layers but the heads random weights; the second layer of a block starts small (Zhang et al. 2019)."""
-        count = own = self.own.in_features + self.shared.in_features
+        inputs = self.own.in_features + self.shared.in_features  # of the one layer that both are parts of
         for layer in (self.own, self.shared):
-            _uniform(layer, 1 / math.sqrt(own), generator)
+            draw_uniform((layer,), generator, math.sqrt(layer.in_features / inputs))
         for first, second in self.blocks:
-            count = first.in_features
-            _uniform(first, 1 / math.sqrt(count), generator)
-            _uniform(second, 1 / math.sqrt(count * len(self.blocks)), generator)
+            draw_uniform((first,), generator)
+            draw_uniform((second,), generator, 1 / math.sqrt(len(self.blocks)))
 
     def forward(self, base: Tensor, moment: Tensor) -> Tensor:
         """Hidden values [n, width].
@@ -63,8 +64,3 @@ class ResidualNetwork(nn.Module):
         """Multiply-adds per Gaussian up to the hidden values, the shared inputs left out."""
         inner = sum(layer.weight.numel() for block in self.blocks for layer in block)
         return self.own.weight.numel() + inner
-
-
-def _uniform(layer: nn.Linear, bound: float, generator: torch.Generator) -> None:
-    for parameter in layer.parameters():
-        nn.init.uniform_(parameter, -bound, bound, generator=generator)
