@@ -14,7 +14,10 @@ FILES = [
     Path(__file__).resolve().parents[2] / "conf" / "callbacks" / name for name in ("evaluate.yaml", "default.yaml")
 ]
 ENTRIES = {
-    name: entry for file in FILES for name, entry in yaml.safe_load(file.read_text()).items() if name != "defaults"
+    name: entry
+    for file in FILES
+    for name, entry in yaml.safe_load(file.read_text()).items()
+    if name != "defaults" and entry is not None
 }
 
 

@@ -258,6 +258,16 @@ def test_a_companion_has_an_opacity_of_its_own():
     assert "thermal_opacity" not in made().effects() and made().opacity_channels == (1,)
 
 
+def test_a_state_and_a_companion_of_one_kind_keep_their_tensors_apart():
+    model = Composed(Static(), companion=Static(channels=3, modality="rgb"))
+    model.prepare(scene())
+    splats = splats_of(model, seeds(channels=4))
+    features = model.features(splats, query()).features
+    assert features.shape == (40, 4)
+    assert splats["sh0"].shape == (40, 1, 1) and splats["companion_sh0"].shape == (40, 1, 3)
+    torch.testing.assert_close(features[:, :1], model.state.features(splats, query()).features)
+
+
 def test_parameters_learn_at_the_rates_of_their_owners():
     model = Composed(
         Conducting(NewtonHarmonic(ambient="learned", lr_ambient=0.7)), {"attenuation": Attenuation(lr=0.3)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,21 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.part import HeatPart
+
+COMPANION = "companion_"  # before the names of its tensors: a static state and a static companion have the same ones
+
+
+class _OfCompanion:
+    """Splats whose tensors are those of the companion, under the names that it gave them."""
+
+    def __init__(self, splats: Splats) -> None:
+        self._splats = splats
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._splats[COMPANION + name]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._splats, name)
 
 
 class Composed(ThermalModel):
@@ -64,7 +80,8 @@ class Composed(ThermalModel):
         for part in self.parts.values():
             tensors |= part.per_gaussian(own)
         if self.companion is not None:
-            tensors |= self.companion.per_gaussian(Seeds(seeds.means, seeds.values[:, 1:], seeds.generator))
+            others = self.companion.per_gaussian(Seeds(seeds.means, seeds.values[:, 1:], seeds.generator))
+            tensors |= {COMPANION + name: tensor for name, tensor in others.items()}
         return tensors
 
     def features(self, splats: Splats, query: Query) -> Emission:
@@ -76,7 +93,8 @@ class Composed(ThermalModel):
             emission = Emission(clipped(values, self.clip))
         if self.companion is None:
             return emission
-        return Emission(torch.cat((emission.features, self.companion.features(splats, query).features), dim=1))
+        others = self.companion.features(_OfCompanion(splats), query).features
+        return Emission(torch.cat((emission.features, others), dim=1))
 
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
         return self.state.geometry(splats, query)
