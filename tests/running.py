@@ -31,9 +31,9 @@ def run(output_dir: Path, *overrides: str):
     from heatsplat.training.session import fit, prepare_machine
 
     config = compose_run(output_dir, *overrides)
-    plain = OmegaConf.to_container(config, resolve=True)
-    prepare_machine(plain["threads"])
-    data = cli.build(plain["data"])
+    prepare_machine(config.threads)
+    data = cli.build(cli.resolved(config)["data"])
+    plain = cli.resolved(config) if config.budget is None else cli.budgeted(config, data, output_dir)
     plain = cli.with_effects(plain, data)
     trainer = cli.build(
         plain["trainer"], callbacks=cli.build_callbacks(plain["callbacks"]), logger=cli.build(plain["logger"])

@@ -232,19 +232,27 @@ def device_of(plain: dict[str, Any]) -> str:
 
 def stored_recipe(ckpt: str | None, output_dir: Path) -> dict[str, Any]:
     """The recipe in a checkpoint, or in the newest one of the run's folder that can be read; empty without."""
-    from heatsplat.contracts import SceneError
     from heatsplat.training.module import CHECKPOINT_KEY
     from heatsplat.training.session import load_checkpoint
 
     if ckpt is not None:
         return load_checkpoint(ckpt).get(CHECKPOINT_KEY, {}).get("recipe", {})
-    found = sorted((output_dir / "checkpoints").glob("*.ckpt"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in found:
-        try:
-            return load_checkpoint(path).get(CHECKPOINT_KEY, {}).get("recipe", {})
-        except SceneError:  # a disk that was full; begun() says so
-            continue
+    for _, checkpoint in left_behind(output_dir):
+        return checkpoint.get(CHECKPOINT_KEY, {}).get("recipe", {})
     return {}
+
+
+def left_behind(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Checkpoints in a run's folder with their paths, newest first; those that cannot be read are passed over, with a word."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.training.session import load_checkpoint
+
+    paths = (output_dir / "checkpoints").glob("*.ckpt")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
+        try:
+            yield path, load_checkpoint(path)
+        except SceneError as error:  # a disk that was full
+            log.warning("%s", error)
 
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
@@ -256,20 +264,11 @@ def begun(plain: dict[str, Any], data: Any, output_dir: Path) -> dict[str, Any] 
 
     A checkpoint of the last step is passed over: from it there is no step left in which the cost could be measured.
     """
-    from heatsplat.contracts import SceneError
     from heatsplat.training.module import CHECKPOINT_KEY
-    from heatsplat.training.session import load_checkpoint
 
     if plain["ckpt"] is not None:
         return None
-    for path in sorted(
-        (output_dir / "checkpoints").glob("*.ckpt"), key=lambda path: path.stat().st_mtime, reverse=True
-    ):
-        try:
-            checkpoint = load_checkpoint(path)
-        except SceneError as error:  # a disk that was full
-            log.warning("%s", error)
-            continue
+    for path, checkpoint in left_behind(output_dir):
         if checkpoint["global_step"] >= plain["max_steps"]:
             continue
         stored = checkpoint[CHECKPOINT_KEY]["recipe"]

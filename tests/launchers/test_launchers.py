@@ -97,6 +97,7 @@ def test_a_job_whose_time_is_over_goes_back_into_the_queue_and_on_from_its_check
     """SIGUSR2 is what SLURM sends before the time limit; checkpoints come every two steps, and one more now."""
     folder = tmp_path / "sweep"
     done = sweep(folder, "submitit_local", "SIGUSR2")
+    assert len(list(folder.glob("3dgs_static_*"))) == 3  # requeued into its own folder
     check(done, folder, alone, threads=1, goes_on_from=5)
 
 
@@ -105,4 +106,5 @@ def test_a_job_whose_time_is_over_goes_back_into_the_queue_and_on_from_its_check
 def test_ray_starts_a_killed_job_again(tmp_path, alone):
     folder = tmp_path / "sweep"
     done = sweep(folder, "ray", "SIGKILL", "hydra.launcher.address=local")
+    assert len(list(folder.glob("3dgs_static_*"))) == 3  # started again in its own folder
     check(done, folder, alone, threads=1, goes_on_from=2)

@@ -319,20 +319,9 @@ def test_a_denser_scene_has_new_points_between_neighbours():
 
 
 def budget_run(folder: Path, *overrides: str):
-    """(module, plain) of a whole run as the command line makes it, in this process."""
-    from heatsplat.training.session import fit, prepare_machine
-
-    config = running.compose_run(folder, "method=etgs", *running.TINY, "callbacks.metrics.lpips_net=null", *overrides)
-    prepare_machine(config.threads)
-    data = cli.build(cli.resolved(config)["data"])
-    plain = cli.budgeted(config, data, folder)
-    trainer = cli.build(
-        plain["trainer"], callbacks=cli.build_callbacks(plain["callbacks"]), logger=cli.build(plain["logger"])
-    )
-    module = cli.build(plain["module"], output_dir=str(folder))
-    module.recipe = plain
-    fit(module, data, trainer, ckpt=plain["ckpt"], test=plain["test"])
-    return module, plain
+    """(module, recipe) of a whole run."""
+    module, _ = running.run(folder, "method=etgs", *running.TINY, "callbacks.metrics.lpips_net=null", *overrides)
+    return module, module.recipe
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -24,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.io.results import write_atomically
+from heatsplat.studies.stepping import Stepper
 from heatsplat.training.rng import generator_for
 
 CURVES_FILE = Path(__file__).with_name("budget_curves.csv")
@@ -201,7 +201,10 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
         budget_s: seconds that the whole run may take.
         device: where it trains.
     """
-    steppers = [_Stepper(make(), _denser(scene, factor), max_steps, device) for factor in (1, DENSER)]
+    steppers = [
+        Stepper(make(), _denser(scene, factor), step=max_steps // 2, max_steps=max_steps, device=device)
+        for factor in (1, DENSER)
+    ]
     times: list[list[float]] = [[] for _ in steppers]
     views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_ROUNDS[1]))]
     for turn in range(WARM_UP):
@@ -212,40 +215,15 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
         for stepper, own in zip(steppers, times, strict=True):
             own.append(stepper.step(views[turn % len(views)]))
         spent = time.perf_counter() - start
-        if (
-            turn + 1 >= CALIBRATION_ROUNDS[0] and spent * (turn + 2) / (turn + 1) > limit
-        ):  # the next round would pass the limit
+        next_spent = spent * (turn + 2) / (turn + 1)
+        if turn + 1 >= CALIBRATION_ROUNDS[0] and next_spent > limit:
             break
     few, many = (statistics.median(own) for own in times)
-    count, more = (stepper.count for stepper in steppers)
+    count, more = (len(stepper.module.splats) for stepper in steppers)
     if more == count:  # init=random: the number does not follow the points
         return Pace(few, 0.0, count, spent)
     slope = max(0.0, (many - few) / (more - count))
     return Pace(max(few - slope * count, 0.0), slope, count, spent)
-
-
-class _Stepper:
-    """Training steps of a module without a trainer, in the middle of a run."""
-
-    def __init__(self, module: Any, scene: SceneData, max_steps: int, device: str) -> None:
-        self.module = module
-        module.attach(scene)
-        module.loss.prepare(scene, module.modality)
-        module.trainer = SimpleNamespace(max_steps=max_steps, global_step=max_steps // 2, world_size=1)
-        module.to(device).on_fit_start()
-        self.optimizer = module.configure_optimizers()["optimizer"]
-        self.count = len(module.splats)
-
-    def step(self, view: Any) -> float:
-        """Seconds of one training step."""
-        start = time.perf_counter()
-        self.optimizer.zero_grad()
-        self.module.training_step(view, 0)["loss"].backward()
-        self.module.on_after_backward()
-        self.optimizer.step()
-        if self.module.device.type == "cuda":
-            torch.cuda.synchronize()
-        return time.perf_counter() - start
 
 
 def _denser(scene: SceneData, factor: int) -> SceneData:

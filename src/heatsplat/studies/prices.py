@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 
 from heatsplat.contracts import SceneData
+from heatsplat.studies.stepping import Stepper
 
 WARM_UP = 2  # steps of each model that are not timed: kernels compile and memory is found
 ROUNDS = (3, 15)  # fewest and most
@@ -54,7 +54,11 @@ def prices(
     """
     if not without:
         return {}
-    models = {name: _Stepper(make(), scene, max_steps, device) for name, make in {"": whole, **without}.items()}
+    models = {
+        name: Stepper(make(), scene, step=max_steps - 1, max_steps=max_steps, device=device)
+        for name, make in {"": whole, **without}.items()
+    }
+    sizes = {name: _size(model.module) for name, model in models.items()}
     views = [scene.train[i] for i in range(min(len(scene.train), ROUNDS[1]))]
     best = dict.fromkeys(models, float("inf"))
     start = time.perf_counter()
@@ -65,38 +69,17 @@ def prices(
             seconds = model.step(views[turn % len(views)])
             if turn >= 0:
                 best[name] = min(best[name], seconds)
-    full = models[""]
     return {
         name: Price(
-            full.per_gaussian - models[name].per_gaussian,
-            full.shared - models[name].shared,
+            sizes[""][0] - sizes[name][0],
+            sizes[""][1] - sizes[name][1],
             1e3 * (best[""] - best[name]),
         )
         for name in without
     }
 
 
-class _Stepper:
-    """Training steps of a module without a trainer."""
-
-    def __init__(self, module: Any, scene: SceneData, max_steps: int, device: torch.device | str) -> None:
-        self.module = module
-        module.attach(scene)
-        self.per_gaussian = sum(tensor[0].numel() for tensor in module.splats.parameters())
-        self.shared = sum(tensor.numel() for tensor in module.parameters()) - self.per_gaussian * len(module.splats)
-        module.loss.prepare(scene, module.modality)
-        self.trainer = SimpleNamespace(max_steps=max_steps, global_step=max_steps - 1, world_size=1)
-        module.trainer = self.trainer
-        module.to(device).on_fit_start()
-        self.optimizer = module.configure_optimizers()["optimizer"]
-
-    def step(self, view: Any) -> float:
-        """Seconds of one training step."""
-        start = time.perf_counter()
-        self.optimizer.zero_grad()
-        self.module.training_step(view, 0)["loss"].backward()
-        self.module.on_after_backward()
-        self.optimizer.step()
-        if self.module.device.type == "cuda":
-            torch.cuda.synchronize()
-        return time.perf_counter() - start
+def _size(module: Any) -> tuple[int, int]:
+    """Numbers that a module learns for each Gaussian, and all others."""
+    per_gaussian = sum(tensor[0].numel() for tensor in module.splats.parameters())
+    return per_gaussian, sum(tensor.numel() for tensor in module.parameters()) - per_gaussian * len(module.splats)

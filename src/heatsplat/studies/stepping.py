@@ -1,0 +1,42 @@
+"""Training steps of a module without a trainer, to time them."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from heatsplat.contracts import SceneData
+
+
+class Stepper:
+    """A module in the middle of a run, ready to step.
+
+    Args:
+        module: a training module as the configuration builds it.
+        scene: on which it trains.
+        step: the step at which it believes to be, of ``max_steps``.
+        max_steps: of the run.
+        device: "cpu" or "cuda".
+    """
+
+    def __init__(self, module: Any, scene: SceneData, *, step: int, max_steps: int, device: torch.device | str) -> None:
+        self.module = module
+        module.attach(scene)
+        module.loss.prepare(scene, module.modality)
+        module.trainer = SimpleNamespace(max_steps=max_steps, global_step=step, world_size=1)
+        module.to(device).on_fit_start()
+        self.optimizer = module.configure_optimizers()["optimizer"]
+
+    def step(self, view: Any) -> float:
+        """Seconds of one training step on a view."""
+        start = time.perf_counter()
+        self.optimizer.zero_grad()
+        self.module.training_step(view, 0)["loss"].backward()
+        self.module.on_after_backward()
+        self.optimizer.step()
+        if self.module.device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter() - start
