@@ -17,9 +17,9 @@ class Splats(nn.Module):
     remove rows in one place. Geometry: ``means`` [N, 3] in world units, ``log_scales`` [N, 3], ``quats`` [N, 4] wxyz
     (need not have unit length), ``opacity_logits`` [N, M], one column per modality. A thermal model adds its own names.
 
-    A tensor that few Gaussians need may become sparse: ``release`` gives up rows for good. It then has a row for each
-    Gaussian that kept one, in the order of the Gaussians, and ``places`` says which. A row that was given up counts as
-    zeros, and a new Gaussian whose row is zeros gets none. Until something is released, there is no such thing.
+    A tensor that few Gaussians need may become sparse (``density.ops.Cloud.drop``). It then has a row for each Gaussian
+    that kept one, in the order of the Gaussians, and ``places`` says which. A row that was dropped counts as zeros, and a
+    new Gaussian whose row is zeros gets none. Until something is dropped, there is no such thing.
 
     Args:
         tensors: name -> [N, ...] float tensor; must hold the four geometry names.
@@ -38,7 +38,6 @@ class Splats(nn.Module):
             raise ValueError(f"splats need one row per Gaussian in every tensor, got {counts}")
         self.raw = nn.ParameterDict({name: nn.Parameter(tensor.detach().clone()) for name, tensor in tensors.items()})
         self._places = nn.Module()  # a buffer [N] for each sparse tensor
-        self.released: dict[str, tuple[Tensor, dict[str, Tensor]]] = {}  # what the owner of the optimiser is to remove
 
     def __len__(self) -> int:
         return self.raw["means"].shape[0]
@@ -93,22 +92,9 @@ class Splats(nn.Module):
         result[found >= 0] = rows[found[found >= 0]]
         return result
 
-    def release(self, name: str, gone: Tensor, instead: Mapping[str, Tensor]) -> None:
-        """Gives up the rows of a tensor that belong to some Gaussians, for other values of their other tensors.
-
-        They leave with their moments after the step that is under way, when density control gets the Gaussians (a
-        ``density.ops.Cloud``): the optimiser must first finish with the tensors that have gradients.
-
-        Args:
-            name: of the tensor.
-            gone: [N] bool; Gaussians that have no row are passed over.
-            instead: name -> values [N, ...], which Gaussians that lose their row take.
-        """
-        self.released[name] = gone, dict(instead)
-
     def resize(self, count: int) -> None:
         """Gives every tensor ``count`` rows of zeros; for loading a checkpoint of another size, whose values follow."""
-        self._places, self.released = nn.Module(), {}
+        self._places = nn.Module()
         for name in self.names:
             self._resize(name, count)
 

@@ -51,6 +51,15 @@ def test_the_page_counts_what_was_judged(outcomes):
     assert sum(counts) == len(outcomes) and counts[0] + counts[1] == 2
 
 
+def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
+    last = outcomes[-1].seed
+    fresh = [outcome for outcome in outcomes if outcome.seed == last]
+    text = written(outcomes, frozenset({last}))
+    cases = [int(line.split()[2]) for line in text.splitlines() if "verdicts are right" in line]
+    assert cases == [len(CATALOGUE) * (len(outcomes) - len(fresh)), len(CATALOGUE) * len(fresh)]
+    assert "## Verdicts against truth, tiny, on recordings that no threshold was set on" in text
+
+
 def test_scenes_without_a_known_truth_are_refused(tmp_path):
     class Unknown:
         def __init__(self, **_):
@@ -58,7 +67,7 @@ def test_scenes_without_a_known_truth_are_refused(tmp_path):
             self.scene.notes.pop("effects")
 
     with pytest.raises(SceneError, match="does not say in its notes which effects it shows"):
-        run(tmp_path, partial(Unknown), ["static"], seeds=1)
+        run(tmp_path, partial(Unknown), ["static"], seeds=[0])
 
 
 def test_every_preset_says_what_it_shows_and_many_are_told_apart():

@@ -116,8 +116,9 @@ def cloud(count=8):
     optimizer.step()
     gone = torch.ones(count, dtype=torch.bool)
     gone[[1, 4, 6]] = False
-    splats.release("gains", gone, {"start": torch.full((count,), 5.0)})
-    return Cloud(splats, optimizer)
+    made = Cloud(splats, optimizer)
+    made.drop("gains", gone, {"start": torch.full((count,), 5.0)})
+    return made
 
 
 def check(made, owners):
@@ -130,12 +131,11 @@ def check(made, owners):
     return made.optimizer.state[gains]["exp_avg"]
 
 
-def test_released_rows_leave_with_their_moments():
+def test_dropped_rows_leave_with_their_moments():
     made = cloud()
     moments = check(made, [None, 2, None, None, 5, None, 7, None])
     torch.testing.assert_close(moments, 0.2 * made.splats["gains"].detach())
     assert made.splats["start"].tolist() == [5, 0, 5, 5, 0, 5, 0, 5]
-    assert not made.splats.released
     made.drop("gains", torch.arange(8) < 4, {"start": torch.full((8,), 9.0)})
     check(made, [None, None, None, None, 5, None, 7, None])
     assert made.splats["start"].tolist() == [5, 9, 5, 5, 0, 5, 0, 5]
@@ -230,11 +230,11 @@ def test_sources_go_where_relaxation_tells_the_same(param):
         before = torch.stack([model._state(splats, time, None) for time in times])
         heat = (before[:, 2] - alone).square().mean().sqrt()
         assert heat > 20 * 0.002  # its heat alone is far above the noise
+    cloud = Cloud(splats)
     for step in (4, 5, 6):
-        model.on_step(step)
-        assert model.regularisers(splats) == {}
-        assert bool(splats.released) == (step >= 5)
-    Cloud(splats)
+        for needless in model.needless_rows(splats, step):
+            cloud.drop(*needless)
+        assert (splats.places("source_gains") is not None) == (step >= 5)
     assert splats.places("source_gains").tolist() == [0, -1, -1]
     assert splats["source_gains"].shape[0] == 1
     with torch.no_grad():

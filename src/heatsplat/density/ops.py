@@ -15,8 +15,6 @@ from heatsplat.splats import Splats
 class Cloud:
     """Gaussians with everything that has a row per Gaussian: parameters, Adam moments, density statistics.
 
-    Rows of tensors that a model released (``Splats.release``) are removed here, as soon as a Cloud is made.
-
     Args:
         splats: the parameters.
         optimizer: the optimiser, whose groups carry "name"; groups named like a tensor of ``splats`` hold just that
@@ -27,11 +25,6 @@ class Cloud:
     splats: Splats
     optimizer: torch.optim.Optimizer | None = None
     state: dict[str, Tensor] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for name, (gone, instead) in self.splats.released.items():
-            self.drop(name, gone, instead)
-        self.splats.released.clear()
 
     def __len__(self) -> int:
         return len(self.splats)

@@ -127,9 +127,14 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
     return found
 
 
+def falls_with(name: str) -> frozenset[str]:
+    """The effect and those that stand on it."""
+    return frozenset({name, *(other for other, ground in STANDS_ON.items() if ground == name)})
+
+
 def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
     """The verdicts with one effect off, and with it those that stand on it."""
-    gone = {name, *(other for other, ground in STANDS_ON.items() if ground == name)}
+    gone = falls_with(name)
     return {other: replace(verdict, on=verdict.on and other not in gone) for other, verdict in verdicts.items()}
 
 

@@ -6,12 +6,13 @@ import logging
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from heatsplat.effects import assembly
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
 
@@ -73,6 +74,8 @@ def run(
 ) -> None:
     """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
 
+    Without any effect there is one recipe, whoever chose it: it is trained once.
+
     Args:
         output_dir: of the study; runs that have results there are not run again.
         train: path of train.py.
@@ -83,8 +86,12 @@ def run(
         overrides: of every run.
     """
     folder = Path(output_dir)
+    plain: dict[tuple[str, int], RunResults] = {}  # without any effect, by preset and seed
 
-    def trained(job: Job) -> RunResults:
+    def trained(job: Job, bare: bool) -> RunResults:
+        """The results of a run; ``bare`` where it is known before that no effect will be on."""
+        if bare and (job.preset, job.seed) in plain:
+            return plain[job.preset, job.seed]
         place = folder / "runs" / job.folder / str(job.seed)
         if not (place / METRICS_FILE).exists():
             log.info("training %s, seed %d", job.folder, job.seed)
@@ -92,28 +99,34 @@ def run(
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode:
                 raise RuntimeError(f"{' '.join(command)} failed:\n{(done.stderr or done.stdout)[-2000:]}")
-        return RunResults.read(place / METRICS_FILE)
+        results = RunResults.read(place / METRICS_FILE)
+        if not _on(results):
+            plain[job.preset, job.seed] = results
+        return results
 
     rows = []
-    for preset in presets:
-        for job in _jobs(preset, selections):
-            rows.append(_mean(job, [trained(_at(job, seed)) for seed in seeds]))
-            if job.selection == "auto" and leave_one_out:
+    for preset, truth in presets.items():
+        for selection in selections:
+            job, bare = Job(preset, selection, 0), selection == "none" or (selection == "oracle" and not truth)
+            whole = [trained(replace(job, seed=seed), bare) for seed in seeds]
+            rows.append(_mean(job, whole))
+            if selection == "auto" and leave_one_out:
                 for name in rows[-1].effects:
-                    left = Job(preset, "auto", 0, name)
-                    rows.append(_mean(left, [trained(_at(left, seed)) for seed in seeds]))
+                    left = replace(job, left_out=name)
+                    less = [
+                        trained(replace(left, seed=seed), _on(results) <= assembly.falls_with(name))
+                        for seed, results in zip(seeds, whole, strict=True)
+                    ]
+                    rows.append(_mean(left, less))
         write_atomically(folder / TABLE_FILE, tables(rows))  # what is known so far
     figure = picture(rows)
     if figure is not None:
         write_png(folder / PICTURE_FILE, figure_picture(figure))
 
 
-def _jobs(preset: str, selections: Sequence[str]) -> Iterator[Job]:
-    yield from (Job(preset, selection, 0) for selection in selections)
-
-
-def _at(job: Job, seed: int) -> Job:
-    return Job(job.preset, job.selection, seed, job.left_out)
+def _on(results: RunResults) -> frozenset[str]:
+    """Names of the effects that were on in a run."""
+    return frozenset(name for name, effect in results.effects.items() if effect["on"])
 
 
 def _mean(job: Job, results: Sequence[RunResults]) -> Row:

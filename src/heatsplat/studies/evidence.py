@@ -62,7 +62,8 @@ def run(
     data: Callable[..., Any],
     scenes: Sequence[str],
     sizes: Sequence[str] = ("tiny",),
-    seeds: int = 5,
+    seeds: Sequence[int] = (0, 1, 2, 3, 4),
+    unseen: Sequence[int] = (),
     document: str | None = None,
 ) -> str:
     """The page, also written to effects.md in ``output_dir`` and to ``document``.
@@ -71,15 +72,16 @@ def run(
         output_dir: folder of the results.
         data: makes the data module of a scene from ``scene``, ``size`` and ``scene_seed``; its notes name the "effects".
         scenes, sizes: every pair of them is judged.
-        seeds: how many recordings of each.
+        seeds: of the recordings of each.
+        unseen: of further ones, which no threshold was set on; they are counted apart.
         document: file that is written besides; None for none.
     """
     torch.set_num_threads(1)  # small tensors
     outcomes = []
     for size in sizes:
         for scene in scenes:
-            outcomes += [judged(data, scene, size, seed) for seed in range(seeds)]
-    text = written(outcomes)
+            outcomes += [judged(data, scene, size, seed) for seed in (*seeds, *unseen)]
+    text = written(outcomes, frozenset(unseen))
     Path(output_dir).mkdir(parents=True, exist_ok=True)
     for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
         path.write_text(text, encoding="utf-8")
@@ -107,8 +109,8 @@ def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcom
     return outcome
 
 
-def written(outcomes: Sequence[Outcome]) -> str:
-    """The page."""
+def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -> str:
+    """The page; recordings of the seeds in ``unseen`` have tables of their own."""
     lines = [HEAD, "## The catalogue\n", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     for effect in CATALOGUE:
         needs = ", ".join(sorted(effect.needs)) or "images"
@@ -117,18 +119,20 @@ def written(outcomes: Sequence[Outcome]) -> str:
             f"{effect.threshold:g} | {effect.adds} |"
         )
     for size in dict.fromkeys(outcome.size for outcome in outcomes):
-        lines += _confusion(size, [outcome for outcome in outcomes if outcome.size == size])
+        for which, wanted in ((size, False), (f"{size}, on recordings that no threshold was set on", True)):
+            these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
+            lines += _confusion(which, these) if these else []
     return "\n".join(lines) + "\n"
 
 
-def _confusion(size: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """How verdicts and truth agree at a size: one table by effect, one by scene."""
+def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """How verdicts and truth agree: one table by effect, one by scene."""
     cases = len(outcomes) * len(CATALOGUE)
     right = cases - sum(outcome.wrong for outcome in outcomes)
     clean = sum(outcome.wrong == 0 for outcome in outcomes)
     seconds = sorted(outcome.seconds for outcome in outcomes)[len(outcomes) // 2]
     lines = [
-        f"\n## Verdicts against truth, {size}\n",
+        f"\n## Verdicts against truth, {which}\n",
         f"{right} of {cases} verdicts are right ({100 * right / cases:.1f} %); {clean} of {len(outcomes)} scenes have not a "
         f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
         "| effect | present: found | present: missed | absent: left out | absent: taken in |",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -165,6 +166,14 @@ class ThermalModel(nn.Module, ABC):
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """Extra loss terms by name, each a weighted scalar with a gradient. Penalties x² belong in PerGaussian.l2."""
         return {}
+
+    def needless_rows(self, splats: Splats, step: int) -> Iterable[tuple[str, Tensor, Mapping[str, Tensor]]]:
+        """Rows of tensors that some Gaussians can do without from now on, asked for after every step of the optimiser.
+
+        Each is the name of a tensor, the Gaussians that lose their row of it, [N] bool, and the values [N, ...] that their
+        other tensors take instead, by name (see ``density.ops.Cloud.drop``).
+        """
+        return ()
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """Temperature of every Gaussian in kelvin at a time, [N]; None where the model has no temperature."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -108,6 +108,9 @@ class Composed(ThermalModel):
         for part in self.parts.values():
             terms |= part.regularisers()
         return terms
+
+    def needless_rows(self, splats: Splats, step: int) -> Iterable[tuple[str, Tensor, Mapping[str, Tensor]]]:
+        return self.state.needless_rows(splats, step)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """That of the state: what a camera would see at the surface itself."""

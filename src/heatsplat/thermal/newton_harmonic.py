@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
@@ -103,7 +103,6 @@ class NewtonHarmonic(ThermalModel):
         self.lr_initial, self.lr_gain, self.lr_rate = lr_initial, lr_gain, lr_rate
         self.lr, self.lr_end = lr_ambient, lr_end
         self.sources = SparseSources(drop_sources_at, source_floor, source_noise) if drop_sources_at else None
-        self._due = False  # whether sources are to be dropped in this step
         self._ambient_from = ambient
         self._ambient_unknown = False
         self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
@@ -130,18 +129,11 @@ class NewtonHarmonic(ThermalModel):
         if self.sources is not None and self.omega.numel() > 0:
             self.sources.prepare(scene, self.modality)
 
-    def on_step(self, step: int) -> None:
-        self._due = self.sources is not None and self.omega.numel() > 0 and step in self.sources.drop_at
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        """None; at the steps of ``drop_sources_at`` it is here that sources are given up: it is called once a step."""
-        if self._due:
-            self._due = False
-            self._drop_sources(splats)
-        return {}
-
     @torch.no_grad()
-    def _drop_sources(self, splats: Splats) -> None:
+    def needless_rows(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
+        """At the steps of ``drop_sources_at``, the sources of Gaussians that relaxation alone can tell."""
+        if self.sources is None or self.omega.numel() == 0 or step not in self.sources.drop_at:
+            return
         gone, initial, log_rate = self.sources.needless(
             lambda time_s: self._state(splats, time_s, None), self.ambient, self.span_s.item()
         )
@@ -150,11 +142,11 @@ class NewtonHarmonic(ThermalModel):
             instead["log_rate"] = log_rate
         else:
             instead["log_conductance"] = log_rate + splats["log_capacity"]
-        splats.release("source_gains", gone, instead)
         places = splats.places("source_gains")
-        before = len(gone) if places is None else int((places >= 0).sum())
-        left = ~gone if places is None else ~gone & (places >= 0)
-        log.info("%d of %d heat sources stay, for %d Gaussians", int(left.sum()), before, len(gone))
+        had = torch.ones_like(gone) if places is None else places >= 0
+        stay, before = int((had & ~gone).sum()), int(had.sum())
+        log.info("%d of %d heat sources stay, for %d Gaussians", stay, before, len(gone))
+        yield "source_gains", gone, instead
 
     def _set_ambient(self, scene: SceneData) -> None:
         celsius = scene.ambient_c if isinstance(self._ambient_from, str) else self._ambient_from

@@ -204,6 +204,8 @@ class SplatTraining(pl.LightningModule):
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, inner, self._density_state)
+        for name, gone, instead in self.thermal.needless_rows(self.splats, step):
+            cloud.drop(name, gone, instead)
         if self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density")) is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
