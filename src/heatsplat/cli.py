@@ -208,13 +208,16 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
             lambda: build(choosing["module"]), data.scene, plain["max_steps"], seconds, device_of(plain)
         )
         cap_max = OmegaConf.select(config, keys[0]) if keys else None
-        plan = budget.plan(budget.read_points(), plain["name"], pace, seconds, cap_max)
+        free_decay = not any(text.lstrip("+").startswith("optim.decay=") for text in given)
+        plan = budget.plan(budget.read_points(), plain["name"], pace, seconds, cap_max, free_decay)
         for line in plan.lines():
             log.info("%s", line)
     config = config.copy()
     config.max_steps = plan.steps
     for key in keys:
         OmegaConf.update(config, key, plan.cap)
+    if plan.decay is not None:
+        config.optim.decay = plan.decay
     plain = resolved(config)
     plain["trainer"]["max_steps"] = budget.HEADROOM * plan.steps
     plain["budget"] = plan.as_dict()

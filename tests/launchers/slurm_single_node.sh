@@ -75,36 +75,22 @@ done
 sinfo --version
 sinfo
 
-# Rows: a job left alone, one whose time is over after step 4 (SIGUSR2, which SLURM sends before the limit), one that runs
-# into a real limit of two minutes, one that is killed, one that cannot be built. Two jobs at a time.
-SPY=+callbacks.spy._target_=interrupting.Interrupt
-ROWS="{whole:{set:['$SPY']},\
-preempted:{set:['$SPY','+callbacks.spy.step=4','+callbacks.spy.name=SIGUSR2']},\
-long:{set:['$SPY','+callbacks.spy.pause_s=1.5','max_steps=60']},\
-killed:{set:['$SPY','+callbacks.spy.step=4','+callbacks.spy.name=SIGKILL']},\
-broken:{set:['init.opacity=2.0']}}"
-export PYTHONPATH="$ROOT/tests/launchers"
-sweep() {
-    "$PYTHON" "$ROOT/src/train.py" -m method=3dgs data.size=tiny data.downscale=4 max_steps=8 callbacks.images=null \
-        callbacks.probes=null callbacks.costs.fps_repeats=1 trainer.limit_val_batches=1 trainer.limit_test_batches=1 \
-        seed=0 launcher=slurm hydra.launcher.gpus_per_node=null hydra.launcher.cpus_per_task=1 \
-        hydra.launcher.array_parallelism=2 hydra.launcher.timeout_min=2 hydra.launcher.signal_delay_s=30 \
-        hydra.launcher.max_num_timeout=10 "hydra.sweeper.rows=$ROWS" "hydra.sweep.dir=$STATE/sweep" "$@" 2>&1
-}
-report() {
-    for job in "$STATE"/sweep/3dgs_*; do
-        printf '%s  metrics.json: %s  FAILED: %s\n' "$(sed -n 's/.*row=//p' "$job/.hydra/overrides.yaml" | tr -d "'\"")" \
-            "$([ -f "$job/metrics.json" ] && echo yes || echo no)" "$(grep -E '^[A-Za-z_.]*(Error|Exception)' "$job/FAILED" 2>/dev/null | tail -n 1 | grep . || echo no)"
-        grep -h 'going on from step' "$job/run.log" | sed 's/.*\(going on from step [0-9]*\).*/    \1/' || true
-    done
+# Besides those of single_node.sh, a job whose time is over after step 4 (SIGUSR2, which SLURM sends before the limit) and one
+# that runs into a real limit of two minutes.
+. "$ROOT/tests/launchers/single_node.sh"
+LAUNCHER=(launcher=slurm hydra.launcher.gpus_per_node=null hydra.launcher.cpus_per_task=1 hydra.launcher.array_parallelism=2
+    hydra.launcher.timeout_min=2 hydra.launcher.signal_delay_s=30 hydra.launcher.max_num_timeout=10)
+ROWS="preempted:{set:['$SPY','+callbacks.spy.step=4','+callbacks.spy.name=SIGUSR2']},\
+long:{set:['$SPY','+callbacks.spy.pause_s=1.5','max_steps=60']},"
+preemptions() {
     grep -h -E 'timed-out|preempted|Requeued' "$STATE"/sweep/.submitit/*/*.out | sed 's/.*\(Caught\|Requeued\)/\1/' || true
-    cat "$STATE/sweep/table.md"
 }
 
 # What the queue looks like meanwhile.
 ( for _ in $(seq 4); do sleep 45; squeue --array --format='%.8i %.10T %.6M %.9l'; done ) &
-echo "== the sweep" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
+sweep_through "the sweep"
 wait
+preemptions
 report
-echo "== the same command once more" && sweep | grep -E '#[0-9]+ (done|died|FAILED|has)' | cut -c 1-100 || true
+sweep_through "the same command once more"
 report

@@ -18,6 +18,7 @@ from heatsplat.io.results import RunResults
 from heatsplat.studies.budget import (
     CALIBRATION_SHARE,
     CURVES_FILE,
+    Choice,
     Curve,
     Pace,
     Plan,
@@ -93,7 +94,7 @@ def test_the_curves_of_the_repository_rise_with_the_steps():
 
 def seconds_for(found: Plan) -> float:
     """What a plan's steps take at PACE by its curve."""
-    curve = next(iter(curves_of(POINTS)[found.growth or FREE]))
+    curve = next(iter(curves_of(POINTS)[Choice(found.growth or FREE, 1.0)]))
     return found.steps * PACE.step_s(PACE.points * curve.mean_growth(found.steps))
 
 
@@ -122,6 +123,17 @@ def test_little_time_takes_few_gaussians_and_much_time_many():
     assert (short.cap, short.growth) == (4000, 1.0)
     assert (long.cap, long.growth) == (100_000, None) and long.steps > short.steps
     assert plan(POINTS, "etgs", PACE, 120.0, cap_max=9000).cap == 9000  # what the configuration allows
+
+
+def test_short_runs_keep_their_learning_rates_and_long_ones_let_them_fall():
+    slow = [replace(point, decay=0.25, psnr=point.psnr + 3 - 1.5 * i) for i, point in enumerate(POINTS[:3])]
+    points = POINTS[:3] + slow  # 3 dB better after 250 steps, none after 4000
+    short, long = (plan(points, "etgs", PACE, asked, cap_max=100_000) for asked in (4.0, 300.0))
+    assert (short.decay, long.decay) == (0.25, 1.0)
+    assert "25% of the decay of learning rates" in short.lines()[0]
+    kept = plan(points, "etgs", PACE, 4.0, cap_max=100_000, free_decay=False)
+    assert kept.decay is None and kept.expected_psnr < short.expected_psnr
+    assert "decay" not in kept.lines()[0]
 
 
 def test_twice_the_time_is_what_a_plan_for_it_would_choose():
@@ -279,7 +291,7 @@ def a_run(steps: int, cap: int | None, seed: int, psnr: float, seconds: float) -
     results.put("test", "psnr", psnr)
     results.put("cost", "train_seconds", seconds)
     results.put("cost", "gaussians", 5000)
-    return Trained("etgs", "heated", steps, cap, seed, results, 6000.0)
+    return Trained("etgs", "heated", steps, cap, 1.0, seed, results, 6000.0)
 
 
 def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
@@ -296,7 +308,7 @@ def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
     planned = RunResults(run={"budget": {"train_s": 29.0, "calibration_s": 0.7, "off_percent": -1.0, "steps": 900}})
     planned.put("test", "psnr", 26.0)
     text = tables(grid, [("etgs", "heated", 30.0, planned)])
-    assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000 | 25.00 | 32.0 |" in text
+    assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000, decay 1 | 25.00 | 32.0 |" in text
     assert len(picture(points).axes) == 2
 
 

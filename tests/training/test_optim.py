@@ -112,3 +112,15 @@ def test_a_resumed_optimiser_continues_bit_for_bit(tmp_path):
     scheduler.load_state_dict(state["scheduler"])
     steps(second, optimizer, scheduler, 9, 20)
     assert all(torch.equal(whole[name], second[name]) for name in whole.names)
+
+
+@pytest.mark.parametrize(("decay", "end"), [(0.0, 1.0), (0.25, 0.01**0.25), (1.0, 0.01)])
+def test_a_run_goes_through_a_share_of_the_decay(decay, end):
+    cloud = splats(4)
+    optimizer, scheduler = build(cloud, Optimisation(decay=decay))
+    steps(cloud, optimizer, scheduler, 0, 100)
+    rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
+    assert rates["means"] == pytest.approx(end * 1.6e-4 * 2.0)
+    assert rates["quats"] == 1e-3
+    with pytest.raises(ValueError, match="optim.decay must not be negative, got -1"):
+        Optimisation(decay=-1)

@@ -144,6 +144,7 @@ class BudgetClock(pl.Callback):
             "planned_steps": self.plan["steps"],
             "steps": trainer.global_step,
             "max_gaussians": self.plan["cap"],
+            "learning_rate_decay": self.plan["decay"],
             "growth_held_at_step": self._held,
             "schedule_done": round(done, 4),
             "expected_psnr_on_demo_scenes": self.plan["expected_psnr"],

@@ -102,8 +102,18 @@ class Band:
         return (1 / inverse).clamp(*TEMPERATURES_K), kept == radiance
 
 
-class _Radiance(torch.autograd.Function):
-    """The sum over nodes with its slope, of which only the slope is kept for the way back."""
+class _WithSlope(torch.autograd.Function):
+    """A function of one number whose slope was found on the way, which is all that the way back needs."""
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_value: Tensor):
+        (slope,) = ctx.saved_tensors
+        return v_value * slope, None
+
+
+class _Radiance(_WithSlope):
+    """The sum over nodes."""
 
     @staticmethod
     def forward(ctx, temperature_k: Tensor, band: Band) -> Tensor:
@@ -113,14 +123,8 @@ class _Radiance(torch.autograd.Function):
         ctx.save_for_backward(torch.where(kept == given, slope, 0.0).to(temperature_k))
         return sent.to(temperature_k)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, v_sent: Tensor):
-        (slope,) = ctx.saved_tensors
-        return v_sent * slope, None
 
-
-class _Temperature(torch.autograd.Function):
+class _Temperature(_WithSlope):
     """The inverse, whose slope is that of an implicit function."""
 
     @staticmethod
@@ -129,9 +133,3 @@ class _Temperature(torch.autograd.Function):
         _, slope = band.with_slope(found)
         ctx.save_for_backward(torch.where(inside, 1 / slope, 0.0).to(radiance))
         return found.to(radiance)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, v_found: Tensor):
-        (slope,) = ctx.saved_tensors
-        return v_found * slope, None

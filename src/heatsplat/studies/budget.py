@@ -1,4 +1,4 @@
-"""Budget in, best recipe out: steps and Gaussians that make the most of so many seconds of training.
+"""Budget in, best recipe out: steps, Gaussians and learning rates that make the most of so many seconds of training.
 
 Three measurements meet. Curves say how well a method does after so many steps with so many Gaussians; they hold no
 seconds, so they travel between machines. A calibration of a few steps says what a step costs here, on this scene, with few
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from scipy.spatial import cKDTree
@@ -57,6 +57,13 @@ def seconds_of(budget: str | float) -> float:
 # Curves: what steps and Gaussians are worth ---------------------------------------------------------------------------
 
 
+class Choice(NamedTuple):
+    """Knobs besides the number of steps: cap on the Gaussians in those of the start, and ``optim.decay``."""
+
+    growth: float
+    decay: float
+
+
 @dataclass(frozen=True)
 class Point:
     """The end of one measured run, or the mean of several with different seeds.
@@ -68,6 +75,7 @@ class Point:
         mean_growth: Gaussians in the mean over the run's steps, in Gaussians of the start.
         psnr: of the test views at full resolution, dB.
         seeds: runs behind the mean.
+        decay: share of the decay of the learning rates, ``optim.decay``.
     """
 
     method: str
@@ -77,6 +85,12 @@ class Point:
     mean_growth: float
     psnr: float
     seeds: int = 1
+    decay: float = 1.0
+
+    @property
+    def choice(self) -> Choice:
+        """What a plan may choose."""
+        return Choice(self.growth, self.decay)
 
 
 @dataclass(frozen=True)
@@ -130,6 +144,7 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
                     float(row["mean_growth"]),
                     float(row["psnr"]),
                     int(row["seeds"]),
+                    float(row["decay"]),
                 )
                 for row in csv.DictReader(file)
             ]
@@ -144,23 +159,23 @@ def write_points(points: Iterable[Point], path: Path) -> None:
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, list(Point.__dataclass_fields__), lineterminator="\n")
     writer.writeheader()
-    for point in sorted(points, key=lambda point: (point.method, point.scene, point.growth, point.steps)):
+    for point in sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps)):
         writer.writerow(
             asdict(point)
             | {"psnr": f"{point.psnr:.3f}"}
-            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth")}
+            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay")}
         )
     write_atomically(path, text.getvalue())
 
 
-def curves_of(points: Iterable[Point]) -> dict[float, list[Curve]]:
-    """Growth -> the curves with that cap, one for each method and scene."""
-    found: dict[tuple[float, str, str], list[Point]] = {}
+def curves_of(points: Iterable[Point]) -> dict[Choice, list[Curve]]:
+    """Choice -> the curves with it, one for each method and scene."""
+    found: dict[tuple[Choice, str, str], list[Point]] = {}
     for point in points:
-        found.setdefault((point.growth, point.method, point.scene), []).append(point)
-    curves: dict[float, list[Curve]] = {}
-    for (growth, _, _), own in sorted(found.items()):
-        curves.setdefault(growth, []).append(Curve(tuple(sorted(own, key=lambda point: point.steps))))
+        found.setdefault((point.choice, point.method, point.scene), []).append(point)
+    curves: dict[Choice, list[Curve]] = {}
+    for (choice, _, _), own in sorted(found.items()):
+        curves.setdefault(choice, []).append(Curve(tuple(sorted(own, key=lambda point: point.steps))))
     return curves
 
 
@@ -256,6 +271,7 @@ class Plan:
         steps: length of the run.
         cap: Gaussians at most, or None where the method keeps what it has.
         growth: that cap in Gaussians of the start; None is no cap but the configuration's.
+        decay: ``optim.decay``, or None where the configuration's stays.
         expected_psnr: of the demo scenes on which the curves were measured, dB; None where the method has none.
         twice_steps, twice_growth: what would be chosen in twice the time.
         twice_gain_db: and what it would gain.
@@ -269,6 +285,7 @@ class Plan:
     steps: int
     cap: int | None
     growth: float | None
+    decay: float | None
     expected_psnr: float | None
     twice_steps: int
     twice_growth: float | None
@@ -289,7 +306,8 @@ class Plan:
         """What the log says."""
         cap = "no Gaussians are added" if self.cap is None else f"at most {self.cap:,} Gaussians"
         left = f"{self.asked_s:g} s less {self.calibration_s:.1f} s of calibration (a step takes {self.step_ms:.1f} ms at first)"
-        first = f"budget: {self.steps:,} steps and {cap} for {left}"
+        decay = "" if self.decay is None else f", {self.decay:.0%} of the decay of learning rates"
+        first = f"budget: {self.steps:,} steps, {cap}{decay} for {left}"
         if self.expected_psnr is not None:
             first += f"; such runs reach {self.expected_psnr:.1f} dB on the demo scenes"
         return [first, self.twice(), *(f"budget: {reason}" for reason in self.reasons)]
@@ -299,8 +317,10 @@ class Plan:
         return f"twice the time ({2 * self.asked_s:g} s) would buy about {self.twice_gain_db:+.2f} dB: {self.twice_steps:,} steps"
 
 
-def plan(points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_max: int | None) -> Plan:
-    """The steps and the cap on Gaussians with the best expected PSNR in ``asked_s`` seconds.
+def plan(
+    points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_max: int | None, free_decay: bool = True
+) -> Plan:
+    """The steps, the cap on Gaussians and the decay of learning rates with the best expected PSNR in ``asked_s`` seconds.
 
     Args:
         points: measured curves of any methods.
@@ -308,6 +328,7 @@ def plan(points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_m
         pace: what a step costs here.
         asked_s: seconds for calibration and training.
         cap_max: Gaussians that the configuration allows; None where the method adds none.
+        free_decay: whether the decay may be chosen; else the configuration's stays, about which curves of 1 must do.
 
     Raises:
         SceneError: the time is too short, with the least; or nothing was measured.
@@ -322,47 +343,48 @@ def plan(points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_m
         )
     if not own:
         raise SceneError("there are no measured curves to plan from; run python src/study.py study=budget")
-    curves = curves_of(own)
+    curves = curves_of(point for point in own if free_decay or point.decay == 1.0)
     if cap_max is None:
-        curves = {min(curves): curves[min(curves)]}
-        reasons.append("this method adds no Gaussians, so only the number of steps was chosen")
+        fewest = min(choice.growth for choice in curves)
+        curves = {choice: found for choice, found in curves.items() if choice.growth == fewest}
+        reasons.append("this method adds no Gaussians, so their number was not chosen")
     most = max(len(found) for found in curves.values())
-    curves = {growth: found for growth, found in curves.items() if len(found) == most}  # compare on the same scenes
+    curves = {choice: found for choice, found in curves.items() if len(found) == most}  # compare on the same scenes
     train_s = asked_s - pace.spent_s
 
-    def cost(growth: float, steps: float) -> float:
+    def cost(choice: Choice, steps: float) -> float:
         """Seconds of a run."""
         if cap_max is None:
             return steps * pace.step_s(pace.points)
-        multiple = statistics.fmean(curve.mean_growth(steps) for curve in curves[growth])
+        multiple = statistics.fmean(curve.mean_growth(steps) for curve in curves[choice])
         return steps * pace.step_s(min(pace.points * multiple, max(cap_max, pace.points)))
 
-    def affordable(growth: float, seconds: float) -> float:
+    def affordable(choice: Choice, seconds: float) -> float:
         """Steps that take so many seconds; the cost rises with the steps."""
         low, high = 1.0, 2.0
-        while cost(growth, high) < seconds:
+        while cost(choice, high) < seconds:
             low, high = high, 2 * high
         for _ in range(50):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if cost(growth, middle) < seconds else (low, middle)
+            low, high = (middle, high) if cost(choice, middle) < seconds else (low, middle)
         return low
 
-    def best(seconds: float) -> tuple[float, float, int]:
-        """Expected PSNR, growth and steps of the best choice."""
-        choices = []
-        for growth, found in curves.items():
-            steps = affordable(growth, seconds)
-            choices.append((statistics.fmean(curve.psnr(steps) for curve in found), growth, round(steps)))
-        return max(choices)
+    def best(seconds: float) -> tuple[float, Choice, int]:
+        """Expected PSNR, choice and steps of the best."""
+        ends = []
+        for choice, found in curves.items():
+            steps = affordable(choice, seconds)
+            ends.append((statistics.fmean(curve.psnr(steps) for curve in found), choice, round(steps)))
+        return max(ends)
 
-    least = min(cost(growth, MIN_STEPS) for growth in curves)
+    least = min(cost(choice, MIN_STEPS) for choice in curves)
     if train_s < least:
         raise SceneError(
             f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
             f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
             "smaller (data.downscale=2, init.count=10000)."
         )
-    score, growth, steps = best(train_s)
+    score, (growth, decay), steps = best(train_s)
     steps = max(steps, MIN_STEPS)
     better, more, longer = best(train_s + asked_s)
     measured = max(curve.last for curve in curves[more])
@@ -380,9 +402,10 @@ def plan(points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_m
         steps=steps,
         cap=cap,
         growth=None if cap_max is None or math.isinf(growth) else growth,
+        decay=decay if free_decay else None,
         expected_psnr=round(score, 2) if any(point.method == method for point in points) else None,
         twice_steps=longer,
-        twice_growth=None if cap_max is None or math.isinf(more) else more,
+        twice_growth=None if cap_max is None or math.isinf(more.growth) else more.growth,
         twice_gain_db=round(max(better - score, 0.0), 2),
         step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),

@@ -1,4 +1,4 @@
-"""The curves behind budget=SECONDS: an exhaustive grid of run lengths and caps on Gaussians, and planned runs beside it.
+"""The curves behind budget=SECONDS: a grid of run lengths, caps on Gaussians and learning rates; planned runs beside it.
 
 Rules: every run is whole, its schedule as long as it is, so a grid point is what a user would get; scores are those of the
 test views at full resolution. The curves hold no seconds, so they may be measured on a busy machine; the comparison of
@@ -8,6 +8,7 @@ planned runs with the grid holds seconds, so it may not.
 from __future__ import annotations
 
 import csv
+import itertools
 import logging
 import math
 import statistics
@@ -34,7 +35,7 @@ class Trained:
     """A run of the grid.
 
     Args:
-        method, scene, steps, cap, seed: which; ``cap`` None is that of the method.
+        method, scene, steps, cap, decay, seed: which; ``cap`` None is that of the method.
         results: what it found.
         mean_gaussians: over its steps.
     """
@@ -43,6 +44,7 @@ class Trained:
     scene: str
     steps: int
     cap: int | None
+    decay: float
     seed: int
     results: RunResults
     mean_gaussians: float
@@ -59,6 +61,7 @@ def run(
     scenes: Mapping[str, Sequence[str]],
     steps: Sequence[int],
     caps: Sequence[int | None],
+    decays: Sequence[float],
     seeds: Sequence[int],
     budgets: Sequence[float],
     overrides: Sequence[str],
@@ -72,6 +75,7 @@ def run(
         scenes: method -> synthetic scenes.
         steps: lengths of a run.
         caps: most Gaussians; None is the method's own cap.
+        decays: shares of the decay of the learning rates (``optim.decay``).
         seeds: of every run of the grid.
         budgets: seconds for which a planned run is set beside the grid; these runs use the curves just measured.
         overrides: of every run.
@@ -79,16 +83,13 @@ def run(
     """
     folder = Path(output_dir)
     grid = []
-    for method, names in scenes.items():
-        for scene in names:
-            for length in steps:
-                for cap in caps:
-                    for seed in seeds:
-                        place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}" / str(seed)
-                        wanted = [f"max_steps={length}", *([f"density.cap_max={cap}"] if cap else [])]
-                        results = _trained(place, train, [*overrides, *_of(method, scene, seed), *wanted])
-                        mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
-                        grid.append(Trained(method, scene, length, cap, seed, results, mean))
+    pairs = [(method, scene) for method, names in scenes.items() for scene in names]
+    for (method, scene), length, cap, decay, seed in itertools.product(pairs, steps, caps, decays, seeds):
+        place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}_{decay:g}" / str(seed)
+        wanted = [f"max_steps={length}", f"optim.decay={decay:g}", *([f"density.cap_max={cap}"] if cap else [])]
+        results = _trained(place, train, [*overrides, *_of(method, scene, seed), *wanted])
+        mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
+        grid.append(Trained(method, scene, length, cap, decay, seed, results, mean))
     points = means(grid)
     write_points(points, folder / POINTS_FILE)
     if curves is not None:
@@ -103,7 +104,7 @@ def run(
             folder / "planned" / f"{method}_{scene}_{budget:g}s" / "0", train,
             [*overrides, *_of(method, scene, 0), f"budget={budget:g}s"],
         ))
-        for method, names in scenes.items() for scene in names for budget in budgets
+        for (method, scene), budget in itertools.product(pairs, budgets)
     ]  # fmt: skip
     write_atomically(folder / TABLE_FILE, tables(grid, planned))
     write_png(folder / PICTURE_FILE, figure_picture(picture(points)))
@@ -138,7 +139,7 @@ def means(grid: Iterable[Trained]) -> list[Point]:
     """The points of the curves: means over the seeds."""
     groups: dict[tuple, list[Trained]] = {}
     for one in grid:
-        groups.setdefault((one.method, one.scene, one.steps, one.cap), []).append(one)
+        groups.setdefault((one.method, one.scene, one.steps, one.cap, one.decay), []).append(one)
     return [
         Point(
             method=own[0].method,
@@ -148,6 +149,7 @@ def means(grid: Iterable[Trained]) -> list[Point]:
             mean_growth=statistics.fmean(one.mean_gaussians / one.results.data["points"] for one in own),
             psnr=statistics.fmean(one.results.test["psnr"] for one in own),
             seeds=len(own),
+            decay=own[0].decay,
         )
         for own in groups.values()
     ]
@@ -156,12 +158,12 @@ def means(grid: Iterable[Trained]) -> list[Point]:
 def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, RunResults]]) -> str:
     """The grid, and each planned run beside the best run of the grid that was no slower."""
     lines = ["# Accuracy against steps and Gaussians, and planned runs", ""]
-    lines += ["| method | scene | steps | Gaussians at most | seed | train (s) | Gaussians | PSNR (dB) |"]
-    lines += ["|---|---|---:|---:|---:|---:|---:|---:|"]
+    lines += ["| method | scene | steps | Gaussians at most | decay | seed | train (s) | Gaussians | PSNR (dB) |"]
+    lines += ["|---|---|---:|---:|---:|---:|---:|---:|---:|"]
     for one in grid:
         cost = one.results.cost
         lines.append(
-            f"| {one.method} | {one.scene} | {one.steps:,} | {_cap(one.cap)} | {one.seed} "
+            f"| {one.method} | {one.scene} | {one.steps:,} | {_cap(one.cap)} | {one.decay:g} | {one.seed} "
             f"| {cost['train_seconds']:.1f} | {cost['gaussians']:,.0f} | {one.results.test['psnr']:.2f} |"
         )
     if not planned:
@@ -185,7 +187,7 @@ def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, Run
         rival = "none | – | –"
         if best is not None:
             rival = (
-                f"{best.steps:,} steps, {_cap(best.cap)} | {best.results.test['psnr']:.2f} "
+                f"{best.steps:,} steps, {_cap(best.cap)}, decay {best.decay:g} | {best.results.test['psnr']:.2f} "
                 f"| {best.results.cost['train_seconds']:.1f}"
             )
         spent = found["train_s"] + found["calibration_s"]
@@ -201,7 +203,7 @@ def _cap(cap: int | None) -> str:
 
 
 def picture(points: Sequence[Point]) -> Figure:
-    """PSNR and Gaussians against steps, a row for each method and scene, a line for each cap."""
+    """PSNR and Gaussians against steps, a row for each method and scene, a line for each cap and decay."""
     pairs = list(dict.fromkeys((point.method, point.scene) for point in points))
     figure = Figure(figsize=(9, 3.2 * len(pairs)), dpi=110, layout="constrained")
     for row, (method, scene) in enumerate(pairs):
@@ -210,8 +212,9 @@ def picture(points: Sequence[Point]) -> Figure:
             (("psnr", "PSNR (dB)"), ("mean_growth", "mean Gaussians / those of the start"))
         ):
             axes = figure.add_subplot(len(pairs), 2, 2 * row + column + 1)
-            for i, (growth, curves) in enumerate(curves_of(own).items()):
-                _line(axes, curves[0], name, i, "free" if math.isinf(growth) else f"at most {growth:g} times the start")
+            for i, ((growth, decay), curves) in enumerate(curves_of(own).items()):
+                cap = "free" if math.isinf(growth) else f"at most {growth:g} times the start"
+                _line(axes, curves[0], name, i, f"{cap}, decay {decay:g}")
             lengths = sorted({point.steps for point in own})
             axes.set(xscale="log", xlabel="steps", ylabel=label, title=f"{method} on {scene}")
             axes.set_xticks(lengths, [f"{length:,}" for length in lengths])

@@ -22,7 +22,8 @@ from heatsplat.training.module import SplatTraining
 log = logging.getLogger("heatsplat")
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
-# folder, and loaders that cannot resume (ours takes the step from the trainer, so a resumed run sees the right views).
+# folder, SLURM where a run was started by hand, and loaders that cannot resume (ours takes the step from the trainer, so
+# a resumed run sees the right views).
 NOISE = (
     r".*does not have many workers.*",
     r".*LeafSpec.*",
@@ -32,6 +33,7 @@ NOISE = (
     r".*smaller than the logging interval.*",
     r".*dirpath has changed.*",
     r".*dataloader is not resumable.*",
+    r".*`srun` command is available.*",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.evidence.joint_fit import joint
@@ -36,10 +37,9 @@ def conduction(obs: Observations) -> Evidence:
         return Evidence(None, f"{len(points)} points are too few to have neighbours, {FEWEST} are needed")
     near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
     first, last = early[used], late[used]
-    ambient = obs.ambient if obs.ambient is not None else float(torch.minimum(first, last).min())
-    level = (first[near].mean(1) - ambient).abs().clamp_min(1e-9)
-    kept = ((last[near].mean(1) - ambient) / level).median()
-    contrast, remains = first - first[near].mean(1), last - last[near].mean(1)
+    before, after = first[near].mean(1), last[near].mean(1)
+    kept = _kept_apart(before, after) if "frame_offset" in model.shared else _kept(before, after, obs.ambient)
+    contrast, remains = first - before, last - after
     strong = contrast.abs() > 5.0 * obs.noise
     if int(strong.sum()) < FEWEST_STRONG or kept < LEFT:
         return Evidence(0.0, "neighbours are too much alike, or all is cold in the end, to tell how contrasts fade")
@@ -49,3 +49,20 @@ def conduction(obs: Observations) -> Evidence:
         (rate - 1.0) / (FASTER - 1.0),
         f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}",
     )
+
+
+def _kept(before: Tensor, after: Tensor, ambient: float | None) -> Tensor:
+    """The share of their excess over the surroundings that levels keep."""
+    if ambient is None:
+        ambient = float(torch.minimum(before, after).min())
+    return ((after - ambient) / (before - ambient).abs().clamp_min(1e-9)).median()
+
+
+def _kept_apart(before: Tensor, after: Tensor) -> Tensor:
+    """The share of their distance from one another that levels keep.
+
+    A drift of the sensor and a cooling of all points are told apart up to an offset that all share; distances lack it.
+    """
+    far, rest = before - before.median(), after - after.median()
+    clear = far.abs() >= far.abs().median().clamp_min(1e-9)
+    return (rest[clear] / far[clear]).median() if clear.any() else torch.zeros(())

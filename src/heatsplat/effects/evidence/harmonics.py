@@ -6,14 +6,14 @@ import math
 
 import torch
 
-from heatsplat.effects.evidence.joint import Joint, Model
+from heatsplat.effects.evidence.fits import Fits, Model
 from heatsplat.effects.observations import Observations
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
-def needed(fit: Joint, model: Model, obs: Observations) -> int:
+def needed(fit: Fits, model: Model, obs: Observations) -> int:
     """K for which the criterion is least when the courses that points share are written as K harmonics and a decay.
 
     The grid of frequencies is that of the thermal model, whose response to a harmonic after its start is that harmonic
