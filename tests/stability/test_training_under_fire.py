@@ -79,7 +79,7 @@ def hundredfold(plain: dict[str, Any]) -> dict[str, Any]:
         return number * 100 if key.startswith("lr") and not key.endswith("_end") else number
 
     def all_faster(key, number):
-        return number if key in ("means_end", "eps") else number * 100
+        return number if key in ("means_end", "decay", "eps") else number * 100
 
     module = everywhere(plain["module"], faster)
     return plain | {"module": module | {"optim": everywhere(module["optim"], all_faster)}}
