@@ -42,7 +42,7 @@ def commands(monkeypatch):
                 on -= falls_with(word.removeprefix("effects.").partition("=")[0])
         results = RunResults(
             run={"parameters": 1000 + 100 * len(on)},
-            test={"psnr": 30.0 + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth)},
+            test={"psnr": 30.0 + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},
             cost={"steps_per_second": 1000.0 / (10 + len(on))},
             effects={name: {"on": name in on} for name in ("relaxation", "harmonic_source", "agc")},
         )
@@ -59,12 +59,12 @@ def test_every_selection_runs_and_each_chosen_effect_is_left_out(commands, tmp_p
     oracle = [command for command in commands if "effects.relaxation=on" in command]
     assert len(oracle) == 2 and all("effects=none" in c and "effects.harmonic_source=on" in c for c in oracle)
     table = (tmp_path / study.TABLE_FILE).read_text()
-    assert "| heated | auto | relaxation, harmonic_source | 32.00 | 0.800 | 1,200 | 12.0 |" in table
-    assert "| static | all | relaxation, harmonic_source, agc | 30.00 | 1.000 | 1,300 | 13.0 |" in table
-    assert "| heated | oracle | relaxation, harmonic_source | 32.00 | 0.800 | 1,200 | 12.0 |" in table
-    assert "| static | none | none | 30.00 | 1.000 | 1,000 | 10.0 |" in table
-    assert "| heated | harmonic_source | 1.00 | 0.100 | 100 | 1.00 |" in table
-    assert "| heated | relaxation | 2.00 | 0.200 | 200 | 2.00 |" in table
+    assert "| heated | auto | relaxation, harmonic_source | 32.00 | 40.00 | 0.800 | 1,200 | 12.0 |" in table
+    assert "| static | all | relaxation, harmonic_source, agc | 30.00 | 40.00 | 1.000 | 1,300 | 13.0 |" in table
+    assert "| heated | oracle | relaxation, harmonic_source | 32.00 | 40.00 | 0.800 | 1,200 | 12.0 |" in table
+    assert "| static | none | none | 30.00 | 40.00 | 1.000 | 1,000 | 10.0 |" in table
+    assert "| heated | harmonic_source | 1.00 | 0.00 | 0.100 | 100 | 1.00 |" in table
+    assert "| heated | relaxation | 2.00 | 0.00 | 0.200 | 200 | 2.00 |" in table
     assert (tmp_path / study.PICTURE_FILE).stat().st_size > 5000
 
 
