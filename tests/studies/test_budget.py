@@ -15,6 +15,7 @@ from heatsplat.callbacks.budget import BudgetClock
 from heatsplat.callbacks.timing import CostMeter
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.io.results import RunResults
+from heatsplat.studies import budget_grid
 from heatsplat.studies.budget import (
     CALIBRATION_SHARE,
     CURVES_FILE,
@@ -310,6 +311,29 @@ def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
     text = tables(grid, [("etgs", "heated", 30.0, planned)])
     assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000, decay 1 | 25.00 | 32.0 |" in text
     assert len(picture(points).axes) == 2
+
+
+def test_the_grid_trains_every_combination_and_leaves_the_curves_of_other_scenes(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides):
+        asked.append(overrides)
+        place.mkdir(parents=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        return a_run(0, None, 0, 20.0 + len(asked), 5.0).results
+
+    monkeypatch.setattr(budget_grid, "_trained", trained)
+    write_points([replace(POINTS[0], scene="cooling"), POINTS[0]], tmp_path / "curves.csv")
+    settings = {"train": "train.py", "steps": [250, 500], "caps": [8000, None], "decays": [1.0, 0.25], "seeds": [0]}
+    settings |= {"budgets": [], "overrides": ["data.size=demo"], "curves": str(tmp_path / "curves.csv")}
+    budget_grid.run(tmp_path / "study", scenes=["etgs/heated"], **settings)
+    assert len(asked) == 8 and len({tuple(overrides) for overrides in asked}) == 8
+    assert sum("optim.decay=0.25" in one and "density.cap_max=8000" in one for one in asked) == 2
+    points = read_points(tmp_path / "curves.csv")
+    assert [point.scene for point in points] == ["cooling"] + 8 * ["heated"]
+    assert len(curves_of(points[1:])) == 4
+    with pytest.raises(SceneError, match="of the form method/scene, such as etgs/heated, got .*'etgs'"):
+        budget_grid.run(tmp_path / "study", scenes=["etgs"], **settings)
 
 
 def test_mean_gaussians_weigh_the_steps(tmp_path):

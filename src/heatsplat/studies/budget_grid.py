@@ -14,12 +14,13 @@ import math
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
 from heatsplat.studies.budget import Curve, Point, curves_of, read_points, write_points
@@ -58,7 +59,7 @@ class Trained:
 def run(
     output_dir: Path | str,
     train: str,
-    scenes: Mapping[str, Sequence[str]],
+    scenes: Sequence[str],
     steps: Sequence[int],
     caps: Sequence[int | None],
     decays: Sequence[float],
@@ -72,7 +73,7 @@ def run(
     Args:
         output_dir: of the study; runs that have results there are not run again.
         train: path of train.py.
-        scenes: method -> synthetic scenes.
+        scenes: "method/scene" of synthetic scenes, such as "etgs/heated".
         steps: lengths of a run.
         caps: most Gaussians; None is the method's own cap.
         decays: shares of the decay of the learning rates (``optim.decay``).
@@ -83,7 +84,9 @@ def run(
     """
     folder = Path(output_dir)
     grid = []
-    pairs = [(method, scene) for method, names in scenes.items() for scene in names]
+    pairs = [tuple(pair.split("/")) for pair in scenes]
+    if any(len(pair) != 2 for pair in pairs):
+        raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {list(scenes)}")
     for (method, scene), length, cap, decay, seed in itertools.product(pairs, steps, caps, decays, seeds):
         place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}_{decay:g}" / str(seed)
         wanted = [f"max_steps={length}", f"optim.decay={decay:g}", *([f"density.cap_max={cap}"] if cap else [])]
@@ -94,7 +97,7 @@ def run(
     write_points(points, folder / POINTS_FILE)
     if curves is not None:
         kept = (
-            [point for point in read_points(Path(curves)) if point.method not in scenes]
+            [point for point in read_points(Path(curves)) if (point.method, point.scene) not in pairs]
             if Path(curves).exists()
             else []
         )
