@@ -218,6 +218,9 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
         OmegaConf.update(config, key, plan.cap)
     if plan.decay is not None:
         config.optim.decay = plan.decay
+    for key in ("density.reset_every", "density.recipe.reset_every"):  # as in the runs behind the curves
+        if OmegaConf.select(config, key) is not None:
+            OmegaConf.update(config, key, None)
     plain = resolved(config)
     plain["trainer"]["max_steps"] = budget.HEADROOM * plan.steps
     plain["budget"] = plan.as_dict()

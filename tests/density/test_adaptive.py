@@ -72,6 +72,16 @@ def test_opacity_reset_happens_on_time_and_not_after_stop():
     assert refine(policy, cloud, 299) is None
 
 
+def test_without_resets_opacities_and_large_gaussians_stay():
+    policy = Adaptive(start=0, stop=1000, every=10, reset_every=None)
+    cloud = make_cloud(policy, [0.01, 5.0], [0.9, 0.9])
+    for step in range(9, 999, 10):
+        refine(policy, cloud, step)
+    assert len(cloud) == 2 and cloud.splats.opacities[0].tolist() == pytest.approx([0.9, 0.9])
+    with pytest.raises(ValueError, match="reset_every and cap_max must be at least 1"):
+        Adaptive(reset_every=0)
+
+
 def test_nothing_before_start_between_refinements_or_after_stop():
     policy = Adaptive(start=50, stop=100, every=10)
     cloud = make_cloud(policy, [0.001] * 3, [0.5] * 3)

@@ -26,7 +26,7 @@ class Adaptive(DensityControl):
         clone_scale: Gaussians with a largest semi-axis up to this (times extent) are cloned, larger ones split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed.
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
-        reset_every: steps between opacity resets; none at or after ``stop``.
+        reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
         reset_opacity: opacities are lowered to at most this.
         cap_max: never more Gaussians than this; the strongest gradients grow first.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
@@ -41,12 +41,12 @@ class Adaptive(DensityControl):
         clone_scale: float = 0.01,
         prune_opacity: float = 0.005,
         prune_scale: float = 0.1,
-        reset_every: int = 3000,
+        reset_every: int | None = 3000,
         reset_opacity: float = 0.01,
         cap_max: int = 100_000,
         absgrad: bool = False,
     ) -> None:
-        if every < 1 or reset_every < 1 or cap_max < 1:
+        if every < 1 or cap_max < 1 or (reset_every is not None and reset_every < 1):
             raise ValueError(
                 f"density.every, reset_every and cap_max must be at least 1, got {every}, {reset_every}, {cap_max}"
             )
@@ -81,7 +81,7 @@ class Adaptive(DensityControl):
             removed = self._prune(cloud, step, extent)
             for statistic in cloud.state.values():
                 statistic.zero_()
-        reset = 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
+        reset = self.reset_every is not None and 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
         if reset:
             ceiling = torch.logit(torch.tensor(self.reset_opacity)).item()
             cloud.overwrite("opacity_logits", cloud.splats["opacity_logits"].clamp(max=ceiling))
@@ -119,7 +119,7 @@ class Adaptive(DensityControl):
 
     def _prune(self, cloud: Cloud, step: int, extent: float) -> int:
         keep = (cloud.splats.opacities > self.prune_opacity).any(dim=0)
-        if step + 1 > self.reset_every:
+        if self.reset_every is not None and step + 1 > self.reset_every:
             keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
         keep &= torch.isfinite(cloud.splats.means).all(dim=1)
         removed = int((~keep).sum())
