@@ -87,10 +87,14 @@ def stoppable() -> Iterator[None]:
     """
     asked: list[int] = []
 
-    def ask(number: int, _: Any) -> None:
-        if not asked:
-            asked.append(number)
-            signal.raise_signal(signal.SIGINT)
+    def ask(number: int, frame: Any) -> None:
+        if asked:
+            return
+        asked.append(number)
+        interrupt = signal.getsignal(signal.SIGINT)
+        if not callable(interrupt):  # a shell's background jobs ignore Ctrl-C, but not this
+            raise KeyboardInterrupt
+        interrupt(signal.SIGINT, frame)
 
     try:
         before = {number: signal.signal(number, ask) for number in (signal.SIGTERM, signal.SIGUSR2)}

@@ -13,10 +13,14 @@ from heatsplat import cli
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
 
 
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN], ids=["terminal", "background job"])
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR2"])
-def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name):
+def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name, ctrl_c):
     heard, number = [], signal.Signals[name]
-    before = signal.signal(number, lambda got, _: heard.append(got))
+    before, before_ctrl_c = (
+        signal.signal(number, lambda got, _: heard.append(got)),
+        signal.signal(signal.SIGINT, ctrl_c),
+    )
     try:
         with pytest.raises(KeyboardInterrupt), cli.stoppable():
             os.kill(os.getpid(), number)
@@ -27,6 +31,7 @@ def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name):
         assert heard == [number, number], "the listener was not put back"
     finally:
         signal.signal(number, before)
+        signal.signal(signal.SIGINT, before_ctrl_c)
 
 
 def test_ctrl_c_is_nobody_elses():
