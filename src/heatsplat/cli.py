@@ -193,8 +193,8 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
     from heatsplat.studies import budget
 
     seconds = budget.seconds_of(config.budget)
-    given = HydraConfig.get().overrides.task or []
-    if any(text.lstrip("+").startswith("max_steps=") for text in given):
+    given = {text.lstrip("+").partition("=")[0] for text in HydraConfig.get().overrides.task or []}
+    if "max_steps" in given:
         raise SceneError("budget chooses the number of steps, and max_steps gives it: leave out one of them")
     plain = resolved(config)
     stored = stored_recipe(plain["ckpt"], output_dir)
@@ -212,7 +212,7 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
             lambda: build(choosing["module"]), data.scene, plain["max_steps"], seconds, device_of(plain)
         )
         cap_max = OmegaConf.select(config, keys[0]) if keys else None
-        free_decay = not any(text.lstrip("+").startswith("optim.decay=") for text in given)
+        free_decay = "optim.decay" not in given
         plan = budget.plan(budget.read_points(), plain["name"], pace, seconds, cap_max, free_decay)
         for line in plan.lines():
             log.info("%s", line)
@@ -223,7 +223,7 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
     if plan.decay is not None:
         config.optim.decay = plan.decay
     for key in ("density.reset_every", "density.recipe.reset_every"):  # as in the runs behind the curves
-        if OmegaConf.select(config, key) is not None:
+        if key not in given and OmegaConf.select(config, key) is not None:
             OmegaConf.update(config, key, None)
     plain = resolved(config)
     plain["trainer"]["max_steps"] = budget.HEADROOM * plan.steps

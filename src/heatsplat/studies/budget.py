@@ -343,7 +343,7 @@ def plan(
         )
     if not own:
         raise SceneError("there are no measured curves to plan from; run python src/study.py study=budget")
-    curves = curves_of(point for point in own if free_decay or point.decay == 1.0)
+    curves = curves_of([point for point in own if free_decay or point.decay == 1.0] or own)
     if cap_max is None:
         fewest = min(choice.growth for choice in curves)
         curves = {choice: found for choice, found in curves.items() if choice.growth == fewest}
