@@ -6,7 +6,6 @@ Only Hydra is imported before the configuration is composed, so that --help, --c
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import sys
 import traceback
@@ -21,9 +20,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from heatsplat.training.machine import cores
+
 ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")
-FAILED = "FAILED"
 
 log = logging.getLogger("heatsplat")
 build = partial(hydra.utils.instantiate, _convert_="all")
@@ -48,11 +48,6 @@ def _run_of(ckpt: str | None) -> str:
     return str(folder.parent if folder.name == "checkpoints" else folder)
 
 
-def cores() -> int:
-    """CPU cores that this process may use: on a cluster those of the job, not those of the node."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _cores_of(asked: int | None) -> int | None:
     """Threads of a job that asked for so many cores; a run outside a sweep, or with nothing asked, takes all."""
     return asked if HydraConfig.get().mode == RunMode.MULTIRUN else None
@@ -67,8 +62,6 @@ OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
 OmegaConf.register_new_resolver("run_of", _run_of, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
-# Folders of jobs are named by their overrides; file systems allow 255 bytes, and seed and row come with the number.
-OmegaConf.register_new_resolver("start_of", lambda text: str(text)[:120], replace=True)
 OmegaConf.register_new_resolver("steps", _steps, replace=True)
 OmegaConf.register_new_resolver("scene_name", _scene_name, replace=True)
 
@@ -121,6 +114,8 @@ def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]
 
     @wraps(work)
     def job(config: DictConfig) -> Any:
+        from heatsplat.io.results import FAILED  # here, for it brings torch
+
         hydra_config = HydraConfig.get()
         output_dir = Path(hydra_config.runtime.output_dir)
         (output_dir / FAILED).unlink(missing_ok=True)
@@ -176,6 +171,11 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     return results.test.get("psnr")
 
 
+def task_overrides() -> list[str]:
+    """What the command line says of this job, such as "max_steps=300"; nothing outside a job."""
+    return list(HydraConfig.get().overrides.task or []) if HydraConfig.initialized() else []
+
+
 def resolved(config: DictConfig) -> dict[str, Any]:
     """A run's configuration as plain containers, with the data's folder as it is called from anywhere."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -187,25 +187,31 @@ def resolved(config: DictConfig) -> dict[str, Any]:
 def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
     """The configuration of a run that makes the most of ``budget`` seconds; a run that goes on keeps its plan.
 
-    "budget" then holds the plan. The trainer has room for more steps than planned, which ``BudgetClock`` may use.
+    "budget" then holds the plan, made from the curves in the file ``budget_curves`` (None: those of the package). The
+    trainer has room for more steps than planned, which ``BudgetClock`` may use.
     """
     from heatsplat.contracts import SceneError
     from heatsplat.studies import budget
 
     seconds = budget.seconds_of(config.budget)
-    given = {text.lstrip("+").partition("=")[0] for text in HydraConfig.get().overrides.task or []}
+    given = {text.lstrip("+").partition("=")[0] for text in task_overrides()}
     if "max_steps" in given:
         raise SceneError("budget chooses the number of steps, and max_steps gives it: leave out one of them")
+    config = config.copy()
+    if config.budget_curves is not None:
+        config.budget_curves = str(Path(config.budget_curves).expanduser().resolve())
     plain = resolved(config)
     stored = stored_recipe(plain["ckpt"], output_dir)
     if plain["ckpt"] is not None and not isinstance(stored.get("budget"), dict):
         raise SceneError(f"{plain['ckpt']} was trained without a budget and keeps its schedule: leave budget out")
     keys = [key for key in ("density.cap_max", "density.recipe.cap_max") if OmegaConf.select(config, key) is not None]
-    if isinstance(stored.get("budget"), dict) and (plain["ckpt"] or stored["budget"]["asked_s"] == seconds):
+    alike = all(stored.get(key) == plain[key] for key in ("name", "data", "budget_curves"))
+    if isinstance(stored.get("budget"), dict) and (plain["ckpt"] or (alike and stored["budget"]["asked_s"] == seconds)):
         plan = budget.Plan.from_dict(stored["budget"])
         if plan.asked_s != seconds:
             raise SceneError(f"{plain['ckpt']} was planned for budget={plan.asked_s:g}s and keeps its plan: give that")
     else:
+        points = budget.read_points(Path(plain["budget_curves"] or budget.CURVES_FILE))
         log.info("measuring what a step costs here")
         choosing = with_effects(plain | {"effects": plain["effects"] | {"price": False}}, data)
         pace = budget.calibrate(
@@ -213,10 +219,9 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
         )
         cap_max = OmegaConf.select(config, keys[0]) if keys else None
         free_decay = "optim.decay" not in given
-        plan = budget.plan(budget.read_points(), plain["name"], pace, seconds, cap_max, free_decay)
+        plan = budget.plan(points, plain["name"], pace, seconds, cap_max, free_decay)
         for line in plan.lines():
             log.info("%s", line)
-    config = config.copy()
     config.max_steps = plan.steps
     for key in keys:
         OmegaConf.update(config, key, plan.cap)
@@ -274,16 +279,20 @@ def begun(plain: dict[str, Any], data: Any, output_dir: Path) -> dict[str, Any] 
 
     A checkpoint of the last step is passed over: from it there is no step left in which the cost could be measured.
     """
+    from heatsplat.effects import assembly
     from heatsplat.training.module import CHECKPOINT_KEY
 
     if plain["ckpt"] is not None:
         return None
     for path, checkpoint in left_behind(output_dir):
-        if checkpoint["global_step"] >= plain["max_steps"]:
+        clock = checkpoint.get("callbacks", {}).get("BudgetClock")  # it moves the end
+        if checkpoint["global_step"] >= (round(clock["end"]) if clock else plain["trainer"]["max_steps"]):
             continue
         stored = checkpoint[CHECKPOINT_KEY]["recipe"]
-        found = with_effects(plain | {"ckpt": str(path)}, data)
-        changed = sorted(key for key in found.keys() - NOT_LEARNED if found[key] != stored.get(key))
+        changed = assembly.changed(plain, stored) if "verdicts" in stored else []
+        if not changed:
+            found = with_effects(plain | {"ckpt": str(path)}, data)
+            changed = sorted(key for key in found.keys() - NOT_LEARNED if found[key] != stored.get(key))
         if not changed:
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return found
@@ -298,16 +307,33 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
     Thermal model, sensor and loss then stand in it as they are built, and "verdicts" says why. A run that goes on from a
     checkpoint takes all that from there.
     """
+    from heatsplat.contracts import SceneError
     from heatsplat.effects import assembly
 
     if not assembly.chooses(plain):
         return plain
+    idle = [
+        text
+        for text in task_overrides()
+        if text.lstrip("+~").startswith(("thermal.", "thermal=", "sensor.", "sensor="))
+    ]
+    if idle:
+        raise SceneError(
+            f"{idle[0]} would be replaced: effects={plain['effects']['select']} puts thermal model and sensor together. Set its "
+            "parts by effects.states.*, effects.parts.* and effects.sensor.*, or choose a method that has its own."
+        )
     if plain["ckpt"] is not None:
         from heatsplat.training.module import CHECKPOINT_KEY
         from heatsplat.training.session import load_checkpoint
 
         stored = load_checkpoint(plain["ckpt"]).get(CHECKPOINT_KEY, {}).get("recipe", {})
         if "verdicts" in stored:
+            changed = assembly.changed(plain, stored)
+            if changed:
+                raise SceneError(
+                    f"{plain['ckpt']} was trained with another {', '.join(changed)}: give what it was trained with, or start "
+                    "anew without ckpt"
+                )
             return assembly.filled(plain, stored, stored["verdicts"])
 
     from heatsplat.effects.catalogue import decide

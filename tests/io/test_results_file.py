@@ -71,11 +71,30 @@ def test_nothing_is_null_without_a_reason():
     assert results.reasons == {}
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"test": {}}'])
-def test_a_broken_file_is_named(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"{", "Expecting property name"),
+        (b"[]", "sections are missing or no mappings: run, test"),
+        (b'{"test": {}}', "no mappings: run, cost"),
+        (b'\xff{"test": {}}', "can't decode byte"),
+        (b"3", "not iterable"),
+    ],
+)
+def test_a_broken_file_is_named(tmp_path, content, why):
     path = tmp_path / "metrics.json"
-    path.write_text(content)
-    with pytest.raises(ValueError, match=f"{path.name} is not a metrics.json"):
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"{path.name} is not a metrics.json of heatsplat: .*{why}"):
+        RunResults.read(path)
+
+
+@pytest.mark.parametrize("change", [{"test": None}, {"test": {"psnr": "31"}}, {"cost": {"gaussians": math.nan}}])
+def test_a_file_with_other_things_in_a_section_is_named(tmp_path, change):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(filled().as_json() | change))
+    with pytest.raises(
+        ValueError, match=r"metrics.json is not .*(no mappings: test|psnr is neither|gaussians is neither)"
+    ):
         RunResults.read(path)
 
 

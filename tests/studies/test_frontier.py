@@ -1,26 +1,39 @@
 """The frontier of finished runs: what is read, who lies on the front, time to a quality, and what is written."""
 
 import csv
+import itertools
+import json
 import re
 from pathlib import Path
 
 import pytest
 import yaml
+from running import compose_run
 
+from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.studies.frontier import dominated, group, read_runs, run, seconds_to
 
+CONFIG = Path(cli.CONF) / "study" / "frontier.yaml"
+LEVELS = {"psnr_levels_db": [25, 30], "mae_levels_c": [15, 10]}
+
 
 def made(
-    folder: Path, method: str, overrides: list[str], course: list[tuple[float, float]], seconds: float, psnr: float
+    folder: Path,
+    method: str,
+    overrides: list[str],
+    course: list[tuple[float, float]],
+    seconds: float,
+    psnr: float,
+    **data: object,
 ):
-    """A run's folder, as far as the frontier reads it."""
+    """A run's folder, as far as the frontier reads it; ``data`` is what the results say of the data."""
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"method={method}", *overrides]))
     rows = ["step,train_seconds,gaussians,psnr,mae_c", *(f"1,{s},10,{v},{40 - v}" for s, v in course), "9,,10,99,0"]
     (folder / "curve.csv").write_text("\n".join(rows) + "\n")
-    results = RunResults(run={"scene": "cooling", "method": method})
+    results = RunResults(run={"scene": "cooling", "method": method}, data=data)
     results.put("test", "psnr", psnr)
     results.put("test", "mae_c", 40 - psnr)
     results.put("cost", "train_seconds", seconds)
@@ -66,7 +79,7 @@ def test_time_to_a_quality_lies_on_the_line_between_validations():
 
 
 def test_tables_pictures_and_a_page_that_needs_nothing_else(runs, tmp_path):
-    run(tmp_path / "out", [str(runs)])
+    run(tmp_path / "out", [str(runs), str(runs / "sweep")], **LEVELS)  # a run counts once
     text = (tmp_path / "out" / "frontier.md").read_text()
     assert "| etgs | 2 | 5.0 | 31.00 ± 1.41 |" in text and "| PSNR, MAE |" in text
     assert re.search(r"\| seconds to \|.* 25 dB \|.* 30 dB \|", text) and "| 3dgs |" in text
@@ -81,4 +94,145 @@ def test_tables_pictures_and_a_page_that_needs_nothing_else(runs, tmp_path):
 
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"there is no finished run .*Give folders that src/train.py wrote"):
-        run(tmp_path / "out", str(tmp_path))
+        run(tmp_path / "out", str(tmp_path), **LEVELS)
+
+
+def measured(size: str, test: int, *more: str, split: str = "every_8th") -> dict:
+    """What results say of views of a size."""
+    return {"image_sizes": [size, *more], "views": {"train": 9, "val": 2, "test": test}, "split": split}
+
+
+def names_by_panel(folder: Path) -> dict[str, set[str]]:
+    panels: dict[str, set[str]] = {}
+    for recipe in group(read_runs(folder)):
+        panels.setdefault(recipe.scene, set()).add(recipe.name)
+    return panels
+
+
+def test_runs_that_measured_other_images_have_panels_of_their_own(tmp_path):
+    """A front of tiny and large images of one scene would say nothing."""
+    for size, shown, test in (("tiny", "64x52", 3), ("demo", "160x128", 9)):
+        for method, psnr in (("etgs", 30.0), ("3dgs", 25.0)):
+            folder = tmp_path / f"{method}_{size}"
+            made(folder, method, [f"data.size={size}", "max_steps=9"], [], 1.0, psnr, **measured(shown, test))
+    made(tmp_path / "half", "etgs", ["data.downscale=2"], [], 9.0, 20.0, **measured("80x64", 9))
+    recipes = group(read_runs(tmp_path))
+    assert {recipe.scene for recipe in recipes} == {
+        f"cooling, image size {text}" for text in ("64x52", "160x128", "80x64")
+    }
+    best = {(recipe.scene, recipe.name) for recipe in recipes if recipe.on_front["psnr"]}
+    assert ("cooling, image size 64x52", "etgs max_steps=9") in best and ("cooling, image size 80x64", "etgs") in best
+
+
+def test_images_that_only_training_sees_smaller_are_compared(tmp_path):
+    made(tmp_path / "a", "supirgs", [], [], 1.0, 30.0, **measured("160x128", 9, "40x32"))
+    made(tmp_path / "b", "bicubic_3dgs", [], [], 2.0, 25.0, **measured("160x128", 9))
+    assert names_by_panel(tmp_path) == {"cooling": {"supirgs", "bicubic_3dgs"}}
+
+
+def test_titles_say_as_much_as_tells_panels_apart(tmp_path):
+    made(tmp_path / "a", "etgs", [], [], 1.0, 30.0, **measured("64x52", 9))
+    made(tmp_path / "b", "etgs", [], [], 1.0, 30.0, **measured("64x52", 3))
+    for name, position in (("c", 0.0), ("d", 1.0)):
+        place = tmp_path / name
+        made(place, "etgs", [f"data.split_position={position}"], [], 1.0, 30.0, **measured("64x52", 3, split="block"))
+        (place / ".hydra" / "config.yaml").write_text(yaml.safe_dump({"data": {"split_position": position}}))
+    few = "cooling, test views 3, split"
+    assert names_by_panel(tmp_path) == {
+        "cooling, test views 9": {"etgs"},
+        f"{few} every_8th": {"etgs"},
+        f"{few} block, data.split_position 0.0": {"etgs"},
+        f"{few} block, data.split_position 1.0": {"etgs"},
+    }
+
+
+def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
+    """Only settings are left out of names, whatever stands in a row's name."""
+    for i, (k, steps) in enumerate(((8, 9), (8, 9), (24, 9), (24, 18))):
+        made(
+            tmp_path / str(i),
+            "etgs",
+            [f"thermal.frequencies={k}", f"max_steps={steps}", f"row='K = {k}'"],
+            [],
+            1.0,
+            30.0,
+        )
+    assert names_by_panel(tmp_path) == {
+        "cooling": {"etgs, K = 8", "etgs, K = 24, max_steps=9", "etgs, K = 24, max_steps=18"}
+    }
+    (eight,) = (recipe for recipe in group(read_runs(tmp_path)) if recipe.name == "etgs, K = 8")
+    assert len(eight.runs) == 2
+
+
+def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
+    made(tmp_path / "a", "etgs", ["max_steps=9", "seed=0", "data.scene_seed=0"], [], 1.0, 30.0)
+    made(tmp_path / "b", "etgs", ["seed=1", "data.scene_seed=1", "max_steps=9", "ckpt=runs/last.ckpt"], [], 1.0, 32.0)
+    made(
+        tmp_path / "c",
+        "etgs",
+        ["test=true", "max_steps=9", "table.scenes=[wall]", "experiment=table_etgs_1"],
+        [],
+        1.0,
+        31.0,
+    )
+    (recipe,) = group(read_runs(tmp_path))
+    assert recipe.name == "etgs max_steps=9" and len(recipe.runs) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        (METRICS_FILE, "{", "is not a metrics.json of heatsplat"),
+        (METRICS_FILE, '{"run": {"scene": "cooling"}}', "sections are missing or no mappings: test, cost"),
+        ("curve.csv", "train_seconds,psnr\n1.0,many\n", "could not convert string to float"),
+        (".hydra/overrides.yaml", "[", "while parsing"),
+    ],
+)
+def test_a_run_that_cannot_be_read_is_left_out_with_a_warning(runs, tmp_path, caplog, name, content, why):
+    (runs / "sweep" / "b" / name).write_text(content)
+    with caplog.at_level("WARNING", logger="heatsplat"):
+        recipes = run(tmp_path / "out", str(runs), **LEVELS)
+    assert {recipe.name for recipe in recipes} == {"etgs", "3dgs thermal.sh_degree=2"}
+    (warning,) = caplog.messages
+    assert warning.startswith(f"{runs / 'sweep' / 'b'} is left out: ") and why in warning
+
+
+def test_where_no_run_can_be_read_the_folder_and_the_remedy_are_named(tmp_path):
+    made(tmp_path / "old", "etgs", [], [(1, 20)], 5.0, 30.0)
+    content = json.loads((tmp_path / "old" / METRICS_FILE).read_text())
+    del content["effects"]
+    (tmp_path / "old" / METRICS_FILE).write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=rf"runs={tmp_path}: there is no finished run .* must be trained again"):
+        run(tmp_path / "out", str(tmp_path), **LEVELS)
+
+
+def test_levels_are_those_asked_for(runs, tmp_path):
+    run(tmp_path / "out", str(runs), psnr_levels_db=[29, 21.5], mae_levels_c=[])
+    text = (tmp_path / "out" / "frontier.md").read_text()
+    assert "| seconds to | 21.5 dB | 29 dB |\n" in text
+
+
+@pytest.mark.parametrize("levels", [30, None, "30", [20, -1], [True], ["20"], [float("nan")], {"a": 1}])
+@pytest.mark.parametrize("name", LEVELS)
+def test_levels_that_are_none_are_refused(runs, tmp_path, name, levels):
+    with pytest.raises(SceneError, match=rf"study.{name}=.*give positive numbers in brackets, such as \[1, 2\]"):
+        run(tmp_path / "out", str(runs), **LEVELS | {name: levels})
+
+
+def test_the_commands_in_the_configuration_make_runs_that_compose(tmp_path):
+    """Every combination of the sweeps that the file shows, as the sweeper makes them."""
+    commands = re.findall(r"^# +python src/train.py -m (.+)$", CONFIG.read_text(), re.MULTILINE)
+    assert len(commands) == 2
+    for command in commands:
+        given = [text.partition("=")[::2] for text in command.split() if not text.startswith("hydra.")]
+        jobs = list(itertools.product(*([f"{key}={value}" for value in values.split(",")] for key, values in given)))
+        for job in (jobs[0], jobs[-1], *[job for job in jobs if job[0] != jobs[0][0]][:1]):
+            assert compose_run(tmp_path, *job).max_steps in (1000, 3000)
+    (study,) = re.findall(
+        r"^# +python src/study.py (study=frontier study.runs=\w\S+)$", CONFIG.read_text(), re.MULTILINE
+    )
+    composed = compose_run(tmp_path, *study.split(), config_name="study")
+    assert (
+        f"hydra.sweep.dir={composed.study.runs}" in commands[0]
+        and f"hydra.sweep.dir={composed.study.runs}" in commands[1]
+    )

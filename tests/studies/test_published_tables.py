@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra.core.hydra_config import HydraConfig
 from running import compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.studies.published import Plan, make_plan
-from heatsplat.studies.published.comparison import compare, markdown, write_comparison
+from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
 from heatsplat.studies.sweeps import Row
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,6 +197,49 @@ def test_methods_beyond_the_paper_join_its_table(tmp_path):
 def test_what_does_not_exist_is_named_with_what_does(name, given, changes, message):
     with pytest.raises(SceneError, match=message):
         plan_of(name, None, given, **changes)
+
+
+@pytest.mark.parametrize("knob", ["seed=0,1", "optim.decay=1.0,0.5"])
+def test_every_job_of_a_table_has_a_folder_of_its_own(knob, tmp_path):
+    """Names are cut, and a seed or a knob may stand behind the cut; without their own folders, jobs are taken for done."""
+    root = everything(tmp_path, "ravigs_4")
+    plan = plan_of("ravigs_4", root, settings=["baseline", "grad"], scenes=["double_robot"])
+    key, _, values = knob.partition("=")
+    folders = []
+    for run in plan.runs:
+        for value in values.split(","):
+            given = ["max_steps=3000", f"{key}={value}", f"data.root={root}", "callbacks.images=null"]
+            compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
+            folders.append(HydraConfig.get().sweep.subdir)
+    assert len(folders) == 4 == len(set(folders))
+    assert all(
+        folder.startswith(f"{run.row}_double_robot_") for folder, run in zip(folders[::2], plan.runs, strict=True)
+    )
+    assert max(len(folder.encode()) for folder in folders) < 200
+    compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
+    assert HydraConfig.get().sweep.subdir == folders[-1]  # so that a stopped sweep goes on
+
+
+def test_runs_of_one_row_with_other_settings_have_lines_of_their_own(tmp_path):
+    """A folder that two commands filled."""
+    plan = plan_of("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
+    found = [
+        Row("etgs", "cooling_bench", {"psnr": [38.0]}, 1, other="max_steps=300"),
+        Row("etgs", "cooling_bench", {"psnr": [39.0]}, 1, other="max_steps=3000"),
+        Row("3dgs", "cooling_bench", {"psnr": [30.0]}, 1),
+    ]
+    lines = compare_all(plan, found)
+    text = markdown(plan, lines)
+    assert "| cooling_bench | etgs, max_steps=300 | 38.00 / 38.25 (-0.25) |" in text
+    assert "| cooling_bench | etgs, max_steps=3000 | 39.00 / 38.25 (+0.75) |" in text
+    assert "| cooling_bench | 3dgs | 30.00 / " in text and "| cooling_bench | mip_splatting | – / " in text
+    assert len([line for line in lines if line.scene == "cooling_bench"]) == 1 + len(compare_at(plan, "cooling_bench"))
+    assert sum(line.scene == "mean of the scenes that ran" for line in lines) == 3
+    assert compare_all(plan, found[2:]) == compare(plan, {("3dgs", "cooling_bench"): found[2]})
+
+
+def compare_at(plan: Plan, scene: str) -> list:
+    return [line for line in compare(plan, {}) if line.scene == scene]
 
 
 def results(scene: str, row: str, **values: float | list[float]) -> dict:

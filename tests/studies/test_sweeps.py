@@ -1,5 +1,6 @@
 """Sweeps: named rows times a grid, the table at the end, failed jobs, and continuing where one stopped."""
 
+import ast
 import csv
 import os
 import subprocess
@@ -8,10 +9,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra.core.utils import JobReturn, JobStatus
 from running import compose_run
 
+from heatsplat import cli
 from heatsplat.io.results import METRICS_FILE, RunResults
-from heatsplat.studies.sweeps import collect, row_name, write_sweep
+from heatsplat.studies.sweeps import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, collect, row_name, write_sweep
+from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
 ABLATIONS = sorted((ROOT / "conf" / "ablation").glob("*.yaml"))
@@ -71,6 +75,131 @@ def test_a_folder_without_jobs_has_no_table(tmp_path):
 def test_a_job_of_a_grid_is_named_by_what_it_sets():
     assert row_name({"method": "etgs", "seed": "1", "thermal.frequencies": "8"}) == "etgs thermal.frequencies=8"
     assert row_name({"seed": "1", "data.scene": "cooling"}) == "run"
+
+
+def test_what_makes_no_other_recipe_is_not_in_a_name():
+    same = (
+        "ckpt=x.ckpt",
+        "test=false",
+        "data.scene_seed=3",
+        "data.seed=3",
+        "++seed=1",
+        "table.scenes=[wall]",
+        "threads=1",
+    )
+    assert row_name(dict(text.partition("=")[::2] for text in ("method=etgs", *same))) == "etgs"
+    one, other = {"b": "1", "a": "2"}, {"a": "2", "b": "1"}
+    assert row_name(one) == row_name(other) == "a=2 b=1"
+
+
+def test_what_runs_may_differ_in_when_they_go_on_and_what_folders_leave_out_makes_no_row():
+    known = NOT_A_ROW | NOT_WHAT_WAS_LEARNED
+    assert known >= cli.NOT_LEARNED
+    train = yaml.safe_load((ROOT / "conf" / "train.yaml").read_text())
+    left_out = train["hydra"]["job"]["config"]["override_dirname"]["exclude_keys"]
+    assert {key for key in left_out if key not in known and key.partition(".")[0] not in known} == set()
+
+
+def test_jobs_of_one_row_with_other_settings_are_rows_of_their_own(tmp_path):
+    """A folder that two commands filled: means over both lengths would be of nothing."""
+    for number, (steps, seed, k) in enumerate(((9, 0, 8), (9, 1, 8), (99, 0, 8), (9, 0, 24), (9, 1, 24))):
+        own = [
+            f"thermal.frequencies={k}",
+            f"seed={seed}",
+            f"max_steps={steps}",
+            "callbacks.images=null",
+            f"row='K = {k}'",
+        ]
+        job(tmp_path, number, own, 30.0 + steps + seed)
+    rows = {row.label: row for row in collect(tmp_path)}
+    assert list(rows) == ["K = 8, max_steps=9", "K = 8, max_steps=99", "K = 24"]
+    assert [row.jobs for row in rows.values()] == [2, 1, 2] and rows["K = 8, max_steps=9"].mean("psnr") == 39.5
+    write_sweep(tmp_path, ["K = 24", "K = 8"], {"K = 8": "40.57 dB"})
+    text = (tmp_path / "table.md").read_text()
+    assert "| K = 8, max_steps=99 | 1 | 129.00 |" in text and text.count("40.57 dB") == 2
+    assert text.index("| K = 24 |") < text.index("| K = 8, max_steps=9 |")
+
+
+def test_a_row_of_several_methods_is_a_row_for_each(tmp_path):
+    for number, method in enumerate(("etgs", "3dgs")):
+        job(tmp_path, number, [f"method={method}", "row=plain"], 30.0 + number)
+    assert {row.label: row.mean("psnr") for row in collect(tmp_path)} == {"plain, etgs": 30.0, "plain, 3dgs": 31.0}
+
+
+def test_results_that_cannot_be_read_are_told_beside_the_others(sweep):
+    damaged = next(path for path in sweep.iterdir() if "_1_" in path.name)
+    (damaged / METRICS_FILE).write_text("{")
+    rows = {row.label: row for row in collect(sweep)}
+    assert rows["K = 24"].jobs == 1
+    (reason,) = rows["K = 24"].failed
+    assert f"{damaged / METRICS_FILE} is not a metrics.json" in reason and "Delete the folder" in reason
+
+
+@pytest.mark.parametrize("name", ["METRICS_FILE", "CURVE_FILE", "FAILED"])
+def test_studies_read_files_by_the_names_that_io_gives_them(name):
+    package = ROOT / "src" / "heatsplat"
+    defined = [
+        path.relative_to(package).as_posix()
+        for path in sorted([*(package / "io").rglob("*.py"), *(package / "studies").rglob("*.py")])
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.Assign) and any(isinstance(one, ast.Name) and one.id == name for one in node.targets)
+    ]
+    assert defined == ["io/results.py"]
+
+
+def test_folders_have_names_that_are_cut_and_still_differ():
+    short = "max_steps=3000,seed=0"
+    assert folder_name(short) == short
+    long = "loss.terms.guided_variation=null," * 6
+    names = [folder_name(f"{long}seed={seed}") for seed in range(9)]
+    assert len(set(names)) == 9 and max(map(len, names)) <= 120
+    assert all(name.startswith(long[:50]) and f",seed={seed}-" in name for seed, name in enumerate(names))
+    assert folder_name(f"{long}seed=3") == names[3]  # a sweep that is started again finds its folders
+    assert folder_name(f"seed=0,{long}x=1") != folder_name(
+        f"seed=0,{long.replace('null', '0', 4)}x=1"
+    )  # alike at both ends
+    inside = {
+        folder_name("ckpt=runs/last.ckpt"),
+        folder_name("ckpt=runs-last.ckpt"),
+        folder_name("ckpt=runs\\last.ckpt"),
+    }
+    assert len(inside) == 3 and not any("/" in name for name in inside)
+
+
+class Remembering:
+    """A launcher whose second job fails."""
+
+    def __init__(self) -> None:
+        self.batches: list[tuple[int, list[str]]] = []
+
+    def launch(self, job_overrides: list[list[str]], initial_job_idx: int) -> list[JobReturn]:
+        self.batches.append((initial_job_idx, [" ".join(job) for job in job_overrides]))
+        returned = [JobReturn(overrides=job, status=JobStatus.COMPLETED) for job in job_overrides]
+        for job in returned:
+            if job.overrides == ["seed=1"]:
+                job.status = JobStatus.FAILED
+                job.return_value = RuntimeError("no points")
+        return returned
+
+
+def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the_end(tmp_path, monkeypatch):
+    config = compose_run(tmp_path, "method=3dgs")
+    # Imported here: composing loads plugins, and with them the classes that sweep, anew.
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+    from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
+
+    launcher = Remembering()
+    monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **settings: launcher)
+    monkeypatch.setattr(BasicSweeper, "validate_batch_is_legal", lambda self, batch: None)
+    sweeper = RowSweeper(max_batch_size=2)
+    config.hydra = {"sweep": {"dir": str(tmp_path)}}
+    context = type("Context", (), {"config_loader": None})()
+    sweeper.setup(hydra_context=context, task_function=None, config=config)
+    with pytest.raises(RuntimeError, match="no points"):
+        sweeper.sweep(["seed=0,1,2,3,4"])
+    assert launcher.batches == [(0, ["seed=0", "seed=1"]), (2, ["seed=2", "seed=3"]), (4, ["seed=4"])]
+    with pytest.raises(ValueError, match="max_batch_size must be 1 or more, or null for all, got 0"):
+        RowSweeper(max_batch_size=0)
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)

@@ -1,6 +1,7 @@
 """Composed models: what is off is absent, and what each part does."""
 
 import math
+from collections import Counter
 
 import pytest
 import torch
@@ -128,13 +129,21 @@ def test_without_a_heat_source_there_is_no_tensor_of_one():
 
 
 def test_conduction_that_is_off_leaves_the_state_alone():
-    with_it = Conducting(NewtonHarmonic(frequencies=4))
+    alone, with_it = NewtonHarmonic(frequencies=4), Conducting(NewtonHarmonic(frequencies=4))
+    alone.prepare(scene())
     with_it.prepare(scene())
     never = made("harmonic")
     splats = splats_of(never)
-    assert splats_of(with_it).names == splats.names
-    assert {n for n, _ in with_it.named_parameters()} == {"log_flow"}
-    assert len(operators(with_it, splats)) > len(operators(never, splats))
+    assert splats_of(with_it).names == splats_of(alone).names == splats.names
+    assert not list(never.parameters()) and {n for n, _ in with_it.named_parameters()} == {"log_flow"}
+    extra = {n.removeprefix("state.") for n, _ in with_it.named_buffers()} - {n for n, _ in alone.named_buffers()}
+    assert extra == {"edges", "joined"}
+    with_it.features(splats, query())  # draws its graph
+    expected, seen, more = (operators(model, splats) for model in (alone, never, with_it))
+    assert seen == expected
+    assert not (Counter(expected) - Counter(more)) and {"_ImplicitStep", "_ImplicitStepBackward"} <= set(more) - set(
+        seen
+    )
 
 
 # Parts --------------------------------------------------------------------------------------------------

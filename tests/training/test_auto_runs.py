@@ -89,6 +89,20 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
     assert len(scene_says) == 1  # the choice is the checkpoint's
     weights, again = module.state_dict(), resumed.state_dict()
     assert weights.keys() == again.keys() and all(torch.equal(weights[name], again[name]) for name in weights)
+    for other in ("effects.agc=off", "loss.terms.photometric.dssim_weight=0.9"):
+        with pytest.raises(SceneError, match=f"step_000006.ckpt was trained with another {other.partition('=')[0]}"):
+            run(tmp_path / "other", *overrides, f"ckpt={half}", other)
+    last.unlink()  # as if it had been stopped after step 6
+    for more, goes_on in (((), True), (("effects.agc=off",), False)):
+        config = cli.resolved(compose_run(tmp_path / "whole", *overrides, *more))
+        assert (cli.begun(config, cli.build(config["data"]), tmp_path / "whole") is not None) == goes_on
+
+
+def test_what_the_choice_would_replace_is_refused(scene_says, tmp_path):
+    with pytest.raises(SceneError, match="thermal.clip=hard would be replaced: .* effects.states"):
+        run(tmp_path, *SHORT, "method=auto", "thermal.clip=hard")
+    with pytest.raises(SceneError, match="sensor=frame_offset would be replaced"):
+        run(tmp_path, *SHORT, "method=auto", "sensor=frame_offset")
 
 
 def test_none_is_3dgs_to_the_last_bit(scene_says, tmp_path):
@@ -100,6 +114,15 @@ def test_none_is_3dgs_to_the_last_bit(scene_says, tmp_path):
     assert len(list(none.parameters())) == len(list(plain.parameters()))
     for name in plain.splats.names:
         assert torch.equal(none.splats[name], plain.splats[name])
+
+
+def test_the_selection_of_etgs_is_etgs_to_the_last_bit(scene_says, tmp_path):
+    same = (*SHORT, "test=false", "data.scene=heated", "loss.terms.photometric.dssim_half=true")
+    chosen, _ = run(tmp_path / "chosen", *same, "method=auto", "effects=etgs", "effects.price=false")
+    method, _ = run(tmp_path / "method", *same, "method=etgs")
+    assert chosen.splats.names == method.splats.names and "source_gains" in chosen.splats.names
+    for name in method.splats.names:
+        assert torch.equal(chosen.splats[name], method.splats[name])
 
 
 def test_everything_at_once_trains(scene_says, tmp_path):

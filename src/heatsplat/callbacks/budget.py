@@ -166,6 +166,7 @@ class BudgetClock(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
+        # The command line reads the end: a run that is over is not gone on with (``heatsplat.cli.begun``).
         return {"from": list(self._from), "end": self._end, "held": self._held}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

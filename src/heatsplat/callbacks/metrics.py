@@ -12,7 +12,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.contracts import SceneData
-from heatsplat.io.results import write_atomically
+from heatsplat.io.results import CURVE_FILE, write_atomically
 from heatsplat.metrics import (
     DEFINITIONS,
     IMAGE_SCORES,
@@ -23,7 +23,6 @@ from heatsplat.metrics import (
     scene_threshold,
 )
 
-CURVE_FILE = "curve.csv"
 TEST_FILE = "test_per_image.csv"
 CURVE_COLUMNS = ("step", "train_seconds", "gaussians", *DEFINITIONS)
 

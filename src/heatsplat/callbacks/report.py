@@ -224,7 +224,7 @@ def report(
 
 
 EFFECTS_NOTE = (
-    "An effect is simulated where its statistic, in units of its own noise, exceeds the threshold; no number stands where it "
+    "An effect is simulated where its statistic exceeds the threshold; no number stands where it "
     "was asked for or the data cannot say. What is off is absent: no parameter, no operation. Parameters are those of the "
     "Gaussians at the end. Milliseconds per step: whole training steps on the Gaussians of the start, with all effects and "
     "without the one (and what stands on it), by turns; quickest against quickest, so a few hundredths are noise."

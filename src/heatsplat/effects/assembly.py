@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
@@ -26,6 +26,7 @@ CAMERA = {
     "tone": ("tone",),
 }
 SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each wishes of an effect of which nothing is said
+SCENE_SAYS = "scene"  # value of a setting that the evidence chooses; without evidence it is the class's own default
 
 
 def wishes(effects: Mapping[str, Any]) -> dict[str, str]:
@@ -64,25 +65,36 @@ def chooses(config: Mapping[str, Any]) -> bool:
     """
     effects, method = config["effects"], config["name"]
     chosen, composed = effects["select"] != "method", "state" in config["thermal"] and "parts" in config["thermal"]
+    if composed and not chosen:
+        raise SceneError(
+            f"effects=method leaves method={method} without effects: it has none of its own. Give effects=auto, all, none "
+            "or a paper's selection (etgs, ravigs, ti3dgs, thermogs, supirgs)."
+        )
     if chosen and not composed:
         raise SceneError(
             f"effects={effects['select']} chooses the parts of method=auto, but method={method} has its own; "
-            "use method=auto, or leave effects out."
+            "give method=auto, or leave effects out."
         )
-    asked = [] if chosen else sorted(explicit(effects))
+    asked = {} if chosen else explicit(effects)
     if asked:
+        name, wish = next(iter(asked.items()))
         raise SceneError(
-            f"effects.{asked[0]} is asked for, but method={method} simulates what its paper does; use method=auto "
-            f"effects=none effects.{asked[0]}=on, or the method's own options (thermal.*, sensor.*)."
+            f"effects.{name}={wish} is asked for, but method={method} simulates what its paper does. Give method=auto with "
+            f"that paper's selection and your wish, such as method=auto effects=etgs effects.{name}={wish} (etgs, ravigs, "
+            "ti3dgs, thermogs, supirgs), or the method's own options (thermal.*, sensor.*)."
         )
     return chosen
 
 
 def possible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
-    """The verdicts, without an opacity for each image where there is only one image."""
+    """The verdicts, without an opacity for each image where a view has only one image."""
     found = dict(verdicts)
-    if found["thermal_opacity"].on and any(len(part) and part[0].rgb is None for part in (scene.train, scene.test)):
-        found["thermal_opacity"] = replace(found["thermal_opacity"], on=False, reason="there are no visible images")
+    if found["thermal_opacity"].on:
+        views = (view for part in (scene.train, scene.val, scene.test) for view in part)
+        bare = next((view.frame.name for view in views if view.rgb is None), None)
+        if bare is not None:
+            reason = f"view {bare} has no visible image, which every view needs"
+            found["thermal_opacity"] = replace(found["thermal_opacity"], on=False, reason=reason)
     return found
 
 
@@ -107,12 +119,12 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
 
     def turn(name: str, on: bool, reason: str) -> None:
         if given.get(name) == ("off" if on else "on"):
-            raise SceneError(f"effects.{name}={given[name]} cannot be had: {reason}")
+            raise SceneError(f"effects.{name}={given[name]} cannot be had: {reason}; leave it out or change the other")
         found[name] = replace(found[name], on=on, reason=reason)
 
     for name, wish in given.items():
         if wish == "on" and not found[name].on:
-            raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}")
+            raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}; add that, or leave it out")
     driven = [name for name in WEATHER_DRIVEN if found[name].on]
     if driven and found["harmonic_source"].on:
         wanted = given.get("harmonic_source") == "on" and not any(given.get(name) == "on" for name in driven)
@@ -144,7 +156,7 @@ def recipe(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dic
     Args:
         verdicts: reconciled.
         templates: every part with its settings, the group "effects" of a configuration (conf/effects/shared/parts.yaml);
-            what a verdict says a part should start from replaces them.
+            what a verdict says a part should start from stands where they say "scene".
 
     Raises:
         SceneError: a verdict says something of a part that is none of its settings.
@@ -164,8 +176,34 @@ def recipe(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dic
     return {"thermal": thermal, "sensor": sensor, "loss": loss}
 
 
+def asked(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run's configuration, as composed, says of effects, their parts and the loss; pricing decides nothing."""
+    effects = {key: value for key, value in config["effects"].items() if key != "price"}
+    return deepcopy({"effects": effects, "loss": config["loss"]})
+
+
+def changed(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
+    """Keys of what was asked for (``asked``) that differ between a configuration and a run's recipe.
+
+    Whole numbers do not count where "max_steps" differs: many are shares of it.
+    """
+    before, now = (dict(_leaves(one)) for one in (stored.get("asked", asked(config)), asked(config)))
+    longer = config["max_steps"] != stored.get("max_steps")
+    keys = [key for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
+    return [key for key in keys if not (longer and all(type(one.get(key)) is int for one in (before, now)))]
+
+
+def _leaves(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of nested mappings by dotted key."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
 def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's configuration with these parts in it, and the verdicts that led to them; templates are left out.
+    """A run's configuration with these parts in it, the verdicts that led to them, and what was asked for.
 
     Args:
         config: as composed.
@@ -183,6 +221,7 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
         "module": {**config["module"], **changed},
         "effects": effects,
         "verdicts": dict(verdicts),
+        "asked": asked(config),
     }
 
 
@@ -249,11 +288,12 @@ def _camera(verdicts: Mapping[str, Verdict], parts: Mapping[str, Any]) -> dict[s
 
 
 def _set(template: Mapping[str, Any], verdicts: Mapping[str, Verdict], names: Collection[str]) -> dict[str, Any]:
-    """A part's settings, with what the verdicts of ``names`` say of it."""
+    """A part's settings, with what the verdicts of ``names`` say of it where they leave that to the scene."""
     settings = dict(template)
     for name in names:
         for key, value in verdicts[name].settings.items():
             if key not in settings:
                 raise SceneError(f"the evidence on {name} sets '{key}', which {settings['_target_']} does not have")
-            settings[key] = value
-    return settings
+            if settings[key] == SCENE_SAYS:
+                settings[key] = value
+    return {key: value for key, value in settings.items() if value != SCENE_SAYS}

@@ -19,8 +19,9 @@ class Evidence:
     """What the data say about an effect.
 
     Args:
-        statistic: a number that is at most about 1 under the null hypothesis, in units of its own noise; None where the
-            data cannot say anything (metadata that is missing, no time, one modality).
+        statistic: a number that stays below the effect's threshold under the null hypothesis; 0 where what was found is too
+            small or belongs to another effect, as the reason says; None where the data cannot say anything (metadata that
+            is missing, no time, one modality).
         reason: the sentence behind it, with the figures in their units.
         settings: what the effect should start from or be limited to, such as {"frequencies": 8}.
     """

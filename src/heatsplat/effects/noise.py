@@ -17,36 +17,51 @@ _FLATTEST = 0.25
 _UNIFORM = 1.0 / math.sqrt(12.0)
 
 
-def noise_of(images: Tensor, step: float = 0.0) -> float:
+def noise_of(images: Tensor, step: float = 0.0, masks: Tensor | None = None) -> float:
     """Standard deviation of the noise of a pixel in image units: the median over images [F, H, W].
+
+    Only pixels count whose neighbours all count by ``masks`` [F, H, W] (bool; None: all do).
 
     **Convention:** never below that of rounding to steps of ``step``; a sensor cannot be judged finer than its files.
     """
+    least = max(_UNIFORM * step, 1e-6)
     if min(images.shape[1:]) < 5:
-        return max(_UNIFORM * step, 1e-6)
-    single = [_of_one(image) for image in images]
-    return max(float(torch.tensor(single).median()), _UNIFORM * step, 1e-6)
+        return least
+    whole = torch.ones_like(images, dtype=torch.bool) if masks is None else _whole(masks)
+    single = [
+        _of_one(image, used[1:-1, 1:-1]) for image, used in zip(images, whole, strict=True) if used[1:-1, 1:-1].any()
+    ]
+    return max(float(torch.tensor(single).median()), least) if single else least
 
 
-def noise_of_repeats(images: Tensor) -> float:
+def noise_of_repeats(images: Tensor, masks: Tensor | None = None) -> float:
     """Standard deviation of the noise of a pixel from images [F, H, W] of a still scene by a still camera.
 
-    Successive differences with their median taken away, so that a drift of the whole image does not count.
+    Successive differences with their median taken away, so that a drift of the whole image does not count; pixels that do
+    not count by ``masks`` [F, H, W] (bool; None: all do) are left out.
     """
     steps = images.diff(dim=0).flatten(1).double()
-    steps = steps - steps.median(dim=1, keepdim=True).values
-    return float(_MAD_TO_SIGMA * steps.abs().median() / math.sqrt(2.0))
+    if masks is not None:
+        steps = torch.where((masks[1:] & masks[:-1]).flatten(1), steps, torch.nan)
+    steps = steps - steps.nanmedian(dim=1, keepdim=True).values
+    spread = float(_MAD_TO_SIGMA * steps.abs().nanmedian() / math.sqrt(2.0))
+    return spread if math.isfinite(spread) else 0.0
 
 
 def quantum_of(image: Tensor) -> float:
-    """The smallest step between two values of an image [H, W]: its quantisation in image units."""
+    """The smallest step between two values of an image (of any shape): its quantisation in image units."""
     levels = image.flatten().double().unique()
     gaps = levels.diff()
     gaps = gaps[gaps > 1e-7]  # float32 rounding of one level is no step
     return float(gaps.min()) if len(gaps) else 0.0
 
 
-def _of_one(image: Tensor) -> float:
+def _whole(masks: Tensor) -> Tensor:
+    """Where a pixel and its eight neighbours all count."""
+    return functional.max_pool2d((~masks)[:, None].float(), 3, stride=1, padding=1)[:, 0] == 0
+
+
+def _of_one(image: Tensor, used: Tensor) -> float:
     image = image.double()[None, None]
     response = functional.conv2d(image, _MASK[None, None])[0, 0].abs()
     smooth = functional.avg_pool2d(image, 3, stride=1)
@@ -54,5 +69,5 @@ def _of_one(image: Tensor) -> float:
         functional.pad(smooth, (1, 1, 0, 0), mode="replicate").diff(n=1, dim=3)[..., 1:],
         functional.pad(smooth, (0, 0, 1, 1), mode="replicate").diff(n=1, dim=2)[..., 1:, :],
     )[0, 0]
-    flat = gradient <= gradient.flatten().kthvalue(max(1, int(_FLATTEST * gradient.numel()))).values
+    flat = used & (gradient <= gradient[used].kthvalue(max(1, int(_FLATTEST * int(used.sum())))).values)
     return _MAD_TO_SIGMA * float(response[flat].median()) / _MASK_GAIN

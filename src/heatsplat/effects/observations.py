@@ -26,7 +26,7 @@ LEAST_PX = 8  # along the shorter side of an image
 LEAST_FRAMES = 4  # a track of fewer observations says nothing about time
 # A point is hidden where another one is nearer to the camera by this share within a cell of about two points.
 NEARER = 0.08
-STILL = 1e-6  # cameras whose matrices differ by less stand still
+STILL_PX = 0.25  # in the median over points; less is no parallax to learn from
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ class Observations:
     Args:
         scene: where it comes from.
         images: [F, H, W] thermal training images (mean over channels), at most MOST_FRAMES evenly spread.
+        masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
         noise: standard deviation of the noise of a pixel, in image units.
         still: whether all frames were taken from one place; tracks are then pixels.
@@ -77,6 +78,7 @@ class Observations:
 
     scene: SceneData
     images: Tensor
+    masks: Tensor | None
     times_s: Tensor | None
     noise: float
     still: bool
@@ -108,32 +110,35 @@ def observe(scene: SceneData) -> Observations:
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
-        return Observations(scene, nothing, None, math.nan, False, None, "no training view has a thermal image")
+        return Observations(scene, nothing, None, None, math.nan, False, None, "no training view has a thermal image")
     shape = views[0].thermal.shape[:2]
     views = [view for view in views if view.thermal.shape[:2] == shape]
     images = torch.stack([view.thermal.mean(2) for view in views]).double()
+    masks = None
+    if any(view.mask is not None for view in views):
+        everywhere = torch.ones(shape, dtype=torch.bool)
+        masks = torch.stack([everywhere if view.mask is None else view.mask for view in views])
     times = [view.time_s for view in views]
     times_s = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float64)
-    viewmats = torch.stack([view.camera.viewmat for view in views])
-    still = len(views) > 1 and bool((viewmats - viewmats[0]).abs().max() < STILL)
-    step = max(quantum_of(images[0]), quantum_of(images[-1]))
-    noise = noise_of(images, step)
+    still = len(views) > 1 and _stands_still(views, scene.points.double())
+    step = max(quantum_of(images[i] if masks is None else images[i][masks[i]]) for i in (0, -1))
+    noise = noise_of(images, step, masks)
     if still:
-        noise = max(noise_of_repeats(images), step / math.sqrt(12.0), 1e-6)
+        noise = max(noise_of_repeats(images, masks), step / math.sqrt(12.0), 1e-6)
     tracks, why = None, ""
     if len(views) < LEAST_FRAMES:
         why = f"{len(views)} training view(s) are too few to follow anything over"
     elif min(shape) < LEAST_PX:
         why = f"images of {shape[1]} x {shape[0]} pixels are too small to follow a point through"
     elif still:
-        tracks = _pixels(views, images)
+        tracks = _pixels(views, images, masks)
     elif len(scene.points) < 1:
         why = "the scene has no points to follow through the images"
     else:
         tracks = _tracks(scene.points.double(), views, images, noise)
         if tracks is None:
             why = f"no scene point is seen in {LEAST_FRAMES} or more training views"
-    return Observations(scene, images, times_s, noise, still, tracks, why)
+    return Observations(scene, images, masks, times_s, noise, still, tracks, why)
 
 
 def spread(count: int, most: int) -> list[int]:
@@ -141,7 +146,22 @@ def spread(count: int, most: int) -> list[int]:
     return sorted(set(torch.linspace(0, count - 1, min(count, most)).round().long().tolist())) if count else []
 
 
-def _pixels(views: list[View], images: Tensor) -> Tracks:
+def _stands_still(views: list[View], points: Tensor) -> bool:
+    """Whether the views were taken from one place: seen from all of them, points move by less than STILL_PX.
+
+    A reconstruction gives a tripod a little motion. Where no point is in front of all cameras, their matrices are equal.
+    """
+    cameras = [view.camera for view in views]
+    points = points[torch.tensor(spread(len(points), MOST_CANDIDATES), dtype=torch.long)]
+    seen = torch.stack([to_camera(points, camera.viewmat)[:, 2] > 1e-9 for camera in cameras]).all(0)
+    if not seen.any():
+        viewmats = torch.stack([camera.viewmat for camera in cameras])
+        return bool(torch.allclose(viewmats, viewmats[:1], rtol=0.0, atol=1e-6))
+    pixels = torch.stack([to_pixels(to_camera(points[seen], camera.viewmat), camera.K) for camera in cameras])
+    return bool((pixels - pixels[:1]).norm(dim=2).median(dim=1).values.max() < STILL_PX)
+
+
+def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
     """Tracks of a grid of pixels of a camera that stands still, one unit away."""
     count, height, width = images.shape
     every = max(1, math.ceil(math.sqrt(height * width / MOST_POINTS)))
@@ -160,7 +180,7 @@ def _pixels(views: list[View], images: Tensor) -> Tracks:
         points=camera.center + world,
         values=values,
         slopes=torch.zeros_like(values),
-        weights=ones.clone(),
+        weights=ones.clone() if masks is None else masks[:, y, x].T.double(),
         distances=ones,
         directions=-world[:, None].expand(-1, count, -1),
         positions=positions[:, None].expand(-1, count, -1),

@@ -16,7 +16,10 @@ from typing import Any
 import heatsplat
 from heatsplat.metrics import DEFINITIONS
 
+# What a run leaves in its folder, beside checkpoints and pictures.
 METRICS_FILE = "metrics.json"
+CURVE_FILE = "curve.csv"  # its validations
+FAILED = "FAILED"  # why it has no results
 
 # Keys that every metrics.json has, null with a reason where a run could not measure them.
 TEST = tuple(DEFINITIONS)
@@ -99,11 +102,23 @@ class RunResults:
         Raises:
             ValueError: the file is not one, naming it and what is wrong.
         """
+        sections = (*SECTIONS, "reasons")
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
-            return cls(**{name: content[name] for name in (*SECTIONS, "reasons")})
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is not a metrics.json of heatsplat: {type(error).__name__}: {error}") from error
+            lacking = [name for name in sections if not isinstance(dict(content).get(name), dict)]
+            if lacking:
+                raise ValueError(f"sections are missing or no mappings: {', '.join(lacking)}")
+            for section in ("test", "cost"):
+                for name, value in content[section].items():
+                    if value is not None and not (_is_number(value) and math.isfinite(value)):
+                        raise ValueError(f"{section}.{name} is neither a number nor null: {value!r}")
+        except (ValueError, TypeError) as error:  # of JSON and UTF-8, too
+            raise ValueError(f"{path} is not a metrics.json of heatsplat: {error}") from error
+        return cls(**{name: content[name] for name in sections})
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def write_atomically(path: str | Path, text: str) -> None:

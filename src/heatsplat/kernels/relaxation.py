@@ -192,7 +192,7 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
         heated = np.empty(BLOCK, np.int64)
         for j in range(stop - start):
             values[start + j] = scratch[RELAXED, j]
-        for i in range(_heated(places, ids, start, stop, heated)):
+        for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
             j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
@@ -266,7 +266,7 @@ def backward(
         scratch[SOURCE] = _f(0.0)
         scratch[SLOPE] = _f(0.0)
         heated = np.empty(BLOCK, np.int64)
-        for i in range(_heated(places, ids, start, stop, heated)):
+        for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
             j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]

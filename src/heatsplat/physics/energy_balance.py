@@ -49,7 +49,7 @@ class Surface(NamedTuple):
     Args:
         start: x at the first sample of the record, in kelvin above the reference.
         log_rate: log r, r in 1/s.
-        sun: g in K m²/kW, at least 0.
+        sun: g in K m²/kW, at least 0, or None where nothing is lit.
         share: p, or None where nothing radiates.
         wind: v, or None where wind is not known.
         normals: [n, 3] unit vectors, or None for surfaces that lie level.
@@ -57,7 +57,7 @@ class Surface(NamedTuple):
 
     start: Tensor
     log_rate: Tensor
-    sun: Tensor
+    sun: Tensor | None
     share: Tensor | None = None
     wind: Tensor | None = None
     normals: Tensor | None = None
@@ -133,64 +133,72 @@ class Climate:
         """
         take = {name: values[..., j] for name, j in self.columns.items()}
         sky = self.share_of_sky(surface.normals)
-        share = 0.0 if surface.share is None else surface.share
-        light = beam + sky * take["light"] if "light" in take else beam
-        total = surface.sun * light + (1 - share) * (1 + self._wind(surface)) * take["air"]
+        convection = self._convection(surface)
+        total = take["air"] if convection is None else convection * take["air"]
+        if surface.sun is not None:
+            total = surface.sun * (beam + sky * take["light"] if "light" in take else beam) + total
         if surface.wind is not None:
-            total = total + (1 - share) * surface.wind * (take["gusts_air"] - mean * take["gusts"])
+            gusty = surface.wind if surface.share is None else (1 - surface.share) * surface.wind
+            total = total + gusty * (take["gusts_air"] - mean * take["gusts"])
         if surface.share is not None:
             seen = sky * take["sky"] + (1 - sky) * take["around"] if "around" in take else take["sky"]
-            total = total + share * seen
+            total = total + surface.share * seen
         return total
 
-    def _wind(self, surface: Surface) -> Tensor | float:
-        """v times the mean of b over this record."""
-        return 0.0 if surface.wind is None else surface.wind * self.breeze_mean
+    def _convection(self, surface: Surface) -> Tensor | None:
+        """(1 - p)(1 + v times the mean of b over this record); None where neither sky nor wind takes part, and it is 1."""
+        calm = None if surface.share is None else 1 - surface.share
+        if surface.wind is None:
+            return calm
+        windy = 1 + surface.wind * self.breeze_mean
+        return windy if calm is None else calm * windy
 
     def mean_temperature(self, surface: Surface) -> Tensor:
         """The temperature x at which the mean balance of the record is even, [n]; differentiable.
 
         Newton's method on a function that rises with x; its last step carries the derivatives (implicit function).
         """
-        beam = 0.0 if self.beam is None else self.beam.mean(surface.normals).to(surface.sun)
-        means = self.means.to(surface.sun)
+        beam = 0.0 if self.beam is None else self.beam.mean(surface.normals).to(surface.log_rate)
+        means = self.means.to(surface.log_rate)
         if surface.share is None:
-            return self.forcing(surface, means, beam, 0.0) / (1 + self._wind(surface))
+            forced, convection = self.forcing(surface, means, beam, 0.0), self._convection(surface)
+            return forced if convection is None else forced / convection
 
         def step(x: Tensor, surface: Surface) -> Tensor:
-            stiffness = (1 - surface.share) * (1 + self._wind(surface))
+            stiffness = self._convection(surface)
             slope = stiffness.detach() + surface.share.detach() * (1 + x.detach() / self.drivers.reference_k) ** 3
             radiated = surface.share * power_excess(x, self.drivers.reference_k)
             rest = self.forcing(surface, means, beam, 0.0) - stiffness * x - radiated
             return (x + rest / slope.clamp(min=LEAST_STIFFNESS)).clamp(-HALF_RANGE_K, HALF_RANGE_K)
 
         with torch.no_grad():
-            x = surface.sun * 0.0
+            x = surface.share * 0.0
             for _ in range(NEWTON_STEPS):
                 x = step(x, surface)
         return step(x, surface)
 
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
-        mean = self.mean_temperature(surface)
-        stiffness = 1 + self._wind(surface)
-        constant = 0.0
+        stiffness = self._convection(surface)
+        mean = 0.0 if stiffness is None else self.mean_temperature(surface)
         if surface.share is not None:
             steep = (1 + mean / self.drivers.reference_k) ** 3
             constant = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
-            stiffness = ((1 - surface.share) * stiffness + surface.share * steep).clamp(min=LEAST_STIFFNESS)
-        log_rate = surface.log_rate + (stiffness.log() if isinstance(stiffness, Tensor) else 0.0)
+            stiffness = (stiffness + surface.share * steep).clamp(min=LEAST_STIFFNESS)
+        log_rate = surface.log_rate if stiffness is None else surface.log_rate + stiffness.log()
         settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
         beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
         kept = torch.exp(-log_rate.exp() * (time_s - float(self.drivers.times_s[0])))
-        forced = self.forcing(surface, settled, beam, mean) + constant * (1 - kept)
-        return surface.start * kept + forced / stiffness
+        forced = self.forcing(surface, settled, beam, mean)
+        if surface.share is not None:
+            forced = forced + constant * (1 - kept)
+        return surface.start * kept + (forced if stiffness is None else forced / stiffness)
 
     def marched_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers."""
         zero = torch.zeros_like(surface.start)
-        filled = (zero if value is None else value for value in (surface.share, surface.wind))
-        columns = torch.stack([surface.start, surface.log_rate, *_after_sun(surface.sun, *filled)], dim=1)
+        filled = (zero if value is None else value for value in (surface.sun, surface.share, surface.wind))
+        columns = torch.stack([surface.start, surface.log_rate, *_after_sun(*filled)], dim=1)
         normals = surface.normals if surface.normals is not None else columns.new_zeros(len(columns), 3)
         return _March.apply(torch.cat((columns, normals), dim=1), self, time_s)
 

@@ -164,7 +164,8 @@ class _VisibleTemperature(torch.autograd.Function):
             if places.shape[0] > 0 and ids.shape[0] < rate.shape[0]:
                 rows = places[ids]
                 rows = rows[rows >= 0]
-            if rows.shape[0] < gains.shape[0]:  # clearing all of it would double the memory traffic
+            # Clearing all of it would double the memory traffic.
+            if gains.numel() > 0 and rows.shape[0] < gains.shape[0]:
                 kernels.clear_others(rows.numpy(), np.empty(gains.shape[0], np.bool_), v_gains.numpy())
             gradient = v_values.contiguous().numpy()
             kernels.backward(*_kernel_arguments(ctx, tensors), gradient, *(x.numpy() for x in outputs))

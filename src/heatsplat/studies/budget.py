@@ -13,6 +13,7 @@ import math
 import re
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -104,8 +105,8 @@ class Curve:
         return self._at(steps, "psnr")
 
     def mean_growth(self, steps: float) -> float:
-        """Expected Gaussians in the mean over the run, in those of the start."""
-        return max(self._at(steps, "mean_growth"), 0.1)
+        """Expected Gaussians in the mean over the run, in those of the start; never fewer than there or in a measured run."""
+        return max(self._at(steps, "mean_growth"), min(1.0, *(point.mean_growth for point in self.points)))
 
     def _at(self, steps: float, name: str) -> float:
         """Straight between measured points over log steps; beyond the last one the slope halves with every doubling."""
@@ -131,11 +132,11 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
     """The measured points of a curves file.
 
     Raises:
-        SceneError: the file is not one.
+        SceneError: the file is not one, or empty.
     """
     try:
         with open(path, newline="", encoding="utf-8") as file:
-            return [
+            points = [
                 Point(
                     row["method"],
                     row["scene"],
@@ -148,10 +149,25 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
                 )
                 for row in csv.DictReader(file)
             ]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        if not points:
+            raise ValueError("it has no rows")
+        if not all(min(p.steps, p.growth, p.mean_growth) > 0 and math.isfinite(p.psnr) for p in points):
+            raise ValueError("steps, growth and mean_growth must be above zero, psnr finite")
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise SceneError(
-            f"{path} holds no curves: {error!r}. Measure them with python src/study.py study=budget"
+            f"{path} holds no curves: {error!r}. Measure them with python src/study.py study=budget, which writes them to "
+            "study.curves=FILE; runs read them from budget_curves=FILE, and without it those that come with heatsplat"
         ) from error
+    return points
+
+
+def merged(kept: Iterable[Point], measured: Iterable[Point]) -> list[Point]:
+    """The points of both; where the same run was measured anew, the new one."""
+
+    def key(point: Point) -> tuple[str, ...]:  # numbers as a file holds them
+        return point.method, point.scene, str(point.steps), f"{point.growth:.3g}", f"{point.decay:.3g}"
+
+    return list(({key(point): point for point in kept} | {key(point): point for point in measured}).values())
 
 
 def write_points(points: Iterable[Point], path: Path) -> None:
@@ -168,15 +184,74 @@ def write_points(points: Iterable[Point], path: Path) -> None:
     write_atomically(path, text.getvalue())
 
 
-def curves_of(points: Iterable[Point]) -> dict[Choice, list[Curve]]:
-    """Choice -> the curves with it, one for each method and scene."""
-    found: dict[tuple[Choice, str, str], list[Point]] = {}
-    for point in points:
-        found.setdefault((point.choice, point.method, point.scene), []).append(point)
-    curves: dict[Choice, list[Curve]] = {}
-    for (choice, _, _), own in sorted(found.items()):
-        curves.setdefault(choice, []).append(Curve(tuple(sorted(own, key=lambda point: point.steps))))
-    return curves
+def curves_of(points: Iterable[Point]) -> dict[tuple[str, str], dict[Choice, Curve]]:
+    """(method, scene) -> choice -> curve, in one order whatever that of ``points``."""
+    curves: dict[tuple[str, str], dict[Choice, list[Point]]] = {}
+    for point in sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps)):
+        curves.setdefault((point.method, point.scene), {}).setdefault(point.choice, []).append(point)
+    return {scene: {choice: Curve(tuple(own)) for choice, own in choices.items()} for scene, choices in curves.items()}
+
+
+class Outlook:
+    """What choices promise after so many steps, where not every scene measured every choice.
+
+    Scenes are compared with themselves only, or a choice would win for having been measured where all goes well. Each says
+    what a choice gains over the *usual* one there after as many steps; a scene that did not measure the choice is taken to
+    gain what the others gained in the mean. So every choice that was measured anywhere beside the usual one takes part, and
+    where all scenes measured all choices, what comes out is their mean. Gains are differences for PSNR and ratios for
+    Gaussians, of which there are never more than the cap.
+
+    The usual choice is the one that most scenes measured; of several, that with the most Gaussians, then with the whole decay.
+    What was measured at one length only says nothing of others, and counts where there is nothing better.
+
+    Args:
+        points: measured points, at least one.
+    """
+
+    def __init__(self, points: Iterable[Point]) -> None:
+        curves = curves_of(points)
+        least = min(2, max(len(curve.points) for choices in curves.values() for curve in choices.values()))
+        able = {
+            scene: {choice: curve for choice, curve in choices.items() if len(curve.points) >= least}
+            for scene, choices in curves.items()
+        }
+        counts = Counter(choice for choices in able.values() for choice in choices)
+        self.usual = max(counts, key=lambda choice: (counts[choice], *choice))
+        self._scenes = {scene: choices for scene, choices in able.items() if self.usual in choices}
+        self.choices = sorted({choice for choices in self._scenes.values() for choice in choices})
+
+    def psnr(self, choice: Choice, steps: float) -> float:
+        """Expected PSNR in dB, in the mean over the scenes."""
+        usual = statistics.fmean(choices[self.usual].psnr(steps) for choices in self._scenes.values())
+        if choice == self.usual:
+            return usual
+        return usual + statistics.fmean(
+            own.psnr(steps) - choices[self.usual].psnr(steps) for own, choices in self._measured(choice)
+        )
+
+    def mean_growth(self, choice: Choice, steps: float) -> float:
+        """Expected Gaussians in the mean over the run, in those of the start, in the mean over the scenes."""
+        ratio = statistics.fmean(
+            own.mean_growth(steps) / choices[self.usual].mean_growth(steps) for own, choices in self._measured(choice)
+        )
+        least = min(choice.growth, 1.0)  # a run starts with them
+        return statistics.fmean(
+            choices[choice].mean_growth(steps)
+            if choice in choices
+            else min(max(ratio * choices[self.usual].mean_growth(steps), least), choice.growth)
+            for choices in self._scenes.values()
+        )
+
+    def last(self, choice: Choice) -> int:
+        """The longest run that was measured with the choice, in steps."""
+        return max(own.last for own, _ in self._measured(choice))
+
+    def missing(self, choice: Choice) -> list[str]:
+        """The "method/scene" that did not measure the choice."""
+        return [f"{method}/{scene}" for (method, scene), choices in self._scenes.items() if choice not in choices]
+
+    def _measured(self, choice: Choice) -> list[tuple[Curve, dict[Choice, Curve]]]:
+        return [(choices[choice], choices) for choices in self._scenes.values() if choice in choices]
 
 
 # Calibration: what a step costs here ----------------------------------------------------------------------------------
@@ -343,21 +418,22 @@ def plan(
         )
     if not own:
         raise SceneError("there are no measured curves to plan from; run python src/study.py study=budget")
-    curves = curves_of([point for point in own if free_decay or point.decay == 1.0] or own)
+    own = [point for point in own if free_decay or point.decay == 1.0] or own
     if cap_max is None:
-        fewest = min(choice.growth for choice in curves)
-        curves = {choice: found for choice, found in curves.items() if choice.growth == fewest}
+        decays: dict[float, set[float]] = {}
+        for point in own:
+            decays.setdefault(point.growth, set()).add(point.decay)
+        alike = min(decays, key=lambda growth: (-len(decays[growth]), growth))  # so that choices differ in decay alone
+        own = [point for point in own if point.growth == alike]
         reasons.append("this method adds no Gaussians, so their number was not chosen")
-    most = max(len(found) for found in curves.values())
-    curves = {choice: found for choice, found in curves.items() if len(found) == most}  # compare on the same scenes
+    outlook = Outlook(own)
     train_s = asked_s - pace.spent_s
 
     def cost(choice: Choice, steps: float) -> float:
         """Seconds of a run."""
         if cap_max is None:
             return steps * pace.step_s(pace.points)
-        multiple = statistics.fmean(curve.mean_growth(steps) for curve in curves[choice])
-        return steps * pace.step_s(min(pace.points * multiple, max(cap_max, pace.points)))
+        return steps * pace.step_s(min(pace.points * outlook.mean_growth(choice, steps), max(cap_max, pace.points)))
 
     def affordable(choice: Choice, seconds: float) -> float:
         """Steps that take so many seconds; the cost rises with the steps."""
@@ -372,22 +448,27 @@ def plan(
     def best(seconds: float) -> tuple[float, Choice, int]:
         """Expected PSNR, choice and steps of the best."""
         ends = []
-        for choice, found in curves.items():
+        for choice in outlook.choices:
             steps = affordable(choice, seconds)
-            ends.append((statistics.fmean(curve.psnr(steps) for curve in found), choice, round(steps)))
+            ends.append((outlook.psnr(choice, steps), choice, round(steps)))
         return max(ends)
 
-    least = min(cost(choice, MIN_STEPS) for choice in curves)
+    least = min(cost(choice, MIN_STEPS) for choice in outlook.choices)
     if train_s < least:
         raise SceneError(
             f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
             f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
             "smaller (data.downscale=2, init.count=10000)."
         )
-    score, (growth, decay), steps = best(train_s)
-    steps = max(steps, MIN_STEPS)
+    score, chosen, steps = best(train_s)
+    (growth, decay), steps = chosen, max(steps, MIN_STEPS)
     better, more, longer = best(train_s + asked_s)
-    measured = max(curve.last for curve in curves[more])
+    without = outlook.missing(chosen)
+    if without:
+        reasons.append(
+            f"this cap and decay were not measured on {', '.join(without)}; what they gain elsewhere stands in there"
+        )
+    measured = outlook.last(more)
     if longer > measured:
         reasons.append(
             f"runs of more than {measured:,} steps were not measured; what they gain is continued from the last"

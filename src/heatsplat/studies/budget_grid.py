@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import csv
 import itertools
-import logging
 import math
 import statistics
-import subprocess
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +19,9 @@ from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
-from heatsplat.studies.budget import Curve, Point, curves_of, read_points, write_points
-from heatsplat.studies.frontier import CURVE_FILE
-
-log = logging.getLogger("heatsplat")
+from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
+from heatsplat.studies.budget import Curve, Point, curves_of, merged, read_points, write_points
+from heatsplat.studies.child_runs import trained
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
 
@@ -67,6 +62,7 @@ def run(
     budgets: Sequence[float],
     overrides: Sequence[str],
     curves: str | None,
+    threads: int | None = None,
 ) -> None:
     """Trains the grid and the planned runs; writes the curves, budget.md and budget.png.
 
@@ -78,34 +74,39 @@ def run(
         caps: most Gaussians; None is the method's own cap.
         decays: shares of the decay of the learning rates (``optim.decay``).
         seeds: of every run of the grid.
-        budgets: seconds for which a planned run is set beside the grid; these runs use the curves just measured.
+        budgets: seconds for which a planned run is set beside the grid. These runs are planned from ``curves`` with the new
+            points in it, as later ones will be; without it from the new points alone.
         overrides: of every run.
-        curves: curves file in which the points of these methods are replaced; None: only the study's folder has them.
+        curves: curves file into which the points go: those of the same method, scene, steps, cap and decay are replaced,
+            others stay. None: only the study's folder has the points.
+        threads: CPU threads of every run; None takes all cores.
+
+    Raises:
+        SceneError: ``scenes`` or ``curves`` cannot be used as they are, or a run failed.
     """
-    folder = Path(output_dir)
+    folder = Path(output_dir).resolve()
+    common = [*([f"threads={threads}"] if threads else []), *overrides]
     grid = []
     pairs = [tuple(pair.split("/")) for pair in scenes]
     if any(len(pair) != 2 for pair in pairs):
         raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {list(scenes)}")
+    _known(curves)  # a file that is none is told before the runs, not after them
     for (method, scene), length, cap, decay, seed in itertools.product(pairs, steps, caps, decays, seeds):
         place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}_{decay:g}" / str(seed)
         wanted = [f"max_steps={length}", f"optim.decay={decay:g}", *([f"density.cap_max={cap}"] if cap else [])]
-        results = _trained(place, train, [*overrides, *_of(method, scene, seed), *wanted])
+        results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
         grid.append(Trained(method, scene, length, cap, decay, seed, results, mean))
     points = means(grid)
-    write_points(points, folder / POINTS_FILE)
+    source = folder / POINTS_FILE
+    write_points(points, source)
     if curves is not None:
-        kept = (
-            [point for point in read_points(Path(curves)) if (point.method, point.scene) not in pairs]
-            if Path(curves).exists()
-            else []
-        )
-        write_points([*kept, *points], Path(curves))
+        source = Path(curves).resolve()
+        write_points(merged(_known(curves), points), source)
     planned = [
-        (method, scene, budget, _trained(
+        (method, scene, budget, trained(
             folder / "planned" / f"{method}_{scene}_{budget:g}s" / "0", train,
-            [*overrides, *_of(method, scene, 0), f"budget={budget:g}s"],
+            [*common, *_of(method, scene, 0), f"budget={budget:g}s", f"budget_curves={source}"], folder,
         ))
         for (method, scene), budget in itertools.product(pairs, budgets)
     ]  # fmt: skip
@@ -113,18 +114,13 @@ def run(
     write_png(folder / PICTURE_FILE, figure_picture(picture(points)))
 
 
+def _known(curves: str | None) -> list[Point]:
+    """The points that are in a curves file already."""
+    return read_points(Path(curves)) if curves is not None and Path(curves).exists() else []
+
+
 def _of(method: str, scene: str, seed: int) -> list[str]:
     return [f"method={method}", "data=synthetic", f"data.scene={scene}", f"data.scene_seed={seed}", f"seed={seed}"]
-
-
-def _trained(place: Path, train: str, overrides: Sequence[str]) -> RunResults:
-    if not (place / METRICS_FILE).exists():
-        log.info("training %s", place)
-        command = [sys.executable, train, *overrides, f"hydra.run.dir={place}"]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise RuntimeError(f"{' '.join(command)} failed:\n{(done.stderr or done.stdout)[-2000:]}")
-    return RunResults.read(place / METRICS_FILE)
 
 
 def mean_gaussians(curve: Path, start: int) -> float:
@@ -215,9 +211,9 @@ def picture(points: Sequence[Point]) -> Figure:
             (("psnr", "PSNR (dB)"), ("mean_growth", "mean Gaussians / those of the start"))
         ):
             axes = figure.add_subplot(len(pairs), 2, 2 * row + column + 1)
-            for i, ((growth, decay), curves) in enumerate(curves_of(own).items()):
+            for i, ((growth, decay), curve) in enumerate(curves_of(own)[method, scene].items()):
                 cap = "free" if math.isinf(growth) else f"at most {growth:g} times the start"
-                _line(axes, curves[0], name, i, f"{cap}, decay {decay:g}")
+                _line(axes, curve, name, i, f"{cap}, decay {decay:g}")
             lengths = sorted({point.steps for point in own})
             axes.set(xscale="log", xlabel="steps", ylabel=label, title=f"{method} on {scene}")
             axes.set_xticks(lengths, [f"{length:,}" for length in lengths])

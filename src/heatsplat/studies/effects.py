@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import statistics
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,9 +11,8 @@ from matplotlib.figure import Figure
 
 from heatsplat.effects import assembly
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
-
-log = logging.getLogger(__name__)
+from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.studies.child_runs import trained
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
 NOTE = (
@@ -74,6 +70,7 @@ def run(
     leave_one_out: bool,
     seeds: Sequence[int],
     overrides: Sequence[str],
+    threads: int | None = None,
 ) -> None:
     """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
 
@@ -87,22 +84,21 @@ def run(
         leave_one_out: whether chosen effects are left out in turn.
         seeds: of every row.
         overrides: of every run.
+        threads: CPU threads of every run; None takes all cores.
+
+    Raises:
+        SceneError: a run failed, or its folder holds a run of other settings.
     """
-    folder = Path(output_dir)
+    folder = Path(output_dir).resolve()
+    common = [*([f"threads={threads}"] if threads else []), *overrides]
     plain: dict[tuple[str, int], RunResults] = {}  # without any effect, by preset and seed
 
-    def trained(job: Job, bare: bool) -> RunResults:
+    def of(job: Job, bare: bool) -> RunResults:
         """The results of a run; ``bare`` where it is known before that no effect will be on."""
         if bare and (job.preset, job.seed) in plain:
             return plain[job.preset, job.seed]
         place = folder / "runs" / job.folder / str(job.seed)
-        if not (place / METRICS_FILE).exists():
-            log.info("training %s, seed %d", job.folder, job.seed)
-            command = [sys.executable, train, *overrides, *job.overrides(presets[job.preset]), f"hydra.run.dir={place}"]
-            done = subprocess.run(command, capture_output=True, text=True)
-            if done.returncode:
-                raise RuntimeError(f"{' '.join(command)} failed:\n{(done.stderr or done.stdout)[-2000:]}")
-        results = RunResults.read(place / METRICS_FILE)
+        results = trained(place, train, [*common, *job.overrides(presets[job.preset])], folder)
         if not _on(results):
             plain[job.preset, job.seed] = results
         return results
@@ -111,13 +107,13 @@ def run(
     for preset, truth in presets.items():
         for selection in selections:
             job, bare = Job(preset, selection, 0), selection == "none" or (selection == "oracle" and not truth)
-            whole = [trained(replace(job, seed=seed), bare) for seed in seeds]
+            whole = [of(replace(job, seed=seed), bare) for seed in seeds]
             rows.append(_mean(job, whole))
             if selection == "auto" and leave_one_out:
                 for name in rows[-1].effects:
                     left = replace(job, left_out=name)
                     less = [
-                        trained(replace(left, seed=seed), _on(results) <= assembly.falls_with(name))
+                        of(replace(left, seed=seed), _on(results) <= assembly.falls_with(name))
                         for seed, results in zip(seeds, whole, strict=True)
                     ]
                     rows.append(_mean(left, less))

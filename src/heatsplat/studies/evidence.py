@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +17,23 @@ import torch
 from heatsplat.contracts import SceneError
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.training.machine import cores
 
 log = logging.getLogger("heatsplat")
 
 HEAD = """# Effects: what a scene may call for, and how that is told
 
 This page is generated: `python src/study.py study=evidence`. An effect is simulated where its evidence exceeds its
-threshold; evidence is a statistic on the training images that stays below about 1 under the null hypothesis. Effects that
+threshold; evidence is a statistic on the training images that stays below it under the null hypothesis. Effects that
 look alike one by one are told apart by one joint fit of all of them to tracks of scene points (`effects/evidence/joint.py`):
 each has to lower a Bayesian information criterion in the presence of the others. Where metadata is missing an effect is
-off, and the reason says so. `effects.<name>=on|off` overrules the evidence.
+off, and the reason says so.
+
+`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing;
+`effects.<name>=on|off|auto` overrules either, and what is set by hand (`effects.parts.attenuation.moments=8`) wins over what the
+evidence would start from. The papers' systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the effects
+that they simulate, whatever the scene. That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera; where a
+paper has a network, the catalogue has a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
 """
 COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
 
@@ -65,6 +75,7 @@ def run(
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     unseen: Sequence[int] = (),
     document: str | None = None,
+    jobs: int | None = 1,
 ) -> str:
     """The page, also written to effects.md in ``output_dir`` and to ``document``.
 
@@ -75,18 +86,33 @@ def run(
         seeds: of the recordings of each.
         unseen: of further ones, which no threshold was set on; they are counted apart.
         document: file that is written besides; None for none.
+        jobs: recordings that are judged side by side, with one thread each; None: one for each core.
     """
-    torch.set_num_threads(1)  # small tensors
+    cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
     outcomes = []
-    for size in sizes:
-        for scene in scenes:
-            outcomes += [judged(data, scene, size, seed) for seed in (*seeds, *unseen)]
+    for outcome in _judged(data, cases, cores() if jobs is None else jobs):
+        outcomes.append(outcome)
+        log.info("%d of %d: %s %s %d", len(outcomes), len(cases), outcome.scene, outcome.size, outcome.seed)
+        for name in sorted(outcome.found ^ outcome.present):
+            log.info("    %s is %s", name, "missed" if name in outcome.present else "not there")
+            log.info("    %s", outcome.verdicts[name].reason)
     text = written(outcomes, frozenset(unseen))
     Path(output_dir).mkdir(parents=True, exist_ok=True)
     for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
         path.write_text(text, encoding="utf-8")
     log.info("%s", text)
     return text
+
+
+def _judged(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], jobs: int) -> Iterator[Outcome]:
+    """The outcomes of cases (scene, size, seed), in their order."""
+    if jobs == 1:
+        torch.set_num_threads(1)  # small tensors
+        yield from (judged(data, *case) for case in cases)
+        return
+    context = multiprocessing.get_context("spawn")  # a fork would share OpenMP's threads
+    with ProcessPoolExecutor(jobs, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        yield from pool.map(partial(judged, data), *zip(*cases, strict=True))
 
 
 def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcome:
@@ -102,11 +128,7 @@ def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcom
         )
     start = time.perf_counter()
     verdicts = decide(recorded)
-    outcome = Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, time.perf_counter() - start)
-    for name in sorted(outcome.found ^ outcome.present):
-        log.info("%s %s %d: %s is %s", scene, size, seed, name, "missed" if name in outcome.present else "not there")
-        log.info("    %s", verdicts[name].reason)
-    return outcome
+    return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, time.perf_counter() - start)
 
 
 def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -> str:

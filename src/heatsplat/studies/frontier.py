@@ -1,8 +1,8 @@
 """What accuracy costs in time: quality against seconds along finished runs, the Pareto front, and time to a quality.
 
 Rules: seconds are of training alone, evaluation excluded; a course is that of the validation views, its end mark that of
-the test views; runs of one recipe on one scene with different seeds are averaged at their ends. Runs are read, not made:
-any folder below outputs/ will do, old ones too.
+the test views; runs of one recipe on one scene with different seeds are averaged at their ends. Only runs that measured
+alike views are compared. Runs are read, not made: any folder below outputs/ will do, old ones too.
 """
 
 from __future__ import annotations
@@ -12,25 +12,28 @@ import csv
 import html
 import io
 import logging
+import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
-from heatsplat.studies.sweeps import row_name
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.sweeps import named_row, settings_of, unshared
 
 log = logging.getLogger("heatsplat")
 
-CURVE_FILE = "curve.csv"
-PSNR_LEVELS = (15, 20, 25, 30, 32, 34, 36, 38, 40, 42, 44, 46)
-MAE_LEVELS = (5.0, 2.0, 1.0, 0.5, 0.3, 0.2, 0.1, 0.05)
 COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
+# Options of the data that choose what is measured, beside the rule of the split, and those of a rule. What only training
+# sees, such as data.degrade, is not here.
+OF_MEASURED = ("noise_k", "only")
+OF_SPLIT = {"block": ("split_fraction", "split_position"), "list": ("split_file",)}
 
 
 @dataclass
@@ -39,14 +42,20 @@ class Run:
 
     Args:
         folder: where it lies.
-        scene, recipe: what was reconstructed and how.
+        scene: its name.
+        measured: what tells its validation and test views from others of the scene: "image size" -> "64x52" and the like.
+        method, row: its method, and its row in a sweep ("" without).
+        settings: other overrides that make its recipe, such as "thermal.frequencies=8".
         end: scores of the test views and costs, by name.
         course: score -> (seconds, value) of the validations in order.
     """
 
     folder: Path
     scene: str
-    recipe: str
+    measured: dict[str, str]
+    method: str
+    row: str
+    settings: list[str]
     end: dict[str, float]
     course: dict[str, list[tuple[float, float]]]
 
@@ -56,9 +65,10 @@ class Recipe:
     """The runs of one recipe on one scene.
 
     Args:
-        scene, name: which.
+        scene: title of the panel: the scene, and what was measured of it where that differs between runs.
+        name: of the recipe.
         runs: one per seed.
-        on_front: score -> whether no other recipe of the scene is as good in less time.
+        on_front: score -> whether no other recipe of the panel is as good in less time.
     """
 
     scene: str
@@ -82,23 +92,33 @@ class Recipe:
         return statistics.fmean(found) if found and None not in found else None
 
 
-def run(output_dir: Path | str, runs: str | Sequence[str]) -> list[Recipe]:
+def run(
+    output_dir: Path | str, runs: str | Sequence[str], psnr_levels_db: Sequence[float], mae_levels_c: Sequence[float]
+) -> list[Recipe]:
     """The recipes found; writes frontier.md, .csv, .png, .svg and .html, and the picture to TensorBoard.
 
     Args:
         output_dir: folder of the results.
         runs: folders of runs or sweeps, searched to any depth.
+        psnr_levels_db, mae_levels_c: qualities (dB; °C) until which the seconds of training are told.
 
     Raises:
-        SceneError: there is no finished run in them.
+        SceneError: there is no finished run in them, or levels are not positive numbers.
     """
     output_dir = Path(output_dir)
+    levels = {
+        "psnr": checked_levels("psnr_levels_db", psnr_levels_db),
+        "mae_c": checked_levels("mae_levels_c", mae_levels_c)[::-1],
+    }
     folders = [Path(text).expanduser() for text in ([runs] if isinstance(runs, str) else runs)]
-    found = [one for folder in folders for one in read_runs(folder)]
+    # Folders may lie in each other; a run counts once.
+    found = list({one.folder.resolve(): one for folder in folders for one in read_runs(folder)}.values())
     if not found:
         raise SceneError(
-            f"runs={', '.join(map(str, folders))}: there is no finished run (no {METRICS_FILE} with a {CURVE_FILE} beside). "
-            "Give folders that src/train.py wrote, such as runs=[outputs/etgs_cooling,outputs/sweeps/...]."
+            f"runs={', '.join(map(str, folders))}: there is no finished run (no {METRICS_FILE} that can be read with a "
+            f"{CURVE_FILE} beside). Give folders that src/train.py wrote, such as "
+            "study.runs=[outputs/etgs_cooling,outputs/sweeps/...]; a run whose files are damaged must be trained again, in "
+            "a new folder."
         )
     recipes = group(found)
     figure = picture(recipes)
@@ -107,10 +127,10 @@ def run(output_dir: Path | str, runs: str | Sequence[str]) -> list[Recipe]:
     vector = io.StringIO()
     figure.savefig(vector, format="svg", metadata={"Date": None})
     write_atomically(output_dir / "frontier.svg", vector.getvalue())
-    write_atomically(output_dir / "frontier.csv", table_csv(found))
-    text = markdown(recipes)
+    write_atomically(output_dir / "frontier.csv", table_csv(recipes))
+    text = markdown(recipes, levels)
     write_atomically(output_dir / "frontier.md", text)
-    write_atomically(output_dir / "frontier.html", page(recipes, vector.getvalue()))
+    write_atomically(output_dir / "frontier.html", page(recipes, levels, vector.getvalue()))
     from torch.utils.tensorboard import SummaryWriter
 
     with SummaryWriter(str(output_dir / "tb")) as writer:
@@ -120,25 +140,82 @@ def run(output_dir: Path | str, runs: str | Sequence[str]) -> list[Recipe]:
     return recipes
 
 
+def checked_levels(name: str, levels: Any) -> list[float]:
+    """Levels of a score in ascending order, each once.
+
+    Raises:
+        SceneError: they are no list of positive numbers; the message names the option.
+    """
+    numbers = list(levels) if isinstance(levels, (list, tuple)) else [None]
+    for value in numbers:
+        good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
+        if not good:
+            raise SceneError(f"study.{name}={levels}: give positive numbers in brackets, such as [1, 2]; [] for none")
+    return sorted({float(value) for value in numbers})
+
+
 # Reading -------------------------------------------------------------------------------------------------------------
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The finished runs in a folder at any depth, in the order of their paths; evaluations of a run are not runs."""
+    """The finished runs in a folder at any depth, in the order of their paths; evaluations of a run are not runs.
+
+    One whose files cannot be read is left out, and a warning names it and says why.
+    """
     found = []
     for file in sorted(folder.rglob(METRICS_FILE)):
-        curve, hydra = file.parent / CURVE_FILE, file.parent / ".hydra"
-        if not curve.exists() or not (hydra / "overrides.yaml").exists():
+        place = file.parent
+        if not (place / CURVE_FILE).exists() or not (place / ".hydra" / "overrides.yaml").exists():
             continue
-        results = RunResults.read(file)
-        overrides = yaml.safe_load((hydra / "overrides.yaml").read_text(encoding="utf-8")) or []
-        settings = dict(text.partition("=")[::2] for text in overrides)
-        recipe = settings.get("row", "").strip("'\"")
-        method = str(results.run.get("method"))
-        recipe = f"{method}, {recipe}" if recipe else row_name({"method": method} | settings)
-        end = {name: value for name, value in (results.test | results.cost).items() if value is not None}
-        found.append(Run(file.parent, str(results.run.get("scene")), recipe, end, _courses(curve)))
+        try:
+            found.append(_read_run(place))
+        except (ValueError, OSError, yaml.YAMLError, csv.Error) as error:
+            log.warning("%s is left out: %s", place, error)
     return found
+
+
+def _read_run(place: Path) -> Run:
+    results = RunResults.read(place / METRICS_FILE)
+    overrides = dict(str(text).partition("=")[::2] for text in _yaml(place / ".hydra" / "overrides.yaml") or [])
+    config = place / ".hydra" / "config.yaml"
+    data = (_yaml(config) or {}).get("data") if config.exists() else None
+    return Run(
+        place,
+        str(results.run.get("scene")),
+        _measured(results.data, data or {}),
+        str(results.run.get("method")),
+        named_row(overrides),
+        settings_of(overrides),
+        {name: value for name, value in (results.test | results.cost).items() if value is not None},
+        _courses(place / CURVE_FILE),
+    )
+
+
+def _yaml(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
+    """What tells the validation and test views of a run from others of a scene of this name; what is not known is left out.
+
+    Args:
+        found: section "data" of the results.
+        config: options of the data.
+    """
+    views = found.get("views") or {}
+    sizes = [str(text).partition("x")[::2] for text in found.get("image_sizes") or []]
+    # Training images may be smaller than those that are measured (data.degrade), never larger.
+    width, height = max(((int(w), int(h)) for w, h in sizes), key=math.prod, default=(0, 0))
+    split = found.get("split", config.get("split"))
+    options = [*OF_MEASURED, *OF_SPLIT.get(str(split), ())]
+    known = {
+        "image size": f"{width}x{height}" if width else None,
+        "test views": views.get("test"),
+        "validation views": views.get("val"),
+        "split": split,
+        **{f"data.{name}": config.get(name) for name in options},
+    }
+    return {name: str(value) for name, value in known.items() if value is not None}
 
 
 def _courses(path: Path) -> dict[str, list[tuple[float, float]]]:
@@ -152,15 +229,15 @@ def _courses(path: Path) -> dict[str, list[tuple[float, float]]]:
 
 
 def group(runs: Iterable[Run]) -> list[Recipe]:
-    """Runs by scene and recipe, with what lies on the front of its scene; names leave out what all recipes share."""
+    """Runs by panel and recipe, with what lies on the front of its panel.
+
+    A panel is a scene whose runs measured alike views. Names leave out what all recipes share.
+    """
     runs = list(runs)
-    settings = [set(one.recipe.split(" ")[1:]) for one in runs]
-    shared = set.intersection(*settings) if len({one.recipe for one in runs}) > 1 else set()
-    for one in runs:
-        one.recipe = " ".join(word for word in one.recipe.split(" ") if word not in shared)
     recipes: dict[tuple[str, str], Recipe] = {}
-    for one in runs:
-        recipes.setdefault((one.scene, one.recipe), Recipe(one.scene, one.recipe)).runs.append(one)
+    titles = _titles(runs)
+    for one, title, name in zip(runs, titles, _names(runs, titles), strict=True):
+        recipes.setdefault((title, name), Recipe(title, name)).runs.append(one)
     for scene in {recipe.scene for recipe in recipes.values()}:
         of_scene = [recipe for recipe in recipes.values() if recipe.scene == scene]
         for name, sign in (("psnr", 1.0), ("mae_c", -1.0)):
@@ -172,6 +249,41 @@ def group(runs: Iterable[Run]) -> list[Recipe]:
             for recipe, seconds, quality in points:
                 recipe.on_front[name] = not dominated(seconds, quality, [(s, q) for _, s, q in points])
     return sorted(recipes.values(), key=lambda recipe: (recipe.scene, recipe.mean("train_seconds") or 0.0))
+
+
+def _titles(runs: Sequence[Run]) -> list[str]:
+    """For each run the title of its panel: the scene, and of what was measured as much as tells panels apart."""
+    titles = [one.scene for one in runs]
+    for part in dict.fromkeys(name for one in runs for name in one.measured):
+        values = [one.measured.get(part, "unknown") for one in runs]
+        kinds: dict[str, set[str]] = {}
+        for title, value in zip(titles, values, strict=True):
+            kinds.setdefault(title, set()).add(value)
+        titles = [
+            f"{title}, {part} {value}" if len(kinds[title]) > 1 else title
+            for title, value in zip(titles, values, strict=True)
+        ]
+    return titles
+
+
+def _names(runs: Sequence[Run], titles: Sequence[str]) -> list[str]:
+    """For each run the name of its recipe: method, row, and settings that tell it from others.
+
+    A named row has those that not all runs of the row share; else they are those that not all runs share, of the data
+    those that not all runs of the panel share.
+    """
+    settings = [one.settings for one in runs]
+    several = len({(one.method, one.row, *one.settings) for one in runs}) > 1
+    in_all = unshared([""] * len(runs), settings) if several else settings
+    in_row = unshared([f"{one.method}, {one.row}" for one in runs], settings)
+    in_panel = unshared(titles, settings) if several else settings
+    names = []
+    for one, of_all, of_row, of_panel in zip(runs, in_all, in_row, in_panel, strict=True):
+        told = of_row if one.row else of_all
+        told = " ".join(text for text in told if text in of_panel or not text.lstrip("+~").startswith("data."))
+        start = f"{one.method}, {one.row}" if one.row else one.method
+        names.append(start + (f"{', ' if one.row else ' '}{told}" if told else ""))
+    return names
 
 
 def dominated(seconds: float, quality: float, points: Iterable[tuple[float, float]]) -> bool:
@@ -200,7 +312,7 @@ def seconds_to(course: Sequence[tuple[float, float]], level: float, higher: bool
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
-def _levels(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
+def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
     """The levels that some recipe reaches and not all reach at their first validation."""
     reached = [[recipe.seconds_to(name, level) for recipe in recipes] for level in levels]
     starts = [
@@ -218,8 +330,15 @@ def _cell(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:,.{digits}f}"
 
 
-def tables(recipes: Sequence[Recipe]) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Title, heading and rows of the tables of every scene: results beside costs, and time to a quality."""
+def tables(
+    recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]
+) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, heading and rows of the tables of every panel: results beside costs, and time to a quality.
+
+    Args:
+        recipes: from ``group``.
+        levels: score -> the qualities that are asked for, the easy ones first.
+    """
     found = []
     for scene in dict.fromkeys(recipe.scene for recipe in recipes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
@@ -245,7 +364,7 @@ def tables(recipes: Sequence[Recipe]) -> list[tuple[str, list[str], list[list[st
             marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
             rows.append([recipe.name, str(len(recipe.runs)), *cells, ", ".join(marks)])
         found.append((f"{scene}: results beside their costs", head, rows))
-        psnr, mae = _levels(own, "psnr", PSNR_LEVELS), _levels(own, "mae_c", MAE_LEVELS)
+        psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
         if psnr or mae:
             head = ["seconds to", *(f"{level:g} dB" for level in psnr), *(f"{level:g} °C" for level in mae)]
             rows = [
@@ -260,32 +379,31 @@ def tables(recipes: Sequence[Recipe]) -> list[tuple[str, list[str], list[list[st
     return found
 
 
-def markdown(recipes: Sequence[Recipe]) -> str:
+def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -> str:
     """The tables for people."""
     lines = ["# Accuracy against training time", ""]
-    for title, head, rows in tables(recipes):
+    for title, head, rows in tables(recipes, levels):
         lines += [f"## {title}", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
         lines += ["| " + " | ".join(row) + " |" for row in rows] + [""]
     return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])
 
 
-def table_csv(runs: Sequence[Run]) -> str:
+def table_csv(recipes: Sequence[Recipe]) -> str:
     """Every point of every course, and the ends, for programs."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["scene", "recipe", "folder", "views", "seconds", "score", "value"])
-    for one in runs:
+    for recipe, one in [(mean, one) for mean in recipes for one in mean.runs]:
+        place = [recipe.scene, recipe.name, one.folder.name]
         for name, course in one.course.items():
-            writer.writerows([one.scene, one.recipe, one.folder.name, "validation", s, name, v] for s, v in course)
+            writer.writerows([*place, "validation", s, name, v] for s, v in course)
             if name in one.end and "train_seconds" in one.end:
-                writer.writerow(
-                    [one.scene, one.recipe, one.folder.name, "test", one.end["train_seconds"], name, one.end[name]]
-                )
+                writer.writerow([*place, "test", one.end["train_seconds"], name, one.end[name]])
     return text.getvalue()
 
 
 def picture(recipes: Sequence[Recipe]) -> Figure:
-    """Quality against seconds, a row of axes per scene: thin lines are courses, marks ends, the step line the front."""
+    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front."""
     scenes = list(dict.fromkeys(recipe.scene for recipe in recipes))
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
     for i, scene in enumerate(scenes):
@@ -316,7 +434,7 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
     return figure
 
 
-def page(recipes: Sequence[Recipe], vector: str) -> str:
+def page(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]], vector: str) -> str:
     """A page that needs no other file: the picture and the tables."""
     picture_data = base64.b64encode(vector.encode()).decode()
     parts = [
@@ -329,7 +447,7 @@ def page(recipes: Sequence[Recipe], vector: str) -> str:
         "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end; black edges "
         "lie on the Pareto front.</p>",
     ]
-    for title, head, rows in tables(recipes):
+    for title, head, rows in tables(recipes, levels):
         cells = "".join(f"<th>{html.escape(text)}</th>" for text in head)
         body = "".join("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows)
         parts.append(f"<h2>{html.escape(title)}</h2><table><tr>{cells}</tr>{body}</table>")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import re
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,10 +15,9 @@ import yaml
 from matplotlib.figure import Figure
 
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults, write_atomically
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
-FAILED = "FAILED"
 # Scores and costs in the table, where any job has them, with heading and digits.
 SCORES = {
     "psnr": ("PSNR (dB)", 2),
@@ -35,9 +33,21 @@ COSTS = {
     "gaussians": ("Gaussians", 0),
     "render_fps": ("frames/s", 0),
 }
-# Overrides that tell repetitions and places apart and not rows.
-NOT_A_ROW = {"seed", "row", "data", "data.root", "data.scene", "method", "threads", "ablation"}
-NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra"}  # groups
+# Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
+# are among them; the method is named by itself.
+SEEDS = {"seed", "data.seed", "data.scene_seed"}
+PLACES = {"data", "data.root", "data.scene"}
+NAMES = {"method", "row", "ablation", "experiment"}
+HOW_IT_RUNS = {"threads", "ckpt", "test"}
+NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
+NOT_WHAT_WAS_LEARNED = {
+    "trainer",
+    "launcher",
+    "callbacks",
+    "logger",
+    "hydra",
+    "table",
+}  # groups: these and all below them
 
 
 @dataclass
@@ -50,6 +60,7 @@ class Row:
         values: score or cost -> its values, one per job that has it.
         jobs: how many have results.
         failed: first lines of why the others have none.
+        other: overrides that not all jobs of a row of this name have, such as "max_steps=3000"; empty where all agree.
     """
 
     name: str
@@ -57,6 +68,12 @@ class Row:
     values: dict[str, list[float]] = field(default_factory=dict)
     jobs: int = 0
     failed: list[str] = field(default_factory=list)
+    other: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name, with what tells the row from others of its name."""
+        return f"{self.name}, {self.other}" if self.other else self.name
 
     def mean(self, name: str) -> float | None:
         """Mean over the jobs, None where none has the value."""
@@ -91,35 +108,82 @@ def write_sweep(folder: Path, order: Sequence[str] = (), paper: Mapping[str, str
 
 
 def collect(folder: Path) -> list[Row]:
-    """The rows of a sweep's folder, in the order of its jobs."""
-    rows: dict[tuple[str, str], Row] = {}
-    jobs = sorted(path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml"))
-    for job in sorted(jobs, key=_number):
-        overrides = dict(text.partition("=")[::2] for text in _yaml(job, "overrides"))
-        name = overrides.get("row", "").strip("'\"") or row_name(overrides)
-        file = job / METRICS_FILE
-        results = RunResults.read(file) if file.exists() else None
-        scene = str(results.run["scene"]) if results else _scene(_yaml(job, "config"))
-        row = rows.setdefault((scene, name), Row(name, scene))
+    """The rows of a sweep's folder, in the order of its jobs. Jobs of one name and other settings are rows of their own."""
+    rows: dict[tuple[str, str, str], Row] = {}
+    jobs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
+    names = row_names([dict(text.partition("=")[::2] for text in _yaml(job, "overrides")) for job in jobs])
+    for job, (name, other) in zip(jobs, names, strict=True):
+        results, reason = _results(job)
+        scene = str(results.run["scene"]) if results and "scene" in results.run else _scene(_yaml(job, "config"))
+        row = rows.setdefault((scene, name, other), Row(name, scene, other=other))
         if results is None:
-            row.failed.append(_reason(job))
+            row.failed.append(reason)
             continue
         row.jobs += 1
         for key, value in (results.test | results.cost).items():
-            if value is not None and math.isfinite(value):
+            if value is not None:
                 row.values.setdefault(key, []).append(value)
     return list(rows.values())
 
 
+def row_names(jobs: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
+    """For each job the name of its row, and the settings that not all jobs of a row of this name have ("" for none).
+
+    A job without a named row has its settings for a name (``row_name``).
+
+    Args:
+        jobs: overrides of each: key -> value.
+    """
+    names = [named_row(overrides) for overrides in jobs]
+    settings = [[*_method(overrides), *settings_of(overrides)] for overrides in jobs]
+    others = [" ".join(words) for words in unshared(names, settings)]
+    return [
+        (name, other) if name else (row_name(overrides), "")
+        for overrides, name, other in zip(jobs, names, others, strict=True)
+    ]
+
+
+def unshared(names: Sequence[str], settings: Sequence[Sequence[str]]) -> list[list[str]]:
+    """For each job those of its settings that not all jobs of its name have."""
+    shared: dict[str, set[str]] = {}
+    for name, own in zip(names, settings, strict=True):
+        shared[name] = shared.get(name, set(own)) & set(own)
+    return [[text for text in own if text not in shared[name]] for name, own in zip(names, settings, strict=True)]
+
+
+def named_row(overrides: Mapping[str, str]) -> str:
+    """Name of the row that a job was given (``row=``), empty for none."""
+    name = overrides.get("row", "").strip("'\"")
+    return "" if name == "null" else name
+
+
 def row_name(overrides: Mapping[str, str]) -> str:
     """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
-    method = [overrides["method"]] if "method" in overrides else []
-    told = {
-        key: value
-        for key, value in overrides.items()
-        if key not in NOT_A_ROW and key.lstrip("+~").partition(".")[0] not in NOT_WHAT_WAS_LEARNED
-    }
-    return " ".join([*method, *(f"{key}={value}" for key, value in told.items())]) or "run"
+    return " ".join([*_method(overrides), *settings_of(overrides)]) or "run"
+
+
+def _method(overrides: Mapping[str, str]) -> list[str]:
+    return [overrides["method"]] if "method" in overrides else []
+
+
+def settings_of(overrides: Mapping[str, str]) -> list[str]:
+    """Overrides that make a recipe besides its method: "key=value" in alphabetical order."""
+
+    def makes_a_recipe(key: str) -> bool:
+        key = key.lstrip("+~")
+        return key not in NOT_A_ROW and key.partition(".")[0] not in NOT_WHAT_WAS_LEARNED
+
+    return sorted(f"{key}={value}" for key, value in overrides.items() if makes_a_recipe(key))
+
+
+def _results(job: Path) -> tuple[RunResults | None, str]:
+    """The results of a job, or None and why there are none."""
+    if not (job / METRICS_FILE).exists():
+        return None, _reason(job)
+    try:
+        return RunResults.read(job / METRICS_FILE), ""
+    except (ValueError, OSError) as error:
+        return None, f"{error}. Delete the folder to run it again."
 
 
 def _yaml(job: Path, name: str) -> Any:
@@ -160,14 +224,14 @@ def markdown(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
     head += ["paper"] if paper else []
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in rows:
-        cells = [*([row.scene] if several else []), row.name, str(row.jobs)]
+        cells = [*([row.scene] if several else []), row.label, str(row.jobs)]
         for name, (_, digits) in columns.items():
             mean, spread = row.mean(name), row.spread(name)
             text = "–" if mean is None else f"{mean:,.{digits}f}"
             cells.append(text if spread is None else f"{text} ± {spread:,.{digits}f}")
         cells += [paper.get(row.name, "–")] if paper else []
         lines.append("| " + " | ".join(cells) + " |")
-    failed = [f"- {row.name} on {row.scene}: {reason}" for row in rows for reason in row.failed]
+    failed = [f"- {row.label} on {row.scene}: {reason}" for row in rows for reason in row.failed]
     if failed:
         lines += ["", f"Jobs without a result: {len(failed)}", "", *failed]
     scenes = ", ".join(sorted({row.scene for row in rows}))
@@ -183,7 +247,7 @@ def table_csv(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
     writer.writeheader()
     for row in rows:
         numbers = {name: row.mean(name) for name in columns} | {f"{name}_std": row.spread(name) for name in columns}
-        counts = {"scene": row.scene, "row": row.name, "runs": row.jobs, "failed": len(row.failed)}
+        counts = {"scene": row.scene, "row": row.label, "runs": row.jobs, "failed": len(row.failed)}
         writer.writerow(counts | numbers | {"paper": paper.get(row.name)})
     return text.getvalue()
 
@@ -200,7 +264,7 @@ def picture(rows: Sequence[Row]) -> Figure | None:
         for j, row in enumerate(rows):
             x, y = row.mean("train_seconds"), row.mean(name)
             if x is not None and y is not None:
-                label = f"{row.name}, {row.scene}" if several else row.name
+                label = f"{row.label}, {row.scene}" if several else row.label
                 axes.errorbar(
                     x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, "os^Dv"[j // 10 % 5], color=f"C{j % 10}",
                     capsize=2, markersize=6, label=label,

@@ -36,7 +36,7 @@ class Attenuation(HeatPart):
     """
 
     def __init__(
-        self, depth: float = 0.1, moments: int = 0, smooth: float = 1e-4, lr: float = 0.01, lr_end: float = 0.1
+        self, depth: float = 0.1, moments: int = 12, smooth: float = 1e-4, lr: float = 0.01, lr_end: float = 0.1
     ) -> None:
         super().__init__()
         if depth <= 0 or moments == 1 or moments < 0:

@@ -112,8 +112,10 @@ class EnergyBalance(ThermalModel):
         # What trained parameters count from; another weather leaves it as it is.
         self.register_buffer("range_c", torch.zeros(2, dtype=torch.float64))
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("outside", torch.zeros(3))
+        if wind:
+            self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
+        if sun:  # beside which normals face
+            self.register_buffer("outside", torch.zeros(3))
         self._weather: Weather | None = None
         self.register_load_state_dict_post_hook(_live_on)
 
@@ -130,8 +132,9 @@ class EnergyBalance(ThermalModel):
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self._wind and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
-            centers = torch.stack([frame.camera.center for frame in scene.train.frames])
-            self.outside.copy_(centers.mean(0))
+            if self._sun:
+                centers = torch.stack([frame.camera.center for frame in scene.train.frames])
+                self.outside.copy_(centers.mean(0))
         self.under(weather)
         for part in (scene.train, scene.val, scene.test):
             for frame in part.frames:
@@ -233,7 +236,7 @@ class EnergyBalance(ThermalModel):
         return Surface(
             start=self._range.to_celsius(initial) - celsius(self.reference_k).item(),
             log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
-            sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else torch.zeros_like(initial),
+            sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
             share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
             wind=bounded("raw_wind", *WIND_LIMITS) if drivers.breeze is not None else None,
             normals=self._normals(splats, query) if drivers.up is not None else None,

@@ -13,7 +13,7 @@ from heatsplat.thermal.base import PerGaussian, Query, Seeds
 
 
 class HeatPart(nn.Module, ABC):
-    """One effect on what Gaussians emit. One part is one file with one subclass and one entry in conf/effects/parts.yaml.
+    """One effect on what Gaussians emit. One part is one file with one subclass and one entry in conf/effects/shared/parts.yaml.
 
     Class attributes:
         needs: metadata without which it cannot be simulated, as of a thermal model.

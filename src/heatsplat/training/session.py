@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import sys
 import warnings
@@ -17,6 +16,7 @@ import torch
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
 from heatsplat.kernels.scheduling import use_threads
+from heatsplat.training.machine import cores
 from heatsplat.training.module import SplatTraining
 
 log = logging.getLogger("heatsplat")
@@ -38,8 +38,8 @@ NOISE = (
 
 
 def prepare_machine(threads: int | None) -> None:
-    """Fixes the number of CPU threads (None takes all cores) and quietens messages that no user can act on."""
-    threads = threads or os.cpu_count() or 1
+    """Fixes the number of CPU threads (None: the cores that it may use) and quietens messages that no user can act on."""
+    threads = threads or cores()
     # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
     use_threads(threads)
     torch.set_num_threads(threads)

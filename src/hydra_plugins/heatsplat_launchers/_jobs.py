@@ -157,7 +157,7 @@ def _finished(job: Job) -> JobReturn | None:
 
 def _died(job: Job, error: Exception) -> JobReturn:
     """The result of a job whose process did not live to return one, with the reason in its folder."""
-    from heatsplat.cli import FAILED
+    from heatsplat.io.results import FAILED
 
     reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
     log.error("#%d died: %s", job.number, reason)

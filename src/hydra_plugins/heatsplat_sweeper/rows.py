@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,13 +12,55 @@ from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
-from hydra.types import RunMode
-from omegaconf import OmegaConf
+from hydra.core.utils import JobReturn
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, RunMode, TaskFunction
+from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
     from heatsplat.studies.published import Plan
 
 log = logging.getLogger("heatsplat")
+
+LONGEST = 120  # letters; file systems allow 255 bytes, and row, scene and number come with them
+
+
+def folder_name(overrides: str) -> str:
+    """Overrides of a job as a part of its folder's name: the same for the same job, another for every other job.
+
+    What is too long loses its middle, for seeds stand at its end; what would be a folder of its own is written in one. A hash
+    of the whole then stands behind.
+    """
+    name = re.sub(r"[/\\]", "-", overrides)
+    if len(name) <= LONGEST and name == overrides:
+        return name
+    mark = f"-{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
+    if len(name) > LONGEST - len(mark):
+        half = (LONGEST - len(mark) - len("..")) // 2
+        name = f"{name[:half]}..{name[-half:]}"
+    return name + mark
+
+
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+
+
+class Batches:
+    """A launcher that is handed a batch of jobs at a time. What failed is told when the last batch has ended.
+
+    Args:
+        launcher: what runs a batch.
+        size: jobs in a batch.
+    """
+
+    def __init__(self, launcher: Launcher, size: int) -> None:
+        self.launcher, self.size = launcher, size
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
+        """What the jobs returned, those that failed too, in their order."""
+        returned: list[JobReturn] = []
+        for i in range(0, len(job_overrides), self.size):
+            returned += self.launcher.launch(job_overrides[i : i + self.size], initial_job_idx=initial_job_idx + i)
+        return returned
 
 
 class RowSweeper(BasicSweeper):
@@ -26,7 +70,7 @@ class RowSweeper(BasicSweeper):
     in the same folder (``hydra.sweep.dir=...``) skips the jobs that have results; the others go on from their checkpoints.
 
     Args:
-        max_batch_size: jobs handed to the launcher at a time; None for all.
+        max_batch_size: jobs handed to the launcher at a time, all batches one after the other; None for all at once.
         params: the grid: key -> values with commas, as on the command line.
         rows: name of a row -> {"set": overrides of the row, "paper": what the paper prints for it}; None for a grid alone.
     """
@@ -37,18 +81,27 @@ class RowSweeper(BasicSweeper):
         params: Mapping[str, str] | None = None,
         rows: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
-        super().__init__(max_batch_size, None if params is None else dict(params))
+        if max_batch_size is not None and max_batch_size < 1:
+            raise ValueError(f"hydra.sweeper.max_batch_size must be 1 or more, or null for all, got {max_batch_size}")
+        # Hydra's own batches end with the first one in which a job failed, so to Hydra all jobs are one.
+        super().__init__(None, None if params is None else dict(params))
+        self.batch = max_batch_size
         self.rows = rows
         self.plan: Plan | None = None
 
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
+        if self.batch is not None:
+            self.launcher = Batches(self.launcher, self.batch)
+
     def split_arguments(self, overrides: list[Override], max_batch_size: int | None) -> list[list[list[str]]]:
-        """Batches of jobs, each the list of its overrides; all rows come with one seed before the next seed begins."""
+        """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins."""
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
         if self.plan is not None:
             jobs = [[*job, *run.overrides, f"row='{run.row}'"] for job in jobs for run in self.plan.runs]
         elif self.rows:
             jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
-        return list(self.split_overrides_to_chunks(jobs, max_batch_size))
+        return [jobs]
 
     def sweep(self, arguments: Sequence[str]) -> Any:
         from heatsplat.studies.sweeps import write_sweep

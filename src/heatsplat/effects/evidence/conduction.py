@@ -54,8 +54,11 @@ def conduction(obs: Observations) -> Evidence:
 def _kept(before: Tensor, after: Tensor, ambient: float | None) -> Tensor:
     """The share of their excess over the surroundings that levels keep."""
     if ambient is None:
-        ambient = float(torch.minimum(before, after).min())
-    return ((after - ambient) / (before - ambient).abs().clamp_min(1e-9)).median()
+        warms = bool((after - before).median() > 0)
+        ambient = float(torch.maximum(before, after).max() if warms else torch.minimum(before, after).min())
+    excess = before - ambient
+    clear = excess.abs() >= excess.abs().median().clamp_min(1e-9)
+    return ((after - ambient)[clear] / excess[clear]).median() if clear.any() else torch.zeros(())
 
 
 def _kept_apart(before: Tensor, after: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ def needed(fit: Fits, model: Model, obs: Observations) -> int:
     The grid of frequencies is that of the thermal model, whose response to a harmonic after its start is that harmonic
     and a decay.
     """
+    recorded = torch.tensor([t for t in obs.scene.train.times_s if t is not None], dtype=torch.float64)
     courses = fit.common_courses(max(model.courses, 1))
     frames, count = courses.shape
     passed = obs.times_s - obs.times_s.min()
@@ -28,7 +29,7 @@ def needed(fit: Fits, model: Model, obs: Observations) -> int:
     # A course is known as well as the mean over the points that show it; the noise of one point is the criterion's own.
     best, least = 1, math.inf
     for harmonics in COUNTS:
-        omega = frequency_grid(obs.times_s, harmonics, default_tau_min(obs.times_s), math.sqrt(0.5))
+        omega = frequency_grid(recorded, harmonics, default_tau_min(recorded), math.sqrt(0.5))
         phases = passed[:, None] * omega
         basis = torch.cat([torch.ones(frames, 1, dtype=torch.float64), decays, phases.cos(), phases.sin()], 1)
         if basis.shape[1] > frames - 2:

@@ -102,7 +102,7 @@ class Joint(Fits):
         self._restart(start)
         self._accept(model)
         self._accept(model)
-        return self._pruned(model)
+        return self._grown(self._pruned(model), (*SHARED, *OWN, "attenuation"))
 
     def _compared(self, model: Model, start: tuple[Tensor, Tensor]) -> float:
         self._restart(start)
@@ -124,7 +124,7 @@ class Joint(Fits):
         seen = {model}
         for _ in range(12):
             tried = [(name, more) for name, more in self.candidates(model) if name in names]
-            found = [more for name, more in tried if self._earns(more, model, name)]
+            found = [more for name, more in tried if self.earns(more, model, name)]
             best = min(found, key=lambda more: self.fitted(more).bic, default=None)
             if best is None or self.fitted(best).bic >= self.fitted(model).bic:
                 break
@@ -135,7 +135,8 @@ class Joint(Fits):
             seen.add(model)
         return self._pruned(model)
 
-    def _earns(self, more: Model, less: Model, name: str) -> bool:
+    def earns(self, more: Model, less: Model, name: str) -> bool:
+        """Whether an effect explains enough for what its parameters cost, and is large enough."""
         hurdle = OWN_HURDLE if name in (*OWN, "fixed_pattern") else SHARED_HURDLE
         return self.gain(more, less) > hurdle and self.worthwhile(more, less, name)
 
@@ -188,7 +189,7 @@ class Joint(Fits):
 
     def _pruned(self, model: Model) -> Model:
         while True:
-            idle = [name for name in sorted(model.names()) if not self._earns(model, model.without(name), name)]
+            idle = [name for name in sorted(model.names()) if not self.earns(model, model.without(name), name)]
             if not idle:
                 return model
             model = model.without(min(idle, key=lambda name: self.gain(model, model.without(name))))

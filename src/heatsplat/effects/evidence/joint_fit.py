@@ -170,6 +170,8 @@ def _evidence(obs: Observations, name: str, sentence: str) -> Evidence:
     gain, size = fit.gain(best, model), fit.effect_size(best, model)
     if gain > 1.0 and not fit.worthwhile(best, model, name):
         return Evidence(0.0, f"{sentence} {_beside(size)}, too little beside the noise or the changes of the scene")
+    if fit.earns(best, model, name):
+        return Evidence(0.0, f"{sentence} {_beside(size)}, which the effects that are on explain as well")
     return Evidence(gain, f"{sentence} {_beside(size)}; {gain:.1f} times what its parameters cost")
 
 

@@ -65,6 +65,9 @@ def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
         pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), view.camera.K)
         extent = pixels.new_tensor([view.camera.width, view.camera.height])
         inside[:, f] = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
+        if view.mask is not None:
+            column, line = pixels.long().clamp_min(0).minimum(extent.long() - 1).T
+            inside[:, f] &= view.mask[line, column]
         behind[:, f] = _nearer(pixels, local[:, 2], inside[:, f], int(extent[0] / BESIDE_PX) + 2)
         position = (2.0 * pixels / extent - 1.0).float()
         values[:, f] = between(view.thermal.mean(2, keepdim=True).float(), position)
@@ -86,11 +89,12 @@ def _nearer(pixels: Tensor, depths: Tensor, inside: Tensor, across: int) -> Tens
     """Which point [n] lies nearest to the camera in the same small square, where it is nearer by far; else -1."""
     squares = (pixels[:, 1] / BESIDE_PX).long() * across + (pixels[:, 0] / BESIDE_PX).long()
     ids = inside.nonzero()[:, 0]
-    order = ids[depths[ids].argsort(descending=True)]
-    first = torch.full((int(squares[ids].max()) + 1 if len(ids) else 1,), -1)
-    for_last = squares[order]
-    first[for_last] = order  # the last one written, the nearest, stays
-    nearest = torch.where(inside, first[squares.clamp(0, len(first) - 1)], -1)
+    order = ids[depths[ids].argsort(stable=True)]  # the nearest first
+    none = len(order)
+    first = torch.full((int(squares[ids].max()) + 1 if len(ids) else 1,), none)
+    first.scatter_reduce_(0, squares[order], torch.arange(none), "amin")
+    order = torch.cat([order, order.new_tensor([-1])])
+    nearest = torch.where(inside, order[first[squares.clamp(0, len(first) - 1)]], -1)
     much = depths > (1.0 + NEARER) * depths[nearest.clamp_min(0)]
     return torch.where(inside & (nearest >= 0) & much, nearest, -1)
 

@@ -11,6 +11,7 @@ from heatsplat.effects.evidence.joint_fit import joint
 from heatsplat.effects.observations import Observations
 
 HURDLE = 2.0
+BENT = 1.0  # statistic of radiation above which T⁴ shows as what it is
 MEAN_K = 290.0
 
 
@@ -36,16 +37,19 @@ def radiation(obs: Observations) -> Evidence:
     kept = torch.where(obs.tracks.weights > 0, obs.tracks.values, torch.nan)
     span_k = _span(kept) * obs.unit_k
     bend_k = 1.5 * (0.5 * span_k) ** 2 / MEAN_K
+    statistic = bend_k / (3.0 * obs.noise * obs.unit_k)
     return Evidence(
-        bend_k / (3.0 * obs.noise * obs.unit_k),
+        statistic,
         f"surfaces go through {span_k:.1f} K, over which T⁴ departs from a line by the worth of {bend_k:.2f} K; three times "
         f"the noise is {3 * obs.noise * obs.unit_k:.2f} K",
+        {"solution": "corrected" if statistic > BENT else "linear"},
     )
 
 
 def convection(obs: Observations) -> Evidence:
-    """Whether the wind of the record changes the exchange with the air by more than the noise can hide.
+    """Whether the wind of the record can change temperatures by more than the noise hides.
 
+    The record and the size of temperatures say so, not their course: wind is there, and what it does is a matter of scale.
     With h = 5 + 3 v (McAdams' order of magnitude), a surface that is D above the air in equilibrium is off by D · Δh / h
     when the wind is taken to be its mean.
     """

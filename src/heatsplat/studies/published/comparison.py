@@ -6,7 +6,8 @@ import csv
 import io
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
@@ -33,6 +34,7 @@ class Line:
         cost: name of a cost -> our mean.
         printed: metric -> the paper's figure.
         theirs: metric -> its value, or the mean of the printed values of the same scenes.
+        other: overrides that tell ours from other runs of the row in the folder; empty where there are no others.
     """
 
     scene: str
@@ -46,6 +48,7 @@ class Line:
     cost: dict[str, float] = field(default_factory=dict)
     printed: dict[str, Figure] = field(default_factory=dict)
     theirs: dict[str, float] = field(default_factory=dict)
+    other: str = ""
 
     def difference(self, metric: str) -> float | None:
         """Ours less theirs, None where either is missing."""
@@ -63,13 +66,27 @@ class Line:
 def write_comparison(folder: Path, plan: Plan) -> list[Path]:
     """Writes comparison.md and comparison.csv into the folder of a sweep, and returns their paths."""
     found = collect(folder)
-    key_of = {run.folder: run.scene for run in plan.runs}
-    results = {(row.name, key_of[row.scene]): row for row in found if row.scene in key_of}
-    lines = compare(plan, results)
-    failed = [f"{row.name} on {row.scene}: {reason}" for row in found for reason in row.failed]
+    lines = compare_all(plan, found)
+    failed = [f"{row.label} on {row.scene}: {reason}" for row in found for reason in row.failed]
     write_atomically(folder / COMPARISON_FILE, markdown(plan, lines, _reasons(folder, plan), failed))
     write_atomically(folder / COMPARISON_CSV, comparison_csv(plan, lines))
     return [folder / COMPARISON_FILE, folder / COMPARISON_CSV]
+
+
+def compare_all(plan: Plan, found: Sequence[Row]) -> list[Line]:
+    """The lines of the comparison; a row that ran with several settings (``Row.other``) has a line for each of them."""
+    key_of = {run.folder: run.scene for run in plan.runs}
+    known = [row for row in found if row.scene in key_of]
+    lines = [
+        replace(line, other=other)
+        for other in dict.fromkeys(row.other for row in known) or [""]
+        for line in compare(plan, {(row.name, key_of[row.scene]): row for row in known if row.other == other})
+    ]
+    alike: dict[tuple[str, str, str, tuple[str, ...]], list[Line]] = {}
+    for line in lines:
+        alike.setdefault((line.scene, line.method, line.setting, line.members), []).append(line)
+    shown = ([line for line in same if line.have] or [replace(same[0], other="")] for same in alike.values())
+    return [line for same in shown for line in same]
 
 
 def compare(plan: Plan, results: Mapping[tuple[str, str], Row]) -> list[Line]:
@@ -139,8 +156,10 @@ def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[
 
 def _reasons(folder: Path, plan: Plan) -> list[str]:
     """Why printed metrics have no value of ours, a line each."""
-    runs = [RunResults.read(path) for path in sorted(folder.glob(f"*/{METRICS_FILE}"))]
-    lines = []
+    runs, lines = [], []
+    for path in sorted(folder.glob(f"*/{METRICS_FILE}")):
+        with suppress(ValueError):  # told among the jobs without a result
+            runs.append(RunResults.read(path))
     for metric in dict.fromkeys(figure.metric for figure in plan.figures):
         ours, known = plan.ours(metric), METRICS[metric]
         if ours is None:
@@ -162,7 +181,8 @@ def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), fai
     head += [f"ours: {COSTS[name][0]}" for name in costs]
     table = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for line in lines:
-        cells = [line.label, line.method or "–", *([line.setting or "–"] if several else [])]
+        method = ", ".join(filter(None, [line.method, line.other])) or "–"
+        cells = [line.label, method, *([line.setting or "–"] if several else [])]
         cells += [_cell(line, metric) for metric in metrics]
         cells += [f"{line.cost[name]:,.{COSTS[name][1]}f}" if name in line.cost else "–" for name in costs]
         table.append("| " + " | ".join(cells) + " |")
@@ -203,7 +223,19 @@ def _cell(line: Line, metric: str) -> str:
 
 def comparison_csv(plan: Plan, lines: Sequence[Line]) -> str:
     """The comparison for programs: a row per scene, method, setting and metric, in full precision."""
-    columns = ["scene", "method", "setting", "metric", "ours", "ours_std", "runs", "scenes", "printed", "difference"]
+    columns = [
+        "scene",
+        "method",
+        "setting",
+        "overrides",
+        "metric",
+        "ours",
+        "ours_std",
+        "runs",
+        "scenes",
+        "printed",
+        "difference",
+    ]
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [*columns, *BESIDE, "note"], lineterminator="\n")
     writer.writeheader()
@@ -214,5 +246,7 @@ def comparison_csv(plan: Plan, lines: Sequence[Line]) -> str:
             numbers = {"ours": line.ours.get(metric), "ours_std": line.spread.get(metric), "runs": line.seeds}
             numbers |= {"scenes": len(line.have), "printed": told, "difference": line.difference(metric)}
             place = {"scene": line.scene, "method": line.method, "setting": line.setting, "metric": metric}
-            writer.writerow(place | numbers | line.cost | {"note": figure.note if figure else ""})
+            writer.writerow(
+                place | {"overrides": line.other} | numbers | line.cost | {"note": figure.note if figure else ""}
+            )
     return text.getvalue()

@@ -1,0 +1,62 @@
+"""Training runs that a study starts, each in a folder of its own: a study that was stopped finds them there again."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+
+log = logging.getLogger("heatsplat")
+
+WHERE_IT_RUNS = ("threads", "budget_curves")  # overrides of which a run's results do not tell
+
+
+def trained(place: Path, train: str, overrides: Sequence[str], study: Path) -> RunResults:
+    """The results of the run in ``place``, which is trained unless it has some.
+
+    Args:
+        place: folder of the run.
+        train: path of train.py.
+        overrides: what its command line says beside that folder.
+        study: folder of the study, which goes on where it was stopped.
+
+    Raises:
+        SceneError: the run failed, or the folder holds a run of other settings.
+    """
+    if (place / METRICS_FILE).exists():
+        _refuse_others(place, overrides)
+        return RunResults.read(place / METRICS_FILE)
+    log.info("training %s", place)
+    command = [sys.executable, train, *overrides, f"hydra.run.dir={place}"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        failed = place / FAILED
+        raise SceneError(
+            f"a run of the study failed; {failed if failed.exists() else 'its output'} says why. When that is mended, the "
+            f"same command with hydra.run.dir={study} goes on with what is left.\nFolder of the run: {place}\n"
+            f"Command: {' '.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
+        )
+    return RunResults.read(place / METRICS_FILE)
+
+
+def _refuse_others(place: Path, overrides: Sequence[str]) -> None:
+    path = place / ".hydra" / "overrides.yaml"
+    if not path.exists():
+        return
+    before, now = (_settings(texts) for texts in (yaml.safe_load(path.read_text()) or [], overrides))
+    if before != now:
+        raise SceneError(
+            f"{place} holds a run with other settings ({', '.join(sorted(before ^ now))}): delete that folder, or give the "
+            "study a folder of its own with hydra.run.dir"
+        )
+
+
+def _settings(overrides: Sequence[str]) -> frozenset[str]:
+    return frozenset(text for text in overrides if text.partition("=")[0] not in WHERE_IT_RUNS)

@@ -1,0 +1,56 @@
+"""Runs of a study: found again where they are the same, refused where they are not, and told where they fail."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from heatsplat.contracts import SceneError
+from heatsplat.studies.child_runs import trained
+
+SCRIPT = """import json, sys
+from pathlib import Path
+settings = dict(text.split("=", 1) for text in sys.argv[1:])
+place = Path(settings.pop("hydra.run.dir"))
+(place / ".hydra").mkdir(parents=True, exist_ok=True)
+(place / ".hydra" / "overrides.yaml").write_text(json.dumps([f"{k}={v}" for k, v in settings.items()]))
+if settings.get("seed") == "13":
+    (place / "FAILED").write_text("bad luck")
+    sys.exit("unlucky")
+sys.path[:0] = SOURCES
+from heatsplat.io.results import RunResults
+with (place / "times").open("a") as file:
+    file.write("once\\n")
+RunResults(run={"seed": settings.get("seed")}).write(place / "metrics.json")
+"""
+
+
+@pytest.fixture
+def script(tmp_path) -> str:
+    import heatsplat
+
+    path = tmp_path / "train.py"
+    path.write_text(SCRIPT.replace("SOURCES", repr([str(Path(heatsplat.__path__[0]).parent)])))
+    return str(path)
+
+
+def test_a_run_is_trained_once(script, tmp_path):
+    place = tmp_path / "study" / "one"
+    for threads in (1, 2):
+        assert trained(place, script, ["seed=3", f"threads={threads}"], tmp_path / "study").run["seed"] == "3"
+    assert (place / "times").read_text() == "once\n"
+
+
+def test_a_folder_with_a_run_of_other_settings_is_refused(script, tmp_path):
+    place = tmp_path / "study" / "one"
+    trained(place, script, ["seed=3", "max_steps=5"], tmp_path / "study")
+    with pytest.raises(SceneError, match=r"one holds a run with other settings \(max_steps=5, max_steps=9\): delete"):
+        trained(place, script, ["seed=3", "max_steps=9"], tmp_path / "study")
+
+
+def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):
+    place = tmp_path / "study" / "one"
+    with pytest.raises(SceneError, match="unlucky") as failure:
+        trained(place, script, ["seed=13"], tmp_path / "study")
+    assert f"{place / 'FAILED'} says why" in str(failure.value) and sys.executable in str(failure.value)
+    assert f"hydra.run.dir={tmp_path / 'study'} goes on" in str(failure.value)

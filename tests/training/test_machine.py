@@ -1,0 +1,36 @@
+"""Which cores a process takes."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from heatsplat import cli
+from heatsplat.training import machine, session
+
+SRC = Path(__file__).resolve().parents[2] / "src"
+
+
+@pytest.mark.parametrize(("asked", "expected"), [(None, 3), (2, 2)])
+def test_a_run_takes_the_cores_of_its_job_and_not_those_of_the_node(monkeypatch, asked, expected):
+    taken = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {4, 5, 6}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(session, "use_threads", taken.append)
+    monkeypatch.setattr(session.torch, "set_num_threads", taken.append)
+    session.prepare_machine(asked)
+    assert taken == [expected, expected]
+
+
+def test_where_no_process_can_be_bound_to_cores_all_count(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)  # macOS, Windows
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert machine.cores() == 8
+
+
+def test_the_command_line_counts_by_the_same_rule_and_loads_nothing_heavy_for_it():
+    assert cli.cores is machine.cores
+    told = "import sys, heatsplat.cli; sys.exit(bool({'torch', 'numba', 'pytorch_lightning'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", told], env={**os.environ, "PYTHONPATH": str(SRC)}).returncode == 0
