@@ -186,6 +186,7 @@ def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the
     config = compose_run(tmp_path, "method=3dgs")
     # Imported here: composing loads plugins, and with them the classes that sweep, anew.
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
     from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
 
     launcher = Remembering()

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import spread
-from heatsplat.callbacks.metrics import CURVE_FILE, TEST_FILE, read_table
+from heatsplat.callbacks.metrics import TEST_FILE, read_table
 from heatsplat.contracts import SceneData
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import METRICS_FILE, RunResults, collect_versions, write_atomically
