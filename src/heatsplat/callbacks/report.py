@@ -18,7 +18,7 @@ from heatsplat.callbacks.images import spread
 from heatsplat.callbacks.metrics import TEST_FILE, read_table
 from heatsplat.contracts import SceneData
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import METRICS_FILE, RunResults, collect_versions, write_atomically
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
 from heatsplat.metrics import DEFINITIONS
 
 REPORT_FILE = "report.md"
