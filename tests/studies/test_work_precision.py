@@ -118,6 +118,8 @@ def test_the_front_holds_what_nothing_beats():
 
     quick, exact, beaten, blown = row(1, 0.1), row(3, 1e-3), row(2, 0.2), row(0.1, np.inf)
     assert report.front([beaten, exact, blown, quick, row(0.0, 0.0, "over")], "us") == [quick, exact]
+    rounding = [row(1.0, 1e-13), row(4.0, 6e-14)]  # both at the lower edge of the picture
+    assert report.front(rounding, "us") == rounding[:1]
 
 
 def test_the_study_runs_from_its_configuration(tmp_path):
@@ -130,9 +132,7 @@ def test_the_study_runs_from_its_configuration(tmp_path):
         assert len(list(csv.DictReader(file))) == len(rows)
     for name in ("work_precision", "work_precision_alone"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
-        assert (tmp_path / f"{name}.svg").read_text().count("RK4") >= 1 or (
-            tmp_path / f"{name}.svg"
-        ).stat().st_size > 10_000
+        assert "RK4" in (tmp_path / f"{name}.svg").read_text()
     text = (tmp_path / "table.md").read_text()
     assert "## Rules" in text and "the front is" in text and "nan" not in text
     assert not document.exists()  # half a table does not replace a whole one

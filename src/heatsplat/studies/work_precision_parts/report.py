@@ -132,12 +132,12 @@ def drawn(row: Any) -> float:
 
 
 def front(rows: Sequence[Any], order: str) -> list[Any]:
-    """Rows that no other beats in both time and error, from the quickest on; blown-up ones are none."""
+    """Rows that no other beats in both time and error as drawn, from the quickest on; blown-up ones are none."""
     found, best = [], BLOWN_K
-    for row in sorted((r for r in rows if not r.given_up), key=lambda r: (getattr(r, order), r.worst_k)):
-        if row.worst_k < best:
+    for row in sorted((r for r in rows if not r.given_up), key=lambda r: (getattr(r, order), drawn(r))):
+        if drawn(row) < best:
             found.append(row)
-            best = row.worst_k
+            best = drawn(row)
     return found
 
 
@@ -272,10 +272,12 @@ def _verdict(rows: Sequence[Any], name: str, title: str) -> list[str]:
     for order, label in (("us", "In order"), ("us_alone", "Alone")):
         best = front(done, order)
         others = [f"{_point(r, order)}" for r in best if not r.ours]
-        text = "ours alone" if not others else "ours and " if any(r.ours for r in best) else "not ours, but "
+        text = "ours and " if any(r.ours for r in best) else "not ours, but "
+        if not others:
+            text = "ours alone" if best else "empty: all blew up"
         lines.append(f"  - {label}, the front is {text}{'; '.join(others)}.")
         for own in _chosen(done):
-            rivals = [r for r in done if not r.ours and r.worst_k <= EQUAL * own.worst_k]
+            rivals = [r for r in done if not r.ours and drawn(r) <= EQUAL * drawn(own)]
             rival = min(rivals, key=lambda r: getattr(r, order), default=None)
             text = "no other comes within twice its error within the limits"
             if rival is not None:
@@ -287,10 +289,12 @@ def _verdict(rows: Sequence[Any], name: str, title: str) -> list[str]:
 
 def _chosen(done: Sequence[Any]) -> list[Any]:
     """One point for each of our solvers that the product would take here: its first type, with the product's size of tables."""
-    groups = [points for (_, _), points in _groups([r for r in done if r.ours]).items()]
-    first = {points[0].solver: points for points in reversed(groups)}
-    if "closed form, fused kernel" in first:  # the product takes the other elsewhere than in float32 on a CPU
-        del first["closed form, torch"]
+    groups = _groups([r for r in done if r.ours])
+    first = {points[0].solver: points for points in reversed(groups.values())}
+    if "closed form, fused kernel" in first:  # which is float32 on a CPU; in float64 the product takes the other
+        first.pop("closed form, torch", None)
+        if ("closed form, torch", "float64") in groups:
+            first["closed form, torch"] = groups["closed form, torch", "float64"]
     chosen = (next((r for r in points if r.setting == f"{RATES} rates"), points[-1]) for points in first.values())
     return sorted(chosen, key=lambda r: r.us)
 
