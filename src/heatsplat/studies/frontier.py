@@ -403,14 +403,19 @@ def table_csv(recipes: Sequence[Recipe]) -> str:
 
 
 def picture(recipes: Sequence[Recipe]) -> Figure:
-    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front."""
+    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front.
+
+    A recipe looks the same in all panels.
+    """
     scenes = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    places = {name: j for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
     for i, scene in enumerate(scenes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
         for k, (name, label) in enumerate((("psnr", "PSNR (dB)"), ("mae_c", "MAE (°C)"))):
             axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
-            for j, recipe in enumerate(own):
+            for recipe in own:
+                j = places[recipe.name]
                 color, mark = f"C{j % 10}", "os^Dv<>P"[j // 10 % 8]
                 for one in recipe.runs:
                     if one.course.get(name):
@@ -428,6 +433,9 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
             axes.set(xlabel="seconds of training", ylabel=label, title=scene, xscale="log")
             if name == "mae_c":
                 axes.set_yscale("log")
+                axes.yaxis.set_major_formatter("{x:g}")
+                axes.yaxis.set_minor_formatter("{x:g}")
+            axes.xaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.25, which="both")
             if k == 0 and own:
                 axes.legend(fontsize=7)
