@@ -26,8 +26,7 @@ class Adaptive(DensityControl):
         clone_scale: Gaussians with a largest semi-axis up to this (times extent) are cloned, larger ones split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed.
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
-        reset_every: steps between opacity resets; each leaves as many steps of growth after it, so that what it takes
-            grows again before ``stop``. None: no resets.
+        reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
         reset_opacity: opacities are lowered to at most this.
         cap_max: never more Gaussians than this; the strongest gradients grow first.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
@@ -55,7 +54,6 @@ class Adaptive(DensityControl):
         self.grad_threshold, self.clone_scale = grad_threshold, clone_scale
         self.prune_opacity, self.prune_scale = prune_opacity, prune_scale
         self.reset_every, self.reset_opacity = reset_every, reset_opacity
-        self._resets = range(0) if reset_every is None else range(reset_every, stop - reset_every + 1, reset_every)
         self.cap_max, self.absgrad = cap_max, absgrad
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
@@ -83,7 +81,7 @@ class Adaptive(DensityControl):
             removed = self._prune(cloud, step, extent)
             for statistic in cloud.state.values():
                 statistic.zero_()
-        reset = step + 1 in self._resets
+        reset = self.reset_every is not None and 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
         if reset:
             ceiling = torch.logit(torch.tensor(self.reset_opacity)).item()
             cloud.overwrite("opacity_logits", cloud.splats["opacity_logits"].clamp(max=ceiling))
@@ -121,7 +119,7 @@ class Adaptive(DensityControl):
 
     def _prune(self, cloud: Cloud, step: int, extent: float) -> int:
         keep = (cloud.splats.opacities > self.prune_opacity).any(dim=0)
-        if self._resets and step + 1 > self._resets[0]:
+        if self.reset_every is not None and step + 1 > self.reset_every:
             keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
         keep &= torch.isfinite(cloud.splats.means).all(dim=1)
         removed = int((~keep).sum())
