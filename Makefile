@@ -32,8 +32,8 @@ $(READY): pyproject.toml constraints/torch.txt
 demo: $(READY)  ## train ETGS on the embedded synthetic scene, one to four minutes; ends with the metrics and a picture
 	@$(RUN) src/train.py method=etgs max_steps=7000 $(ARGS)
 
-test: $(READY)  ## run the tests
-	@$(RUN) -m pytest -m "not slow" $(ARGS)
+test: $(READY)  ## run the tests, side by side on up to four cores (a file's tests stay together)
+	@$(RUN) -m pytest -m "not slow" -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 test-slow: $(READY)  ## run the tests that take minutes
 	@$(RUN) -m pytest -m slow $(ARGS)

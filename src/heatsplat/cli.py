@@ -5,13 +5,13 @@ Only Hydra is imported before the configuration is composed, so that --help, --c
 
 from __future__ import annotations
 
+import functools
 import logging
 import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,9 @@ ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")
 
 log = logging.getLogger("heatsplat")
-build = partial(hydra.utils.instantiate, _convert_="all")
+build = functools.partial(hydra.utils.instantiate, _convert_="all")
+
+Look = Callable[[], dict[str, Any]]  # returns verdicts on effects by name
 
 
 def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
@@ -112,7 +114,7 @@ def _job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]
     In a sweep the exception goes on to Hydra, which runs the other jobs; a single run ends with exit code 1.
     """
 
-    @wraps(work)
+    @functools.wraps(work)
     def job(config: DictConfig) -> Any:
         from heatsplat.io.results import FAILED  # here, for it brings torch
 
@@ -161,9 +163,10 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     prepare_machine(config.threads)
     plain = resolved(config)
     data = build(plain["data"])
+    look = functools.cache(lambda: judged(plain["effects"], data.scene))
     if plain["budget"] is not None:
-        plain = budgeted(config, data, output_dir)
-    plain = begun(plain, data, output_dir) or with_effects(plain, data)
+        plain = budgeted(config, data, output_dir, look)
+    plain = begun(plain, data, output_dir) or with_effects(plain, data, look)
     trainer = build(plain["trainer"], callbacks=build_callbacks(plain["callbacks"]), logger=build(plain["logger"]))
     module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain  # set, not passed: Hydra would build every part in it once more
@@ -184,11 +187,11 @@ def resolved(config: DictConfig) -> dict[str, Any]:
     return plain
 
 
-def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
+def budgeted(config: DictConfig, data: Any, output_dir: Path, look: Look | None = None) -> dict[str, Any]:
     """The configuration of a run that makes the most of ``budget`` seconds; a run that goes on keeps its plan.
 
     "budget" then holds the plan, made from the curves in the file ``budget_curves`` (None: those of the package). The
-    trainer has room for more steps than planned, which ``BudgetClock`` may use.
+    trainer has room for more steps than planned, which ``BudgetClock`` may use. ``look`` is that of ``with_effects``.
     """
     from heatsplat.contracts import SceneError
     from heatsplat.studies import budget
@@ -213,7 +216,7 @@ def budgeted(config: DictConfig, data: Any, output_dir: Path) -> dict[str, Any]:
     else:
         points = budget.read_points(Path(plain["budget_curves"] or budget.CURVES_FILE))
         log.info("measuring what a step costs here")
-        choosing = with_effects(plain | {"effects": plain["effects"] | {"price": False}}, data)
+        choosing = with_effects(plain | {"effects": plain["effects"] | {"price": False}}, data, look)
         pace = budget.calibrate(
             lambda: build(choosing["module"]), data.scene, plain["max_steps"], seconds, device_of(plain)
         )
@@ -301,11 +304,26 @@ def begun(plain: dict[str, Any], data: Any, output_dir: Path) -> dict[str, Any] 
     return None
 
 
-def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
+def judged(effects: dict[str, Any], scene: Any) -> dict[str, Any]:
+    """Verdicts on all effects in a scene that can be simulated together, as the group "effects" of a configuration wishes."""
+    from heatsplat.effects import assembly
+    from heatsplat.effects.catalogue import decide
+
+    log.info("looking at scene %s for the effects that it calls for", scene.name)
+    seen = decide(scene, assembly.wishes(effects))
+    return assembly.reconciled(assembly.possible(seen, scene), assembly.explicit(effects))
+
+
+def with_effects(plain: dict[str, Any], data: Any, look: Look | None = None) -> dict[str, Any]:
     """The configuration of a run with the effects that its scene calls for, where it leaves them to be chosen.
 
     Thermal model, sensor and loss then stand in it as they are built, and "verdicts" says why. A run that goes on from a
     checkpoint takes all that from there.
+
+    Args:
+        plain: as composed.
+        data: the data module.
+        look: returns the verdicts (``judged``); who needs them more than once keeps them. None looks at the scene.
     """
     from heatsplat.contracts import SceneError
     from heatsplat.effects import assembly
@@ -336,12 +354,7 @@ def with_effects(plain: dict[str, Any], data: Any) -> dict[str, Any]:
                 )
             return assembly.filled(plain, stored, stored["verdicts"])
 
-    from heatsplat.effects.catalogue import decide
-
-    given = assembly.explicit(plain["effects"])
-    log.info("looking at scene %s for the effects that it calls for", data.scene.name)
-    seen = decide(data.scene, assembly.wishes(plain["effects"]))
-    verdicts = assembly.reconciled(assembly.possible(seen, data.scene), given)
+    verdicts = look() if look else judged(plain["effects"], data.scene)
 
     def configured(chosen: dict[str, Any]) -> dict[str, Any]:
         return assembly.filled(plain, assembly.recipe(chosen, plain["effects"]), assembly.told(verdicts, found))

@@ -224,10 +224,10 @@ class View:
             raise SceneError(f"view {self.frame.name} has no {modality} image; choose a method or data set that fits")
         return image
 
-    def to(self, device: torch.device | str) -> View:
-        """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them)."""
+    def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> View:
+        """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them), as ``dtype`` if given."""
         moved = {
-            key: value.to(device, non_blocking=True)
+            key: value.to(device, dtype if value.is_floating_point() else None, non_blocking=True)
             for key in ("thermal", "rgb", "mask", "clean")
             if (value := getattr(self, key)) is not None
         }

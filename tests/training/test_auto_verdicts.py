@@ -1,22 +1,13 @@
 """method=auto from images to the table of effects, with the verdicts that the images themselves lead to."""
 
 import pytest
-from running import run
+from running import TINY, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from heatsplat.effects import assembly
 from heatsplat.io.results import RunResults
 
-SHORT = (
-    "data.size=tiny",
-    "max_steps=20",
-    "threads=1",
-    "density=fixed",
-    "trainer.val_check_interval=20",
-    "trainer.limit_test_batches=1",
-    "callbacks.probes=null",
-    "callbacks.images=null",
-)
+SHORT = (*TINY, "max_steps=20", "density=fixed", "trainer.val_check_interval=20", "trainer.limit_test_batches=1")
 
 
 @pytest.fixture(scope="module")

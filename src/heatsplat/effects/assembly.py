@@ -26,6 +26,7 @@ CAMERA = {
     "tone": ("tone",),
 }
 SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each wishes of an effect of which nothing is said
+PAPERS = "etgs, ravigs, ti3dgs, thermogs, supirgs"  # selections of the group "effects" that are a paper's
 SCENE_SAYS = "scene"  # value of a setting that the evidence chooses; without evidence it is the class's own default
 
 
@@ -68,20 +69,20 @@ def chooses(config: Mapping[str, Any]) -> bool:
     if composed and not chosen:
         raise SceneError(
             f"effects=method leaves method={method} without effects: it has none of its own. Give effects=auto, all, none "
-            "or a paper's selection (etgs, ravigs, ti3dgs, thermogs, supirgs)."
+            f"or a paper's selection ({PAPERS})."
         )
     if chosen and not composed:
         raise SceneError(
             f"effects={effects['select']} chooses the parts of method=auto, but method={method} has its own; "
             "give method=auto, or leave effects out."
         )
-    asked = {} if chosen else explicit(effects)
-    if asked:
-        name, wish = next(iter(asked.items()))
+    idle = {} if chosen else explicit(effects)
+    if idle:
+        name, wish = next(iter(idle.items()))
         raise SceneError(
             f"effects.{name}={wish} is asked for, but method={method} simulates what its paper does. Give method=auto with "
-            f"that paper's selection and your wish, such as method=auto effects=etgs effects.{name}={wish} (etgs, ravigs, "
-            "ti3dgs, thermogs, supirgs), or the method's own options (thermal.*, sensor.*)."
+            f"that paper's selection and your wish, such as method=auto effects=etgs effects.{name}={wish} ({PAPERS}), "
+            "or the method's own options (thermal.*, sensor.*)."
         )
     return chosen
 

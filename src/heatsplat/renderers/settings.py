@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -11,6 +13,9 @@ from heatsplat.renderers.base import BACKENDS, rasterization
 
 class Renderer:
     """``rasterization`` with the settings of a run.
+
+    A run in float64 is rasterised in float32 all the same, and its images and gradients are float64 again: only the
+    backend "reference" computes in float64.
 
     Args:
         backend: "auto", "cpu", "gsplat" or "reference".
@@ -57,22 +62,31 @@ class Renderer:
         depth: bool = False,
     ) -> RenderOutput:
         """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``."""
-        return rasterization(
-            means,
-            quats,
-            scales,
-            opacities,
-            features,
-            camera.viewmat.to(torch.float32),
-            camera.K.to(torch.float32),
+        given = means.dtype
+        dtype = given if self.backend == "reference" else torch.float32
+
+        def narrowed(ids: Tensor) -> Tensor:
+            return features(ids).to(dtype)
+
+        seen = rasterization(
+            means.to(dtype),
+            quats.to(dtype),
+            scales.to(dtype),
+            opacities.to(dtype),
+            narrowed if callable(features) else features.to(dtype),
+            camera.viewmat.to(dtype),
+            camera.K.to(dtype),
             camera.width,
             camera.height,
             near=self.near,
             far=self.far,
-            background=background,
+            background=None if background is None else background.to(dtype),
             antialiased=self.antialiased,
             modality_channels=modality_channels,
             backend=self.backend,
             absgrad=absgrad,
             depth=depth,
         )
+        if given == dtype:
+            return seen
+        return replace(seen, features=seen.features.to(given), alpha=seen.alpha.to(given))

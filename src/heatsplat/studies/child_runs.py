@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-
-import yaml
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+from heatsplat.studies.recorded import OVERRIDES, overrides_of
 
 log = logging.getLogger("heatsplat")
 
@@ -47,10 +46,9 @@ def trained(place: Path, train: str, overrides: Sequence[str], study: Path) -> R
 
 
 def _refuse_others(place: Path, overrides: Sequence[str]) -> None:
-    path = place / ".hydra" / "overrides.yaml"
-    if not path.exists():
+    if not (place / OVERRIDES).exists():
         return
-    before, now = (_settings(texts) for texts in (yaml.safe_load(path.read_text()) or [], overrides))
+    before, now = _settings(overrides_of(place).items()), _settings(text.partition("=")[::2] for text in overrides)
     if before != now:
         raise SceneError(
             f"{place} holds a run with other settings ({', '.join(sorted(before ^ now))}): delete that folder, or give the "
@@ -58,5 +56,5 @@ def _refuse_others(place: Path, overrides: Sequence[str]) -> None:
         )
 
 
-def _settings(overrides: Sequence[str]) -> frozenset[str]:
-    return frozenset(text for text in overrides if text.partition("=")[0] not in WHERE_IT_RUNS)
+def _settings(overrides: Iterable[tuple[str, str]]) -> frozenset[str]:
+    return frozenset(f"{key}={value}" for key, value in overrides if key not in WHERE_IT_RUNS)

@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.recorded import OVERRIDES, config_of, overrides_of
 from heatsplat.studies.sweeps import named_row, settings_of, unshared
 
 log = logging.getLogger("heatsplat")
@@ -165,7 +166,7 @@ def read_runs(folder: Path) -> list[Run]:
     found = []
     for file in sorted(folder.rglob(METRICS_FILE)):
         place = file.parent
-        if not (place / CURVE_FILE).exists() or not (place / ".hydra" / "overrides.yaml").exists():
+        if not (place / CURVE_FILE).exists() or not (place / OVERRIDES).exists():
             continue
         try:
             found.append(_read_run(place))
@@ -176,23 +177,17 @@ def read_runs(folder: Path) -> list[Run]:
 
 def _read_run(place: Path) -> Run:
     results = RunResults.read(place / METRICS_FILE)
-    overrides = dict(str(text).partition("=")[::2] for text in _yaml(place / ".hydra" / "overrides.yaml") or [])
-    config = place / ".hydra" / "config.yaml"
-    data = (_yaml(config) or {}).get("data") if config.exists() else None
+    overrides = overrides_of(place)
     return Run(
         place,
         str(results.run.get("scene")),
-        _measured(results.data, data or {}),
+        _measured(results.data, config_of(place).get("data") or {}),
         str(results.run.get("method")),
         named_row(overrides),
         settings_of(overrides),
         {name: value for name, value in (results.test | results.cost).items() if value is not None},
         _courses(place / CURVE_FILE),
     )
-
-
-def _yaml(path: Path) -> Any:
-    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:

@@ -26,7 +26,7 @@ class Stepper:
         self.module = module
         module.attach(scene)
         module.loss.prepare(scene, module.modality)
-        module.trainer = SimpleNamespace(max_steps=max_steps, global_step=step, world_size=1)
+        module.trainer = SimpleNamespace(max_steps=max_steps, global_step=step, world_size=1, precision="32-true")
         module.to(device).on_fit_start()
         self.optimizer = module.configure_optimizers()["optimizer"]
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from matplotlib.figure import Figure
 
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.recorded import OVERRIDES, config_of, overrides_of
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them, with heading and digits.
@@ -40,14 +40,7 @@ PLACES = {"data", "data.root", "data.scene"}
 NAMES = {"method", "row", "ablation", "experiment"}
 HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
-NOT_WHAT_WAS_LEARNED = {
-    "trainer",
-    "launcher",
-    "callbacks",
-    "logger",
-    "hydra",
-    "table",
-}  # groups: these and all below them
+NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra", "table"}  # these groups with all below
 
 
 @dataclass
@@ -110,11 +103,11 @@ def write_sweep(folder: Path, order: Sequence[str] = (), paper: Mapping[str, str
 def collect(folder: Path) -> list[Row]:
     """The rows of a sweep's folder, in the order of its jobs. Jobs of one name and other settings are rows of their own."""
     rows: dict[tuple[str, str, str], Row] = {}
-    jobs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
-    names = row_names([dict(text.partition("=")[::2] for text in _yaml(job, "overrides")) for job in jobs])
+    jobs = sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number)
+    names = row_names([overrides_of(job) for job in jobs])
     for job, (name, other) in zip(jobs, names, strict=True):
         results, reason = _results(job)
-        scene = str(results.run["scene"]) if results and "scene" in results.run else _scene(_yaml(job, "config"))
+        scene = str(results.run["scene"]) if results and "scene" in results.run else _scene(config_of(job))
         row = rows.setdefault((scene, name, other), Row(name, scene, other=other))
         if results is None:
             row.failed.append(reason)
@@ -184,11 +177,6 @@ def _results(job: Path) -> tuple[RunResults | None, str]:
         return RunResults.read(job / METRICS_FILE), ""
     except (ValueError, OSError) as error:
         return None, f"{error}. Delete the folder to run it again."
-
-
-def _yaml(job: Path, name: str) -> Any:
-    """What Hydra wrote down of a job: its "overrides" or its "config"."""
-    return yaml.safe_load((job / ".hydra" / f"{name}.yaml").read_text(encoding="utf-8")) or {}
 
 
 def _scene(config: Mapping[str, Any]) -> str:

@@ -47,7 +47,12 @@ class SplatTraining(pl.LightningModule):
         composite: in which quantity splats are blended; None: in image values, as they are.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
+        dtype: "float32" or "float64", of splats, heat, sensor, loss and optimiser; what the renderer makes of it is said
+            in ``Renderer``.
         output_dir: folder of the run.
+
+    Raises:
+        ValueError: the dtype is none of the two.
     """
 
     def __init__(
@@ -63,6 +68,7 @@ class SplatTraining(pl.LightningModule):
         composite: Composite | None = None,
         seed: int = 0,
         supersample: int = 1,
+        dtype: str = "float32",
         output_dir: Path | str = ".",
     ) -> None:
         super().__init__()
@@ -74,6 +80,9 @@ class SplatTraining(pl.LightningModule):
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
         self.supersample = supersample
+        if dtype not in ("float32", "float64"):
+            raise ValueError(f"dtype must be float32 or float64, got '{dtype}'")
+        self._wide = dtype == "float64"
         self.results = RunResults()
         self.scene: SceneData | None = None
         self.splats: Splats | None = None
@@ -102,12 +111,19 @@ class SplatTraining(pl.LightningModule):
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.carried(torch.cat(behind), self.thermal.modality_channels[0]))
+        if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
+            self.double()
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
             raise RuntimeError(
                 f"one scene trains on one device, but trainer.devices asks for {self.trainer.world_size}. "
                 "Use several devices by jobs side by side: add -m and launcher=joblib or launcher=slurm."
+            )
+        if self.trainer.precision != "32-true":
+            raise SceneError(
+                f"trainer.precision={self.trainer.precision} would convert what has a precision of its own, such as phases and "
+                "times: leave it out, and give dtype=float64 for a run in double precision"
             )
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
@@ -165,7 +181,7 @@ class SplatTraining(pl.LightningModule):
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
-        view = view.to(self.device)
+        view = view.to(self.device, self.dtype)
         self.thermal.on_step(step)
         frame = self._fine(view.frame)
         output = self.render(frame, absgrad=self.density.absgrad)

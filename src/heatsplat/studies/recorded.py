@@ -1,0 +1,25 @@
+"""What Hydra wrote down of a run in the run's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+OVERRIDES = Path(".hydra") / "overrides.yaml"
+CONFIG = Path(".hydra") / "config.yaml"
+
+
+def overrides_of(place: Path) -> dict[str, str]:
+    """What the command line said of the run in a folder: key -> value, as text; empty where nothing was written down."""
+    return dict(str(text).partition("=")[::2] for text in _read(place / OVERRIDES) or [])
+
+
+def config_of(place: Path) -> dict[str, Any]:
+    """The configuration of the run in a folder, as composed; empty where none was written down."""
+    return _read(place / CONFIG) or {}
+
+
+def _read(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else None
