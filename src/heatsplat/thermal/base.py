@@ -40,11 +40,12 @@ class Query:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Moved geometry of a deforming model, for all N Gaussians: means [N, 3], quats [N, 4], scales [N, 3]."""
+    """Geometry of all N Gaussians at a time: means [N, 3], quats [N, 4], scales [N, 3], opacities [M, N]."""
 
     means: Tensor
     quats: Tensor
     scales: Tensor
+    opacities: Tensor
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ class ThermalModel(nn.Module, ABC):
         """What the Gaussians in ``query.ids`` emit. Evaluates those only."""
 
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
-        """Moved geometry at ``query.time_s`` for deforming models; None means that splats stay where they are."""
+        """Geometry at ``query.time_s`` for deforming models; None means that splats stay as they are."""
         return None
 
     def on_step(self, step: int) -> None:

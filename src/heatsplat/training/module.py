@@ -163,7 +163,6 @@ class SplatTraining(pl.LightningModule):
 
         output = self.renderer(
             *self._geometry(frame),
-            self.splats.opacities,
             emitted,
             frame.camera,
             self.background,
@@ -173,11 +172,11 @@ class SplatTraining(pl.LightningModule):
         )
         return replace(output, features=self.composite.shown(output.features, channels))
 
-    def _geometry(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, rotations and scales of all Gaussians at the time of ``frame``."""
+    def _geometry(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, scales and opacities of all Gaussians at the time of ``frame``."""
         moved = self.thermal.geometry(self.splats, _query(frame))
         shown = self.splats if moved is None else moved
-        return shown.means, shown.quats, shown.scales
+        return shown.means, shown.quats, shown.scales, shown.opacities
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
@@ -264,8 +263,9 @@ class SplatTraining(pl.LightningModule):
         told = self.attributes(frame)
         if not told:
             return {}
-        values, opacities = torch.stack(list(told.values()), dim=1), self.splats.opacities[:1]
-        output = self.renderer(*self._geometry(frame), opacities, values, frame.camera, None, (len(told),))
+        *shape, opacities = self._geometry(frame)
+        values = torch.stack(list(told.values()), dim=1)
+        output = self.renderer(*shape, opacities[:1], values, frame.camera, None, (len(told),))
         alpha = output.alpha[0, ..., None]
         maps = torch.where(alpha > 0, output.features / alpha, torch.nan)
         return dict(zip(told, maps.unbind(-1), strict=True))
