@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from heatsplat.physics import energy_balance
 from heatsplat.physics.energy_balance import Climate, Surface, power_excess
 from tests.physics.weather_reference import drivers, solved
 
@@ -82,6 +83,41 @@ def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solutio
                 name,
                 column,
             )  # float32 tables; sensitivities of second order
+
+
+OFF = {  # what a balance is without, and the same said by numbers to the balance that has everything
+    "wind": ({"wind": None}, {"wind": 0.0}),
+    "sun": ({"sun": None}, {"sun": 0.0}),
+    "share": ({"share": None}, {"share": 0.0}),
+    "sun and wind": ({"sun": None, "wind": None}, {"sun": 0.0, "wind": 0.0}),
+    "normals": ({"normals": None}, {"normals": (0.0, 0.0, 1.0)}),
+}
+
+
+@pytest.mark.parametrize("name", OFF)
+def test_the_march_without_an_effect_is_that_with_its_parameter_at_zero_and_has_no_column_of_it(name, monkeypatch):
+    gone, zeroed = OFF[name]
+    if name == "normals":  # the beam, which a surface without a normal does not see, is then in the light
+        climate = Climate(replace(drivers(), beams=None))
+    else:
+        climate = Climate(drivers())
+    columns, march = [], energy_balance.kernels.march
+    monkeypatch.setattr(
+        energy_balance.kernels, "march", lambda *given: (columns.append(given[1].shape[1]), march(*given))
+    )
+    whole = bodies(wind=True)
+    zeros = {key: torch.zeros_like(getattr(whole, key)) + tensor(*([x] if x == 0 else x)) for key, x in zeroed.items()}
+    found = []
+    for surface in (whole._replace(**gone), whole._replace(**zeros)):
+        leaves = [None if x is None else x.clone().requires_grad_() for x in surface]
+        x = climate.marched_temperature(Surface(*leaves), 40_000.0)
+        x.sum().backward()
+        found.append((x.detach(), leaves))
+    assert columns == [8 - sum(3 if key == "normals" else 1 for key in gone), 8]
+    torch.testing.assert_close(found[0][0], found[1][0], atol=1e-9, rtol=0)
+    for one, other in zip(found[0][1], found[1][1], strict=True):
+        if one is not None:
+            torch.testing.assert_close(one.grad, other.grad, atol=1e-9, rtol=1e-9)
 
 
 def test_mean_temperature_balances_the_mean(climate):

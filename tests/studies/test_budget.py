@@ -333,10 +333,11 @@ def test_growing_is_held_back_while_it_takes_too_much_of_the_time_and_no_longer(
 
     def step_s(step: int) -> float:
         caps.append(module.density.cap_max)
-        return (1.6 if 100 <= step < 200 else 0.9) * 9.0 / 1000
+        slow = 100 <= step < 200 or step < 40  # first steps are, which says nothing
+        return (1.8 if slow else 0.9) * 9.0 / 1000
 
     simulate(a_clock(), step_s, module=module)
-    assert caps[50] == 9000 and caps[190] == 4000 and caps[450] == 9000
+    assert set(caps[:100]) == {9000} and caps[190] == 4000 and caps[450] == 9000
     assert 100 < module.results.run["budget"]["growth_held_at_step"] < 200
 
 

@@ -17,6 +17,7 @@ log = logging.getLogger("heatsplat")
 SETTLED = 0.5  # share of the schedule after which no Gaussian is added and the rest may be stretched (density.stop)
 GROWING = 0.6  # share of the time that the schedule up to there may take; else no more Gaussians come
 PRESSED = 0.7  # share of the time after which the schedule is shrunk, settled or not
+EARLY = 0.1  # share of the time in which growing is left alone: few Gaussians have come, and first steps are slow
 WINDOW = 0.05  # share of the time over which the pace is measured: a machine may become slower at any moment
 LOOKS = 400  # looks at the clock in a run of the planned length
 
@@ -31,7 +32,8 @@ class BudgetClock(pl.Callback):
 
     Where a scene calls for more Gaussians than expected, or the machine is slower, growing would eat the time in which they
     settle: as long as the growing half would take more than six tenths of the time, no more Gaussians come
-    (``density.cap_max``). Where seven tenths of the time are gone before it ends, the schedule is shrunk at once.
+    (``density.cap_max``); the first tenth of the time is left alone. Where seven tenths of the time are gone before it ends,
+    the schedule is shrunk at once.
 
     Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its clock.
@@ -111,7 +113,7 @@ class BudgetClock(pl.Callback):
     def _hold(self, step: int, spent: float, count: int) -> None:
         """Lets no Gaussian come beyond ``count`` as long as growing takes too much of the time; see the class."""
         step_s = self._step_s()
-        if step_s is None or not self._policies:
+        if step_s is None or not self._policies or spent < EARLY * self.seconds:
             return
         growing = spent + step_s * (SETTLED - self.progress(step)) * self._end
         held = growing > GROWING * self.seconds

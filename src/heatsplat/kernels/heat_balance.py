@@ -8,10 +8,12 @@ multiply-adds each; nothing is stored along the way. Results do not depend on th
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.compile_time import compile_time, constant
 
 BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
@@ -19,11 +21,53 @@ MEMORY = 15.0  # time constants after which a body has forgotten: e^-15 of 50 K 
 SUBSTEPS = 8  # of an interval between samples, at most: of bodies that settle within it
 STEP = 0.35  # of y that one substep covers, if they suffice
 
-# Columns of the parameters of ``march`` and of the sensitivities that it returns.
-START, LOG_RATE, SHARE, SUN, WIND, NX, NY, NZ = range(8)
-PARAMETERS = 8
-# Rows of its drivers.
+# Rows of the drivers of ``march``; those of effects that are off are not read.
 AIR, SKY, AROUND, LIGHT, BREEZE, BEAM_X, BEAM_Y, BEAM_Z = range(8)
+START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
+
+
+@compile_time
+@dataclass(frozen=True)
+class Balance:
+    """Which effects a heat balance has beside the air; ``march`` is compiled for each, without a trace of the others.
+
+    Args:
+        radiates: with the share p of exchange that is radiation.
+        sunny: with absorptance g.
+        windy: with sensitivity v to wind.
+        oriented: with normals; without them surfaces lie level.
+    """
+
+    radiates: bool
+    sunny: bool
+    windy: bool
+    oriented: bool
+
+    @property
+    def share_column(self) -> int:
+        """Column of p among the parameters; columns of effects that are off do not exist."""
+        return 2
+
+    @property
+    def sun_column(self) -> int:
+        """Column of g."""
+        return self.share_column + self.radiates
+
+    @property
+    def wind_column(self) -> int:
+        """Column of v."""
+        return self.sun_column + self.sunny
+
+    @property
+    def normal_column(self) -> int:
+        """First of the three columns of the unit normal."""
+        return self.wind_column + self.windy
+
+
+radiates, sunny = constant("radiates"), constant("sunny")
+windy, oriented = constant("windy"), constant("oriented")
+share_column, sun_column = constant("share_column"), constant("sun_column")
+wind_column, normal_column = constant("wind_column"), constant("normal_column")
 
 
 @inline
@@ -102,7 +146,7 @@ def power(x, reference):
 
 
 @kernel
-def march(parameters, times, drivers, up, oriented, reference, radiation, time, temperatures, sensitivities):
+def march(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
     """Temperatures at a time under the full balance: T⁴ as it is, wind as it blows.
 
     dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v breeze), G = light f +
@@ -111,16 +155,16 @@ def march(parameters, times, drivers, up, oriented, reference, radiation, time, 
     body starts where it can still be remembered.
 
     Args:
-        parameters: [n, 8] x at the first sample in kelvin above the reference, log r, p, g, v and the unit normal n.
+        balance: the effects that there are; without an effect its terms are left out, and with f = 1 where surfaces lie
+            level.
+        parameters: [n, P] x at the first sample in kelvin above the reference, log r, then those of ``balance``.
         times: [T] float64 samples.
-        drivers: [8, T] float64; rows of missing drivers are zero.
+        drivers: [8, T] float64.
         up: [3] direction away from the ground.
-        oriented: whether normals count; without, G = light and s = sky.
         reference: R in kelvin.
-        radiation: 1.0, or 0.0 to leave out w and s; p is then 0.
         time: moment asked for, within the samples.
         temperatures: [n] filled with x.
-        sensitivities: [n, 8] filled with the derivatives of x by the parameters.
+        sensitivities: [n, P] filled with the derivatives of x by the parameters.
     """
     count = parameters.shape[0]
     final = times.shape[0] - 2
@@ -129,101 +173,172 @@ def march(parameters, times, drivers, up, oriented, reference, radiation, time, 
     for block in prange((count + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             r = math.exp(float(parameters[i, LOG_RATE]))
-            p, g, v = float(parameters[i, SHARE]), float(parameters[i, SUN]), float(parameters[i, WIND])
-            nx, ny, nz = float(parameters[i, NX]), float(parameters[i, NY]), float(parameters[i, NZ])
-            f = 1.0
-            if oriented:
+            p, g, v, f = 0.0, 0.0, 0.0, 1.0
+            nx, ny, nz = 0.0, 0.0, 0.0
+            if radiates(balance):
+                p = float(parameters[i, share_column(balance)])
+            if sunny(balance):
+                g = float(parameters[i, sun_column(balance)])
+            if windy(balance):
+                v = float(parameters[i, wind_column(balance)])
+            if oriented(balance):
+                column = normal_column(balance)
+                nx, ny = float(parameters[i, column]), float(parameters[i, column + 1])
+                nz = float(parameters[i, column + 2])
                 f = 0.5 * (1.0 + nx * up[0] + ny * up[1] + nz * up[2])
             x = float(parameters[i, START])
             # Start at the last sample that is MEMORY time constants old (0.7: of T³ in kelvin, down to -10 % of T).
             k, age = final, 0.0
             while k > 0 and age < MEMORY:
                 k -= 1
-                slowest = (1.0 - p) * (1.0 + v * min(drivers[BREEZE, k], drivers[BREEZE, k + 1])) + 0.7 * p
+                slowest = 1.0
+                if windy(balance):
+                    slowest += v * min(drivers[BREEZE, k], drivers[BREEZE, k + 1])
+                if radiates(balance):
+                    slowest = (1.0 - p) * slowest + 0.7 * p
                 age += r * slowest * (times[k + 1] - times[k])
             remembers = k == 0 and age < MEMORY
-            air, breeze = drivers[AIR, k], drivers[BREEZE, k]
-            bx, by, bz = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
-            beam = nx * bx + ny * by + nz * bz
-            if beam <= 0.0:
-                beam, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-            light = drivers[LIGHT, k]
-            sun = f * light + beam
-            tilt = radiation * (drivers[SKY, k] - drivers[AROUND, k])
-            sky = radiation * drivers[AROUND, k] + f * tilt
+            air = drivers[AIR, k]
+            c, tilt, sky, light, sun, w, w_slope = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            breeze, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+            if windy(balance):
+                breeze = drivers[BREEZE, k]
+                c = 1.0 + v * breeze
+            if sunny(balance):
+                light = drivers[LIGHT, k]
+                sun = f * light
+                if oriented(balance):
+                    bx, by, bz = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
+                    beam = nx * bx + ny * by + nz * bz
+                    if beam <= 0.0:
+                        beam, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+                    sun += beam
             if not remembers:
-                x = air + g * sun
+                x = air
+                if sunny(balance):
+                    x += g * sun
+            if radiates(balance):
+                c *= 1.0 - p
+                tilt = drivers[SKY, k] - drivers[AROUND, k]
+                sky = drivers[AROUND, k] + f * tilt
+                w, w_slope = power(x, reference)
             d_start, d_rate, d_share, d_sun, d_wind, dx, dy, dz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            w, w_slope = power(x, reference)
-            w *= radiation
-            w_slope *= radiation
             while k <= final:
                 interval = times[k + 1] - times[k]
                 ending = 1.0
                 if k == final:
                     ending = (time - times[k]) / interval
                 seconds = interval * ending
-                air_2, breeze_2 = drivers[AIR, k + 1], drivers[BREEZE, k + 1]
-                cx, cy, cz = drivers[BEAM_X, k + 1], drivers[BEAM_Y, k + 1], drivers[BEAM_Z, k + 1]
-                beam = nx * cx + ny * cy + nz * cz
-                if beam <= 0.0:
-                    beam, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
-                light_2 = drivers[LIGHT, k + 1]
-                sun_2 = f * light_2 + beam
-                tilt_2 = radiation * (drivers[SKY, k + 1] - drivers[AROUND, k + 1])
-                sky_2 = radiation * drivers[AROUND, k + 1] + f * tilt_2
-                fastest = r * ((1.0 - p) * (1.0 + v * max(breeze, breeze_2)) + p * w_slope)
-                substeps = min(SUBSTEPS, 1 + int(fastest * seconds / STEP))
+                # Differences to the end of the interval, and the fastest that the body can be within it.
+                d_air = drivers[AIR, k + 1] - air
+                d_breeze, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
+                ex, ey, ez = 0.0, 0.0, 0.0
+                fastest = 1.0
+                if windy(balance):
+                    d_breeze = drivers[BREEZE, k + 1] - breeze
+                    fastest += v * max(breeze, breeze + d_breeze)
+                if radiates(balance):
+                    fastest = (1.0 - p) * fastest + p * w_slope
+                    tilt_2 = drivers[SKY, k + 1] - drivers[AROUND, k + 1]
+                    d_tilt, d_sky = tilt_2 - tilt, drivers[AROUND, k + 1] + f * tilt_2 - sky
+                if sunny(balance):
+                    light_2 = drivers[LIGHT, k + 1]
+                    sun_2 = f * light_2
+                    if oriented(balance):
+                        cx, cy, cz = drivers[BEAM_X, k + 1], drivers[BEAM_Y, k + 1], drivers[BEAM_Z, k + 1]
+                        beam = nx * cx + ny * cy + nz * cz
+                        if beam <= 0.0:
+                            beam, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
+                        sun_2 += beam
+                        ex, ey, ez = cx - bx, cy - by, cz - bz
+                    d_level, d_light = light_2 - light, sun_2 - sun
+                substeps = min(SUBSTEPS, 1 + int(r * fastest * seconds / STEP))
                 share = ending / substeps
-                d_air, d_breeze, d_sky, d_light = air_2 - air, breeze_2 - breeze, sky_2 - sky, sun_2 - sun
-                d_tilt, d_level = tilt_2 - tilt, light_2 - light
-                ex, ey, ez = cx - bx, cy - by, cz - bz
                 h = seconds / substeps
                 for _ in range(substeps):
-                    air_2, breeze_2 = air + share * d_air, breeze + share * d_breeze
-                    sky_2, sun_2 = sky + share * d_sky, sun + share * d_light
-                    tilt_2, light_2 = tilt + share * d_tilt, light + share * d_level
-                    cx, cy, cz = bx + share * ex, by + share * ey, bz + share * ez
                     # Linear part: the slope of w here, and the wind halfway.
-                    c, c_2 = (1.0 - p) * (1.0 + v * breeze), (1.0 - p) * (1.0 + v * breeze_2)
-                    a = r * (0.5 * (c + c_2) + p * w_slope)
-                    decay, phi, second, third = weights(a * h)
-                    force = r * (g * sun + c * (air - x) + p * (sky - w))
-                    ahead = r * (g * sun_2 + c_2 * (air_2 - x) + p * (sky_2 - w))
-                    guess = x + h * (phi * force + second * (ahead - force))
-                    w_2, slope_2 = power(guess, reference)
-                    rest = r * (-c_2 * (guess - x) - p * (radiation * w_2 - w)) + a * (guess - x)
-                    new = guess + h * 2.0 * third * rest
-                    w_2, slope_2 = power(new, reference)
-                    w_2 *= radiation
-                    slope_2 *= radiation
+                    air_2, c_2 = air + share * d_air, c
+                    breeze_2, tilt_2, sky_2, light_2, sun_2 = breeze, tilt, sky, light, sun
+                    if windy(balance):
+                        breeze_2 = breeze + share * d_breeze
+                        c_2 = 1.0 + v * breeze_2
+                        if radiates(balance):
+                            c_2 *= 1.0 - p
+                    slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
+                    if sunny(balance):
+                        light_2, sun_2 = light + share * d_level, sun + share * d_light
+                        force += g * sun
+                        ahead += g * sun_2
+                    if radiates(balance):
+                        tilt_2, sky_2 = tilt + share * d_tilt, sky + share * d_sky
+                        slope += p * w_slope
+                        force += p * (sky - w)
+                        ahead += p * (sky_2 - w)
+                    decay, phi, second, third = weights(r * slope * h)
+                    new = x + h * r * (phi * force + second * (ahead - force))
+                    rest = (slope - c_2) * (new - x)
+                    w_2, slope_2 = 0.0, 0.0
+                    if radiates(balance):
+                        w_2, slope_2 = power(new, reference)
+                        rest -= p * (w_2 - w)
+                    if windy(balance) or radiates(balance):
+                        new += 2.0 * third * h * r * rest
+                    slope = c + c_2
+                    if radiates(balance):
+                        w_2, slope_2 = power(new, reference)
+                        slope += p * (w_slope + slope_2)
                     # Sensitivities: the linearised balance, along the trajectory from its beginning to its end.
-                    decay, phi, second, _ = weights(h * r * 0.5 * (c + p * w_slope + c_2 + p * slope_2))
-                    one, two = h * (phi - second), h * second
-                    rate_1 = g * sun + c * (air - x) + p * (sky - w)
-                    rate_2 = g * sun_2 + c_2 * (air_2 - new) + p * (sky_2 - w_2)
-                    d_rate = decay * d_rate + r * (one * rate_1 + two * rate_2)
-                    share_1 = sky - w - (1.0 + v * breeze) * (air - x)
-                    share_2 = sky_2 - w_2 - (1.0 + v * breeze_2) * (air_2 - new)
-                    d_share = decay * d_share + r * (one * share_1 + two * share_2)
-                    d_sun = decay * d_sun + r * (one * sun + two * sun_2)
-                    d_wind = decay * d_wind + r * (1.0 - p) * (
-                        one * breeze * (air - x) + two * breeze_2 * (air_2 - new)
-                    )
-                    lean = 0.5 * r * (one * (g * light + p * tilt) + two * (g * light_2 + p * tilt_2))
-                    dx = decay * dx + r * g * (one * bx + two * cx) + lean * up[0]
-                    dy = decay * dy + r * g * (one * by + two * cy) + lean * up[1]
-                    dz = decay * dz + r * g * (one * bz + two * cz) + lean * up[2]
+                    decay, phi, second, _ = weights(h * r * 0.5 * slope)
+                    one, two = h * r * (phi - second), h * r * second
+                    change = c_2 * (air_2 - new)
+                    if sunny(balance):
+                        change += g * sun_2
+                    if radiates(balance):
+                        change += p * (sky_2 - w_2)
+                    d_rate = decay * d_rate + one * force + two * change
                     d_start *= decay
-                    x, w, w_slope = new, w_2, slope_2
-                    air, breeze, sky, sun, tilt, light = air_2, breeze_2, sky_2, sun_2, tilt_2, light_2
-                    bx, by, bz = cx, cy, cz
+                    if radiates(balance):
+                        calm, calm_2 = air - x, air_2 - new
+                        if windy(balance):
+                            calm *= 1.0 + v * breeze
+                            calm_2 *= 1.0 + v * breeze_2
+                        d_share = decay * d_share + one * (sky - w - calm) + two * (sky_2 - w_2 - calm_2)
+                    if sunny(balance):
+                        d_sun = decay * d_sun + one * sun + two * sun_2
+                    if windy(balance):
+                        gust = one * breeze * (air - x) + two * breeze_2 * (air_2 - new)
+                        if radiates(balance):
+                            gust *= 1.0 - p
+                        d_wind = decay * d_wind + gust
+                    if oriented(balance):
+                        lean = 0.0
+                        if radiates(balance):
+                            lean += p * (one * tilt + two * tilt_2)
+                        if sunny(balance):
+                            lean += g * (one * light + two * light_2)
+                        lean *= 0.5
+                        dx = decay * dx + lean * up[0]
+                        dy = decay * dy + lean * up[1]
+                        dz = decay * dz + lean * up[2]
+                        if sunny(balance):
+                            cx, cy, cz = bx + share * ex, by + share * ey, bz + share * ez
+                            dx += g * (one * bx + two * cx)
+                            dy += g * (one * by + two * cy)
+                            dz += g * (one * bz + two * cz)
+                            bx, by, bz = cx, cy, cz
+                    x, air, c = new, air_2, c_2
+                    w, w_slope, breeze, tilt, sky, light, sun = w_2, slope_2, breeze_2, tilt_2, sky_2, light_2, sun_2
                 k += 1
             temperatures[i] = x
             sensitivities[i, START] = d_start if remembers else 0.0
-            sensitivities[i, LOG_RATE], sensitivities[i, SHARE] = d_rate, d_share
-            sensitivities[i, SUN], sensitivities[i, WIND] = d_sun, d_wind
-            if oriented:
-                sensitivities[i, NX], sensitivities[i, NY], sensitivities[i, NZ] = dx, dy, dz
-            else:
-                sensitivities[i, NX], sensitivities[i, NY], sensitivities[i, NZ] = 0.0, 0.0, 0.0
+            sensitivities[i, LOG_RATE] = d_rate
+            if radiates(balance):
+                sensitivities[i, share_column(balance)] = d_share
+            if sunny(balance):
+                sensitivities[i, sun_column(balance)] = d_sun
+            if windy(balance):
+                sensitivities[i, wind_column(balance)] = d_wind
+            if oriented(balance):
+                column = normal_column(balance)
+                sensitivities[i, column], sensitivities[i, column + 1] = dx, dy
+                sensitivities[i, column + 2] = dz

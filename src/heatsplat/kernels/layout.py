@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 from llvmlite import ir
 from numba.core import types
-from numba.extending import NativeValue, intrinsic, models, register_model, typeof_impl, unbox
+from numba.extending import intrinsic
 
+from heatsplat.kernels.compile_time import ConstantType, compile_time, constant
 from heatsplat.kernels.constants import ELLIPSE, OPACITY_GRADIENTS
 
 _i64 = ir.IntType(64)
 
 
+@compile_time
 @dataclass(frozen=True)
 class Layout:
     """Which modality composites which channel.
@@ -54,60 +56,24 @@ class Layout:
         return max(8, -(-self.slot_columns // 4) * 4)
 
 
-class LayoutType(types.Type):
-    """Numba type of one Layout; its values carry nothing."""
-
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
-        super().__init__(f"Layout({layout.modality_of}, {layout.modalities}, {layout.depth}, {layout.absgrad})")
-
-
-@typeof_impl.register(Layout)
-def _typeof_layout(value, _):
-    return LayoutType(value)
-
-
-@register_model(LayoutType)
-class _LayoutModel(models.OpaqueModel):
-    pass
-
-
-@unbox(LayoutType)
-def _unbox_layout(numba_type, value, c):
-    return NativeValue(c.context.get_dummy_value())
-
-
-def _constant(name: str):
-    """An intrinsic that gives a property of a layout as a literal."""
-
-    @intrinsic
-    def function(typing_context, layout):
-        if not isinstance(layout, LayoutType):
-            return None
-        number = int(getattr(layout.layout, name))
-        return types.literal(number)(layout), lambda context, builder, signature, values: ir.Constant(_i64, number)
-
-    return function
-
-
-channels = _constant("channels")
-modalities = _constant("modalities")
-feature_column = _constant("feature_column")
-slot_columns = _constant("slot_columns")
-has_depth = _constant("depth")
-has_absgrad = _constant("absgrad")
+channels = constant("channels")
+modalities = constant("modalities")
+feature_column = constant("feature_column")
+slot_columns = constant("slot_columns")
+has_depth = constant("depth")
+has_absgrad = constant("absgrad")
 
 
 @intrinsic
 def modality_of(typing_context, layout, channel):
     """The modality that composites a channel; a constant once the loop over channels is unrolled."""
-    if not isinstance(layout, LayoutType):
+    if not isinstance(layout, ConstantType):
         return None
 
     def generate(context, builder, signature, values):
         channel = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
         result = ir.Constant(_i64, 0)
-        for position, modality in enumerate(layout.layout.modality_of):
+        for position, modality in enumerate(layout.value.modality_of):
             if modality:
                 same = builder.icmp_signed("==", channel, ir.Constant(_i64, position))
                 result = builder.select(same, ir.Constant(_i64, modality), result)

@@ -196,36 +196,31 @@ class Climate:
 
     def marched_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers."""
-        zero = torch.zeros_like(surface.start)
-        filled = (zero if value is None else value for value in (surface.sun, surface.share, surface.wind))
-        columns = torch.stack([surface.start, surface.log_rate, *_after_sun(*filled)], dim=1)
-        normals = surface.normals if surface.normals is not None else columns.new_zeros(len(columns), 3)
-        return _March.apply(torch.cat((columns, normals), dim=1), self, time_s)
-
-
-def _after_sun(sun: Tensor, share: Tensor, wind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The kernel's order of these three."""
-    return share, sun, wind
+        absent = [value is None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
+        columns = [surface.start, surface.log_rate, surface.share, surface.sun, surface.wind]
+        parameters = torch.stack([column for column in columns if column is not None], dim=1)
+        if surface.normals is not None:
+            parameters = torch.cat((parameters, surface.normals), dim=1)
+        return _March.apply(parameters, kernels.Balance(*(not gone for gone in absent)), self, time_s)
 
 
 class _March(torch.autograd.Function):
     """The kernel on the CPU, which gives derivatives along with values."""
 
     @staticmethod
-    def forward(ctx, parameters: Tensor, climate: Climate, time_s: float) -> Tensor:
+    def forward(ctx, parameters: Tensor, balance: kernels.Balance, climate: Climate, time_s: float) -> Tensor:
         drivers = climate.drivers
         rows = parameters.detach().cpu().contiguous()
         values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
         up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
         with announced(COMPILING):
             kernels.march(
+                balance,
                 rows.numpy(),
                 drivers.times_s.numpy(),
                 climate.rows.numpy(),
                 up.numpy(),
-                drivers.up is not None,
                 drivers.reference_k,
-                0.0 if drivers.sky is None else 1.0,
                 time_s,
                 values.numpy(),
                 slopes.numpy(),
@@ -237,4 +232,4 @@ class _March(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, gradient: Tensor):
         (slopes,) = ctx.saved_tensors
-        return gradient[:, None] * slopes, None, None
+        return gradient[:, None] * slopes, None, None, None
