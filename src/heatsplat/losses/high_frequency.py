@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import SceneData, View
+from heatsplat.contracts import SceneData
 from heatsplat.geometry.resampling import resampled
 from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.edge import GAIN, sobel, whole_windows
-from heatsplat.losses.low_resolution import fineness
-from heatsplat.losses.teacher import Teacher
-
-log = logging.getLogger(__name__)
+from heatsplat.losses.edge import GAIN, sobel
+from heatsplat.losses.low_resolution import check_fineness, counted_finely
+from heatsplat.losses.teacher import Lessons, Teacher
 
 
 class HighFrequency:
@@ -52,33 +49,24 @@ class HighFrequency:
             raise ValueError(
                 f"gammas must not be negative and factor at least 1, got {gamma_pixel}, {gamma_gradient}, {factor}"
             )
-        self._hire, self._teacher, self.factor = teacher, None, factor
+        self.factor = factor
+        self._lessons = Lessons(
+            teacher, factor, lambda fine, record: (self.detail(fine), self.confidence(fine, record))
+        )
         self.gamma_pixel, self.gamma_gradient = gamma_pixel, gamma_gradient
         self.inner, self.outer = inner, outer
-        self._made: dict[int, tuple[Tensor, Tensor]] = {}
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Checks that the teacher can serve every training image, asks it for all of them and forgets it."""
-        teacher = self._hired()
-        log.info("super-resolution teacher: %s", teacher.description)
-        for frame in scene.train.frames:
-            teacher.check(frame, self.factor)
-        for view in scene.train:
-            self._lesson(view, view.image(modality))
-        self._teacher = None
-        return {"teacher": teacher.description}
+        """Makes the lessons of a scene; see ``Lessons.prepare``."""
+        return self._lessons.prepare(scene, modality)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        if fineness(inputs) != self.factor:
-            raise ValueError(
-                f"the prediction is {fineness(inputs)} times as fine as the training image, the loss expects "
-                f"{self.factor}; set both by super_resolution"
-            )
-        detail, confidence = (made.to(inputs.prediction) for made in self._lesson(inputs.view, inputs.target))
+        check_fineness(inputs, self.factor)
+        detail, confidence = (made.to(inputs.prediction) for made in self._lessons.of(inputs.view, inputs.target))
         error = confidence * (self.detail(inputs.prediction) - detail).abs()
         if inputs.mask is None:
             return error.mean()
-        counted = whole_windows(inputs.mask).repeat_interleave(self.factor, 0).repeat_interleave(self.factor, 1)
+        counted = counted_finely(inputs.mask, self.factor)
         return torch.where(counted[..., None], error, 0.0).sum() / (counted.sum() * error.shape[2]).clamp(min=1)
 
     def detail(self, image: Tensor) -> Tensor:
@@ -92,21 +80,6 @@ class HighFrequency:
         gradient = sum((a - b).abs() for a, b in slopes) / GAIN
         departure = self.gamma_pixel * (fine - enlarged).abs() + self.gamma_gradient * gradient
         return torch.exp(-departure.mean(2, keepdim=True))
-
-    def _hired(self) -> Teacher:
-        if self._teacher is None:
-            self._teacher = self._hire()
-        return self._teacher
-
-    @torch.no_grad()
-    def _lesson(self, view: View, target: Tensor) -> tuple[Tensor, Tensor]:
-        """H(teacher) and W for a training image, made when it is first seen."""
-        key = view.frame.frame_id
-        if key not in self._made:
-            record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
-            fine = self._hired()(record, view.frame, self.factor)
-            self._made[key] = (self.detail(fine).half(), self.confidence(fine, record).half())
-        return self._made[key]
 
 
 def averaged(image: Tensor, side: int) -> Tensor:

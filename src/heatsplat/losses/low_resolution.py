@@ -10,6 +10,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData
 from heatsplat.geometry.resampling import KERNELS, resampled, scale_between
 from heatsplat.losses.compose import LossInputs, LossTerm, prepare
+from heatsplat.losses.edge import whole_windows
 from heatsplat.losses.photometric import Photometric
 
 
@@ -93,3 +94,17 @@ def fineness(inputs: LossInputs) -> int:
             "be a whole multiple of the second (module.supersample: how much finer than training images is rendered)"
         )
     return factor
+
+
+def check_fineness(inputs: LossInputs, factor: int) -> None:
+    """Raises ValueError where the prediction is not ``factor`` times as fine as the target."""
+    if fineness(inputs) != factor:
+        raise ValueError(
+            f"the prediction is {fineness(inputs)} times as fine as the training image, the loss expects {factor}; set "
+            "both by super_resolution"
+        )
+
+
+def counted_finely(mask: Tensor, factor: int) -> Tensor:
+    """Which pixels of a fine grid [factor H, factor W] count: those in a pixel of [H, W] with no masked one about it."""
+    return whole_windows(mask).repeat_interleave(factor, 0).repeat_interleave(factor, 1)

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
-from heatsplat.contracts import Frame, SceneError
+from heatsplat.contracts import Frame, SceneData, SceneError, View
 from heatsplat.geometry.resampling import resampled
 from heatsplat.losses import swinir
 
@@ -66,6 +67,54 @@ def load_teacher(source: str | None, cache: str | None = "~/.cache/heatsplat/tea
     if not path.is_file():
         raise SceneError(f"teacher={source}: there is no file or folder {path.absolute()}. {WHERE}")
     return Network(path, None if cache is None else Path(cache).expanduser())
+
+
+class Lessons:
+    """What is learnt of a teacher's images: made once per training image, kept in half precision.
+
+    Args:
+        teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
+        factor: how much finer than the training images the teacher's are.
+        made: of a teacher's image [factor H, factor W, C] and the record [H, W, C] that it is of, what is kept.
+    """
+
+    def __init__(
+        self,
+        teacher: Callable[[], Teacher],
+        factor: int,
+        made: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
+    ) -> None:
+        self._hire, self._teacher, self.factor, self._make = teacher, None, factor, made
+        self._made: dict[int, tuple[Tensor, ...]] = {}
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Checks that the teacher can serve every training image, asks it for all of them and forgets it.
+
+        Returns what the report should say.
+        """
+        teacher = self._hired()
+        log.info("super-resolution teacher: %s", teacher.description)
+        for frame in scene.train.frames:
+            teacher.check(frame, self.factor)
+        for view in scene.train:
+            self.of(view, view.image(modality))
+        self._teacher = None
+        return {"teacher": teacher.description}
+
+    @torch.no_grad()
+    def of(self, view: View, target: Tensor) -> tuple[Tensor, ...]:
+        """What is kept of a training image; the teacher is asked when it is first seen, with 0 for masked pixels."""
+        key = view.frame.frame_id
+        if key not in self._made:
+            record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
+            fine = self._hired()(record, view.frame, self.factor)
+            self._made[key] = tuple(kept.half() for kept in self._make(fine, record))
+        return self._made[key]
+
+    def _hired(self) -> Teacher:
+        if self._teacher is None:
+            self._teacher = self._hire()
+        return self._teacher
 
 
 class Interpolation(Teacher):
