@@ -41,7 +41,8 @@ class Scenes(SceneDataModule):
         each: makes the data module of a scene from its name, ``each(scene=name)``.
         scenes: names of the scenes, two or more.
         far: metres that a camera sees; scenes lie this far from one another. The renderer must cut there, too.
-        root, scene: not used; they are given to ``each``.
+        root: folder of the scenes, given to ``each``; None leaves ``each`` its own.
+        scene: not used.
         seed: of the order of views.
 
     Raises:
@@ -64,7 +65,8 @@ class Scenes(SceneDataModule):
             raise SceneError(f"data.scenes must list two or more scenes, such as [S1, S2, S3]; got {scenes}")
         if not far > 0:
             raise SceneError(f"data.far must be a positive number of metres, got {far}")
-        self.parts = [each(scene=name, downscale=downscale) for name in scenes]
+        place = {} if root is None else {"root": root}
+        self.parts = [each(scene=name, downscale=downscale, **place) for name in scenes]
         self.far = far
 
     def load(self) -> SceneData:

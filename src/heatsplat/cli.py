@@ -160,6 +160,8 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return RunResults.read(output_dir / METRICS_FILE).test.get("psnr")
 
+    if (first := OmegaConf.select(config, "table.after")) is not None:
+        check_first(first)
     prepare_machine(config.threads)
     plain = resolved(config)
     data = build(plain["data"])
@@ -177,6 +179,17 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
 def task_overrides() -> list[str]:
     """What the command line says of this job, such as "max_steps=300"; nothing outside a job."""
     return list(HydraConfig.get().overrides.task or []) if HydraConfig.initialized() else []
+
+
+def check_first(ckpt: str) -> None:
+    """Raises SceneError where the run that wrote a checkpoint, and after which another comes, has no results."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.io.results import METRICS_FILE
+    from heatsplat.studies.sweeps import reason_of
+
+    folder = Path(_run_of(ckpt))
+    if not (folder / METRICS_FILE).exists():
+        raise SceneError(f"the run that comes before this one has no results: {reason_of(folder)} (in {folder})")
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -274,7 +287,7 @@ def left_behind(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
-NOT_LEARNED = {"threads", "ckpt", "row", "test", "trainer", "callbacks", "logger"}
+NOT_LEARNED = {"threads", "ckpt", "row", "table", "test", "trainer", "callbacks", "logger"}
 
 
 def begun(plain: dict[str, Any], data: Any, output_dir: Path) -> dict[str, Any] | None:

@@ -130,3 +130,5 @@ def test_the_module_makes_one_part_of_each_name():
     for scenes in (None, ["a"], "a,b"):
         with pytest.raises(SceneError, match="two or more scenes"):
             Scenes(each=partial(Rooms), scenes=scenes)
+    named = Scenes(each=partial(Rooms, root="own"), scenes=["a", "bb"], root="/data")
+    assert [part.root for part in named.parts] == ["/data"] * 2

@@ -9,13 +9,14 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from running import compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
-from heatsplat.studies.published import Plan, make_plan
+from heatsplat.studies.published import Plan, Run, make_plan
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
 from heatsplat.studies.sweeps import Row
 
@@ -55,6 +56,11 @@ def put(root: Path, marker: str, *scenes: str) -> Path:
     return root
 
 
+def after(run: Run) -> list[str]:
+    """What the sweep adds to a run that comes after another."""
+    return ["table.after=others/checkpoints/last.ckpt"] if run.after else []
+
+
 def everything(root: Path, name: str) -> Path:
     """A root with an empty folder for every scene that the table wants."""
     plan = plan_of(name)
@@ -88,7 +94,7 @@ def test_every_row_of_every_table_composes_as_a_recipe_of_its_own(path, tmp_path
     made = [
         {
             key: value
-            for key, value in compose_run(tmp_path, f"experiment={path.stem}", *run.overrides).items()
+            for key, value in compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, *after(run)).items()
             if key != "data"
         }
         for run in first.values()
@@ -111,17 +117,45 @@ def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
     assert plan.runs[-1].overrides[0] == "method=etgs" and "data.scene='Cooling-Bench'" in plan.runs[-2].overrides
 
 
-def test_protocols_that_take_more_than_one_run_are_told_and_not_run(tmp_path):
-    plan = plan_of("thermogs_2", everything(tmp_path, "thermogs_2"))
-    assert {run.row for run in plan.runs} == {"ntr_gaussian_cross_time", "thermogs_cross_time"} and len(plan.runs) == 8
-    assert "two commands per scene" in plan.absent["thermogs", "cross_scene"]
+def test_a_run_on_an_unseen_scene_comes_after_one_on_all_others(tmp_path):
+    plan = plan_of("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S3", "S4"))
+    rows = ["ntr_gaussian_cross_time", "thermogs_cross_scene", "thermogs_cross_time"]
+    assert [run.row for run in plan.runs] == [row for row in rows for _ in range(4)]
     assert plan.absent["ntr_gaussian", "cross_scene"] == "its networks are of one scene"
     assert plan.absent["thermalgs", "cross_scene"] == "heatsplat does not have it"
+    assert {run.after for run in plan.runs if run.setting == "cross_time"} == {None}
+    second = plan.runs[5]
+    assert second.job(["max_steps=5"]) == [
+        "max_steps=5", "method=thermogs", "data.scene='S2'", "row='thermogs_cross_scene'"
+    ]  # fmt: skip
+    assert second.after.job(["data.root=/x", "+data.latitude=47", "data.each.altitude_m=9", "seed=1"]) == [
+        "data.root=/x", "+data.each.latitude=47", "data.each.altitude_m=9", "seed=1", "method=thermogs", "data=scenes",
+        "data@data.each=thermo", "data.scenes=['S1','S3','S4']", "row='thermogs_cross_scene_others'",
+    ]  # fmt: skip
+    told = plan.told()
+    assert "12 runs (3 rows x 4 of 4 scenes)" in told
+    assert "Before them, 4 runs: thermogs_cross_scene_others on S2+S3+S4, " in told
+    more = plan_of("thermogs_2", tmp_path, methods=["energy_balance"])
+    assert more.absent["energy_balance", "cross_scene"] == "nothing of it is shared by scenes"
+
+
+def test_a_scene_is_not_left_out_while_others_are_not_on_disk(tmp_path):
+    plan = plan_of("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S4"), scenes=["thermo_s1"])
+    assert [run.row for run in plan.runs] == ["ntr_gaussian_cross_time", "thermogs_cross_time"]
+    reason = "Not run: thermogs_cross_scene on thermo_s1, which comes after a run on all the other scenes; thermo_s3 is"
+    assert reason in plan.told() and reason in markdown(plan, compare(plan, {}))
+
+
+def test_unseen_times_are_means_over_scenes_and_unseen_scenes_stand_alone(tmp_path):
+    plan = plan_of("thermogs_2", everything(tmp_path, "thermogs_2"))
     found = {}
     for i, scene in enumerate(plan.source.scenes):
         found |= results(scene, "thermogs_cross_time", psnr=30.0 + i)
-    line = next(line for line in compare(plan, found) if (line.scene, line.method) == ("thermo_s1_s4", "thermogs"))
-    assert line.ours["psnr"] == 31.5 and line.printed["psnr"].printed == "31.83"
+        found |= results(scene, "thermogs_cross_scene", psnr=20.0 + i)
+    lines = {(line.scene, line.setting): line for line in compare(plan, found) if line.method == "thermogs"}
+    mean, third = lines["thermo_s1_s4", "cross_time"], lines["thermo_s3", "cross_scene"]
+    assert mean.ours["psnr"] == 31.5 and mean.printed["psnr"].printed == "31.83"
+    assert third.ours["psnr"] == 22.0 and third.printed["psnr"].printed == "26.03" and len(lines) == 5
 
 
 def test_all_that_is_missing_is_told_in_one_message(tmp_path):
@@ -352,6 +386,42 @@ def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path, 
     assert (tmp_path / "sweep" / "table.md").exists()
     (folder,) = (path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert folder.name.startswith("etgs_cooling_dumbbels_") and (folder / "metrics.json").exists()
+
+
+def test_one_command_trains_on_the_other_scenes_first_and_goes_on_when_that_failed(tmp_path, monkeypatch, caplog):
+    root = write_fake("thermo", tmp_path / "Thermo", "S1", "S2", "S3", "S4")
+    weather = (root / "S3" / "weather.csv").rename(tmp_path / "weather.csv")
+    quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none", "thermal.width=16", f"data.root={root}")
+    asked = ("table.methods=[thermogs]", "table.scenes=[thermo_s2]", "table.settings=[cross_scene]")
+    overrides = ["experiment=table_thermogs_2", *asked, *SHORT, *quiet, f"hydra.sweep.dir={tmp_path}/sweep"]
+    comparison = tmp_path / "sweep" / "comparison.md"
+
+    def go(*more: str) -> str:
+        caplog.clear()
+        monkeypatch.setattr(sys, "argv", ["train.py", *overrides, *more])
+        with caplog.at_level("INFO", logger="heatsplat"):
+            cli.train()
+        return caplog.text
+
+    told = go("table.dry=true")
+    assert "1 runs (1 rows x 1 of 1 scenes)" in told and not comparison.exists()
+    assert "Before them, 1 runs: thermogs_cross_scene_others on S1+S3+S4" in told
+    with pytest.raises(SystemExit):
+        go()
+    failed = comparison.read_text().partition("## Jobs without a result\n\n")[2].partition("\n\n")[0].splitlines()
+    reasons = dict(line.removeprefix("- ").split(": ", 1) for line in failed)
+    why = reasons["thermogs_cross_scene_others on S1+S3+S4"]
+    assert "lacks 'weather'" in why and len(reasons) == 2
+    assert f"the run that comes before this one has no results: {why}" in reasons["thermogs_cross_scene on S2"]
+
+    weather.rename(root / "S3" / "weather.csv")
+    assert "has results already" not in go()
+    first, then = sorted((tmp_path / "sweep").glob("thermogs*"), key=lambda path: "_others_" not in path.name)
+    stored = [torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for run in (first, then)]
+    assert torch.equal(*(state["thermal.network.own.weight"] for state in stored))
+    assert len(stored[0]["splats.raw.means"]) > len(stored[1]["splats.raw.means"])
+    assert re.search(r"\| thermo_s2 \| thermogs \| cross_scene \| [\d.]+ / 31.24 \(", comparison.read_text())
+    assert go().count("has results already; skipped") == 2
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import ast
 import csv
+import itertools
 import os
 import subprocess
 import sys
@@ -201,6 +202,22 @@ def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the
     assert launcher.batches == [(0, ["seed=0", "seed=1"]), (2, ["seed=2", "seed=3"]), (4, ["seed=4"])]
     with pytest.raises(ValueError, match="max_batch_size must be 1 or more, or null for all, got 0"):
         RowSweeper(max_batch_size=0)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [(None, ["seed=0 a", "b c d"]), (2, ["seed=0 a", "b c", "d"]), (1, ["seed=0", "a", "b", "c", "d"])],
+)
+def test_no_job_starts_before_those_that_come_first_have_ended(size, expected, tmp_path):
+    compose_run(tmp_path, "method=3dgs")
+    from hydra_plugins.heatsplat_sweeper.rows import Batches
+
+    launcher = Remembering()
+    returned = Batches(launcher, size, first=2).launch([["seed=0"], ["a"], ["b"], ["c"], ["d"]], initial_job_idx=0)
+    assert [" ".join(job) for _, job in launcher.batches] == expected
+    starts = [0, *itertools.accumulate(len(jobs) for _, jobs in launcher.batches)]
+    assert [start for start, _ in launcher.batches] == starts[:-1]
+    assert [job.overrides for job in returned] == [["seed=0"], ["a"], ["b"], ["c"], ["d"]]
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)

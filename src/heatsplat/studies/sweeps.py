@@ -36,7 +36,7 @@ COSTS = {
 # Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
 # are among them; the method is named by itself.
 SEEDS = {"seed", "data.seed", "data.scene_seed"}
-PLACES = {"data", "data.root", "data.scene"}
+PLACES = {"data", "data.root", "data.scene", "data.scenes"}
 NAMES = {"method", "row", "ablation", "experiment"}
 HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
@@ -172,7 +172,7 @@ def settings_of(overrides: Mapping[str, str]) -> list[str]:
 def _results(job: Path) -> tuple[RunResults | None, str]:
     """The results of a job, or None and why there are none."""
     if not (job / METRICS_FILE).exists():
-        return None, _reason(job)
+        return None, reason_of(job)
     try:
         return RunResults.read(job / METRICS_FILE), ""
     except (ValueError, OSError) as error:
@@ -181,7 +181,8 @@ def _results(job: Path) -> tuple[RunResults | None, str]:
 
 def _scene(config: Mapping[str, Any]) -> str:
     """The scene that a job was told; a method's own synthetic preset is a reference to another key."""
-    scene = str((config.get("data") or {}).get("scene") or "?")
+    data = config.get("data") or {}
+    scene = str(data.get("scene") or "+".join(data.get("scenes") or ()) or "?")
     return str(config.get(scene[2:-1], scene)) if scene.startswith("${") else scene
 
 
@@ -191,7 +192,7 @@ def _number(job: Path) -> tuple[int, str]:
     return (numbers[-1] if numbers else 0, job.name)
 
 
-def _reason(job: Path) -> str:
+def reason_of(job: Path) -> str:
     """Why a job has no result: the last line of its FAILED file that names an error, since Hydra adds lines of its own."""
     if not (job / FAILED).exists():
         return "not finished"

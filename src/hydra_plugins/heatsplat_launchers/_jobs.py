@@ -77,18 +77,22 @@ class JobLauncher(Launcher):
         return [ended[job.number] for job in jobs]
 
     def _job(self, number: int, overrides: Sequence[str]) -> Job:
-        """The job with its folder, which Hydra names by the job's own configuration."""
-        before = HydraConfig.instance().cfg
-        try:
-            config = _configuration(self.hydra_context, self.config, number, overrides)
-            folder = Path(config.hydra.sweep.dir, config.hydra.sweep.subdir)
-            return Job(number, tuple(overrides), folder, OmegaConf.select(config, "threads"))
-        finally:
-            HydraConfig.instance().cfg = before
+        return planned(self.hydra_context, self.config, number, overrides)
 
     def arguments(self, job: Job) -> tuple[Any, ...]:
         """The arguments with which ``execute`` runs the job in any process; cloudpickle can pickle them."""
         return job, self.hydra_context, self.config, self.task_function, Singleton.get_state()
+
+
+def planned(context: HydraContext, config: DictConfig, number: int, overrides: Sequence[str]) -> Job:
+    """A job of a sweep with its folder, which Hydra names by the job's own configuration."""
+    before = HydraConfig.instance().cfg
+    try:
+        own = _configuration(context, config, number, overrides)
+        folder = Path(own.hydra.sweep.dir, own.hydra.sweep.subdir)
+        return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"))
+    finally:
+        HydraConfig.instance().cfg = before
 
 
 def python_path() -> str:

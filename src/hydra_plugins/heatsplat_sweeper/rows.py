@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 import re
 import sys
@@ -16,6 +17,8 @@ from hydra.core.utils import JobReturn
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
+
+from hydra_plugins.heatsplat_launchers._jobs import planned
 
 if TYPE_CHECKING:
     from heatsplat.studies.published import Plan
@@ -49,17 +52,21 @@ class Batches:
 
     Args:
         launcher: what runs a batch.
-        size: jobs in a batch.
+        size: jobs in a batch; None for as many as there are.
+        first: so many jobs at the beginning are to end before any other starts.
     """
 
-    def __init__(self, launcher: Launcher, size: int) -> None:
-        self.launcher, self.size = launcher, size
+    def __init__(self, launcher: Launcher, size: int | None, first: int = 0) -> None:
+        self.launcher, self.size, self.first = launcher, size, first
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
         """What the jobs returned, those that failed too, in their order."""
         returned: list[JobReturn] = []
-        for i in range(0, len(job_overrides), self.size):
-            returned += self.launcher.launch(job_overrides[i : i + self.size], initial_job_idx=initial_job_idx + i)
+        count = len(job_overrides)
+        size = self.size or max(count, 1)
+        bounds = [*range(0, self.first, size), *range(self.first, count, size), count]
+        for start, end in itertools.pairwise(bounds):
+            returned += self.launcher.launch(job_overrides[start:end], initial_job_idx=initial_job_idx + start)
         return returned
 
 
@@ -98,10 +105,27 @@ class RowSweeper(BasicSweeper):
         """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins."""
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
         if self.plan is not None:
-            jobs = [[*job, *run.overrides, f"row='{run.row}'"] for job in jobs for run in self.plan.runs]
+            jobs = self._of_table(self.plan, jobs)
         elif self.rows:
             jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
         return [jobs]
+
+    def _of_table(self, plan: Plan, grid: Sequence[Sequence[str]]) -> list[list[str]]:
+        """The jobs of a table: those that others come after stand at the beginning, once each, and end before these start."""
+        first: dict[tuple[str, ...], Path] = {}
+        jobs = []
+        for given in grid:
+            for run in plan.runs:
+                after = []
+                if run.after is not None:
+                    before = tuple(run.after.job(given))
+                    if before not in first:
+                        first[before] = planned(self.hydra_context, self.config, len(first), before).folder.absolute()
+                    after = [f"table.after='{first[before]}/checkpoints/last.ckpt'"]
+                jobs.append([*run.job(given), *after])
+        if first:
+            self.launcher = Batches(self.launcher, self.batch, len(first))
+        return [*map(list, first), *jobs]
 
     def sweep(self, arguments: Sequence[str]) -> Any:
         from heatsplat.studies.sweeps import write_sweep

@@ -15,6 +15,7 @@ from heatsplat.studies.published.sources import Source, source
 
 NOT_HERE = "heatsplat does not have it"
 NOT_ASKED = "not asked for"
+OF_ALL = {"data.root", "data.downscale", "data.seed"}  # keys of data=scenes; the others are those of its scenes
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,9 @@ class Run:
     Args:
         method, setting: of the table's row.
         scene: key of the scene in the table.
-        folder: name of the scene's folder on disk.
+        folder: name of the scene's folder on disk; of a run on several scenes those of all, with "+" between.
         overrides: of the configuration.
+        after: the run on other scenes that must be finished before this one starts from it; None for most.
     """
 
     method: str
@@ -33,11 +35,32 @@ class Run:
     scene: str
     folder: str
     overrides: tuple[str, ...]
+    after: Run | None = None
 
     @property
     def row(self) -> str:
         """Name of the row, which is also part of the run's folder."""
         return row_name(self.method, self.setting)
+
+    def job(self, given: Sequence[str]) -> list[str]:
+        """All overrides of the run, those of the command line first."""
+        return [*given, *self.overrides, f"row='{self.row}'"]
+
+
+@dataclass(frozen=True)
+class OnOthers(Run):
+    """The run on all scenes of a data set but one, joined (``data=scenes``), that a run on the one comes after."""
+
+    @property
+    def row(self) -> str:
+        return f"{row_name(self.method, self.setting)}_others"
+
+    def job(self, given: Sequence[str]) -> list[str]:
+        """As of any run; what the command line says of the data set goes to its scenes (``data.each``)."""
+        keys = [text.lstrip("+~").partition("=")[0] for text in given]
+        own = [key.startswith("data.") and not key.startswith("data.each.") and key not in OF_ALL for key in keys]
+        moved = [text.replace("data.", "data.each.", 1) if to else text for text, to in zip(given, own, strict=True)]
+        return super().job(moved)
 
 
 @dataclass(frozen=True)
@@ -53,6 +76,7 @@ class Plan:
         runs: what is to be trained, scene by scene within a row.
         absent: (method, setting) -> why it has the paper's figures only.
         missing: scenes that are wanted and not on disk.
+        waiting: what is not run although its scene is there, a sentence each.
         metrics: printed metric -> score in metrics.json, where the paper's definition is another than usual.
         unnamed: the group of scenes that stands for "the paper does not say which"; empty for none.
         notes: what else a reader must know.
@@ -67,6 +91,7 @@ class Plan:
     runs: tuple[Run, ...]
     absent: Mapping[tuple[str, str], str]
     missing: tuple[str, ...]
+    waiting: tuple[str, ...] = ()
     metrics: Mapping[str, str] = field(default_factory=dict)
     unnamed: str = ""
     notes: tuple[str, ...] = ()
@@ -91,6 +116,7 @@ class Plan:
             lpips_net, lpips_weights: settings of the metrics callback, to say beforehand whether there will be LPIPS.
         """
         rows = [row_name(*row) for row in self.rows if row not in self.absent]
+        rows = list(dict.fromkeys(run.row for run in self.runs)) or rows
         if self.source is None or not (self.runs or self.missing):
             lines = [f"{self.title}: nothing of this table is trained, the paper's figures stand alone"]
         else:
@@ -101,6 +127,11 @@ class Plan:
             ]
         if self.runs:
             lines.append(f"  Scenes: {', '.join(dict.fromkeys(run.folder for run in self.runs))}")
+        firsts = dict.fromkeys((run.after.row, run.after.folder) for run in self.runs if run.after)
+        if firsts:
+            lines.append(
+                f"  Before them, {len(firsts)} runs: {', '.join(f'{row} on {where}' for row, where in firsts)}"
+            )
         lines += [f"  {text}" for text in self.left_out()]
         printed = {figure.metric for figure in self.figures}
         if (self.runs or self.missing) and printed & {"lpips", "rgb_lpips"}:
@@ -113,11 +144,12 @@ class Plan:
         return "\n".join(lines)
 
     def left_out(self) -> list[str]:
-        """Methods with the paper's figures only, a line per reason."""
+        """Methods and scenes with the paper's figures only, a line per reason."""
         reasons: dict[str, list[str]] = {}
         for row, reason in self.absent.items():
             reasons.setdefault(reason, []).append(row_name(*row))
-        return [f"The paper's figures only: {', '.join(rows)} ({reason})" for reason, rows in reasons.items()]
+        lines = [f"The paper's figures only: {', '.join(rows)} ({reason})" for reason, rows in reasons.items()]
+        return [*lines, *self.waiting]
 
     def _how_to_get(self, source: Source) -> str:
         root = self.root or Path("/data") / source.key
@@ -181,7 +213,8 @@ def make_plan(
         reason = reasons.get(f"{method} {setting}", reasons.get(method))
         if reason is None and method not in config["recipes"] and method not in methods:
             reason = NOT_HERE
-        reason = reasons.get(setting) if reason is None else reason
+        if reason is None and f"{method} {setting}" not in config["others"]:
+            reason = reasons.get(setting)
         if reason is None and (method, setting) not in run:
             reason = NOT_ASKED
         if reason is None:
@@ -200,12 +233,27 @@ def make_plan(
             wanted = _chosen(wanted, wanted, sorted(asked), "scenes")
     folder = Path(root).expanduser() if root else None
     found = data.find(folder, config["folders"]) if data else {}
-    runs = [
-        Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"))
-        for (method, setting), recipe in recipes.items()
-        for scene in wanted
-        if scene in found
-    ]
+    runs: list[Run] = []
+    waiting: list[str] = []
+    for (method, setting), recipe in recipes.items():
+        others = config["others"].get(f"{method} {setting}")
+        for scene in wanted:
+            if scene not in found:
+                continue
+            after = None
+            if others is not None:
+                rest = [key for key in data.scenes if key != scene]
+                if lost := [key for key in rest if key not in found]:
+                    waiting.append(
+                        f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
+                        f"{', '.join(lost)} is not on disk"
+                    )
+                    continue
+                folders = [found[key] for key in rest]
+                scenes = ",".join(f"'{name}'" for name in folders)
+                joined = (*recipe, *others, f"data.scenes=[{scenes}]")
+                after = OnOthers(method, setting, scene, "+".join(folders), joined)
+            runs.append(Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"), after))
     return Plan(
         paper,
         table,
@@ -216,6 +264,7 @@ def make_plan(
         tuple(runs),
         absent,
         tuple(scene for scene in wanted if scene not in found),
+        tuple(waiting),
         dict(config["metrics"]),
         config["unnamed"],
         (*config["notes"], *doubts(paper, table)),
