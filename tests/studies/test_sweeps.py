@@ -231,6 +231,12 @@ def test_rows_of_an_ablation_are_different_recipes_that_compose(path, tmp_path):
     assert len(set(texts)) == len(rows) > 1
 
 
+@pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
+def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
+    assert compose_run(tmp_path, f"ablation={path.stem}").name == path.stem.partition("_")[0]
+    assert compose_run(tmp_path, f"ablation={path.stem}", "method=3dgs").name == "3dgs"
+
+
 def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(tmp_path):
     """One of three rows cannot be built; the others have results, and the second time only that one is tried again."""
     rows = "{a:{set:[]},b:{set:['thermal.frequencies=2'],paper:'40 dB'},c:{set:['data.size=huge']}}"
