@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.kernels.constants import ALPHA_MAX, ALPHA_MIN, BLOCK, BLUR, TILE, TILE_BLOCKS, TRANSMITTANCE_MIN
+from heatsplat.kernels.constants import ALPHA_MAX, ALPHA_MIN, BLOCK, TILE, TILE_BLOCKS, TRANSMITTANCE_MIN
 from heatsplat.renderers import base
 from heatsplat.renderers.base import RenderInputs
 from heatsplat.renderers.cpu import _Frame
@@ -89,7 +89,6 @@ def test_gradient_slots_are_numbered_gaussian_by_gaussian():
 
 
 def test_kernels_and_other_backends_share_their_constants():
-    assert np.float32(base.BLUR) == BLUR
     assert np.float32(base.ALPHA_MIN) == ALPHA_MIN
     assert np.float32(base.ALPHA_MAX) == ALPHA_MAX
     assert np.float32(base.TRANSMITTANCE_MIN) == TRANSMITTANCE_MIN

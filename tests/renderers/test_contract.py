@@ -213,6 +213,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Features, alpha and depth by a loop over pixels and Gaussians with explicit inverses, and the relative distance
     of the nearest value from a threshold, which finite differences must not cross."""
     channels, antialiased = scene.options["modality_channels"], scene.options.get("antialiased", False)
+    blur = scene.options.get("blur", BLUR)
     viewmat, K = scene.viewmat.numpy(), scene.K.numpy()
     focal, principal = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
     size = np.array([scene.width, scene.height])
@@ -232,7 +233,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
             [[focal[0], 0, -focal[0] * slope[0]], [0, focal[1], -focal[1] * slope[1]]]
         ) / point[2] @ viewmat[:3, :3]  # fmt: skip
         flat = jacobian @ covariance @ jacobian.T
-        blurred = flat + BLUR * np.eye(2)
+        blurred = flat + blur * np.eye(2)
         factor = math.sqrt(np.linalg.det(flat) / np.linalg.det(blurred)) if antialiased else 1.0
         splats.append((point[2], i, focal * point[:2] / point[2] + principal, np.linalg.inv(blurred), factor))
     splats.sort(key=lambda splat: splat[:2])
@@ -265,6 +266,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 SMALL = [
     plain_scene(30, (3,), seed=3, width=16, height=12),
     plain_scene(30, (2, 1), seed=10, width=16, height=12, antialiased=True),
+    plain_scene(30, (1,), seed=12, width=16, height=12, antialiased=True, blur=0.1),
 ]
 
 
@@ -339,6 +341,8 @@ def test_reference_runs_on_cuda():
 PLAIN = {
     "one channel": plain_scene(channels=(1,)),
     "one channel, antialiased": plain_scene(channels=(1,), antialiased=True),
+    "one channel, antialiased, less blur": plain_scene(channels=(1,), antialiased=True, blur=0.1),
+    "one channel, more blur": plain_scene(channels=(1,), blur=0.7),
     "rgb": plain_scene(channels=(3,)),
     "rgb, antialiased": plain_scene(channels=(3,), antialiased=True),
     "four channels": plain_scene(channels=(4,), absgrad=True),

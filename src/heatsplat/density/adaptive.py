@@ -27,7 +27,7 @@ class Adaptive(DensityControl):
         prune_opacity: Gaussians below this opacity (in every modality) are removed.
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
         reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
-        reset_opacity: opacities are lowered to at most this.
+        reset_opacity: opacities are lowered to at most this, as rendered.
         cap_max: never more Gaussians than this; the strongest gradients grow first.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
     """
@@ -83,8 +83,7 @@ class Adaptive(DensityControl):
                 statistic.zero_()
         reset = self.reset_every is not None and 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
         if reset:
-            ceiling = torch.logit(torch.tensor(self.reset_opacity)).item()
-            cloud.overwrite("opacity_logits", cloud.splats["opacity_logits"].clamp(max=ceiling))
+            cloud.lower_opacities(self.reset_opacity)
         return DensityChange(added, removed, reset) if due or reset else None
 
     def _grow(self, cloud: Cloud, extent: float, generator: torch.Generator) -> int:

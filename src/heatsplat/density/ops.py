@@ -20,14 +20,28 @@ class Cloud:
         optimizer: the optimiser, whose groups carry "name"; groups named like a tensor of ``splats`` hold just that
             tensor. None when nothing is being trained.
         state: density statistics, each [N, ...].
+        kept_opacity: function of centres and semi-axes [N, 3] to the share of its opacity [N] with which a Gaussian is
+            rendered, where a filter makes Gaussians fainter; or to None, as without it: all of it.
     """
 
     splats: Splats
     optimizer: torch.optim.Optimizer | None = None
     state: dict[str, Tensor] = field(default_factory=dict)
+    kept_opacity: Callable[[Tensor, Tensor], Tensor | None] | None = None
 
     def __len__(self) -> int:
         return len(self.splats)
+
+    @torch.no_grad()
+    def lower_opacities(self, ceiling: float) -> None:
+        """Lowers opacities until none is rendered with more than ``ceiling``, and forgets their moments."""
+        logits = self.splats["opacity_logits"]
+        kept = self.kept_opacity(self.splats.means, self.splats.scales) if self.kept_opacity else None
+        if kept is None:
+            lowered = logits.clamp(max=torch.logit(torch.tensor(ceiling)).item())
+        else:  # lowered as far as the others, those that a filter makes fainter would never be seen again
+            lowered = logits.minimum(torch.logit((ceiling / kept).clamp(max=1))[:, None])
+        self.overwrite("opacity_logits", lowered)
 
     @torch.no_grad()
     def drop(self, name: str, gone: Tensor, instead: Mapping[str, Tensor]) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 
 # Of the image, equal to those of heatsplat.renderers.base (a test compares them), as float32 so that arithmetic stays
 # so.
-BLUR = np.float32(0.3)
 ALPHA_MIN = np.float32(1.0 / 255.0)
 ALPHA_MAX = np.float32(0.999)
 TRANSMITTANCE_MIN = np.float32(1e-4)

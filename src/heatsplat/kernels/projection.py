@@ -6,8 +6,8 @@ Plain twin: heatsplat.geometry.projection, under autograd.
 of the projection, whose x/z and y/z are clamped to the field of view and a margin. The rows of J W R diag(s) are U
 and V, so that the screen covariance with its blur is
 
-    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + BLUR I,
-    det = |U x V|^2 + BLUR (U.U + V.V) + BLUR^2        (Cauchy-Binet: a sum of squares, which never cancels).
+    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + blur I,
+    det = |U x V|^2 + blur (U.U + V.V) + blur^2        (Cauchy-Binet: a sum of squares, which never cancels).
 
 Offsets (dx, dy) from the mean are whitened by the Cholesky factor of the inverse covariance instead of multiplied by
 the inverse itself,
@@ -29,7 +29,6 @@ from heatsplat.kernels.compilation import inline, kernel, part
 from heatsplat.kernels.constants import (
     ALPHA_MIN,
     BLOCK,
-    BLUR,
     BOTTOM,
     CHUNK,
     DEPTH,
@@ -70,7 +69,8 @@ from heatsplat.kernels.simd import (
 FX, FY, CX, CY = range(12, 16)
 LOWEST_X, HIGHEST_X, LOWEST_Y, HIGHEST_Y = range(16, 20)  # limits of x/z and y/z in the Jacobian
 NEAR, FAR = 20, 21
-CAMERA = 22
+BLUR, BLUR_SQUARED = 22, 23  # pixels² added to the screen covariance, and their square
+CAMERA = 24
 
 
 @inline
@@ -161,12 +161,12 @@ def _times_rotation(a, r):
 
 
 @inline
-def _covariance(u, v):
+def _covariance(blur, u, v):
     """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the blur."""
     normal = _cross(u, v)
     uu, vv = _dot(u, u), _dot(v, v)
     sharp = _dot(normal, normal)
-    return uu + BLUR, _dot(u, v), vv + BLUR, sharp + BLUR * (uu + vv) + BLUR * BLUR, sharp
+    return uu + blur[0], _dot(u, v), vv + blur[0], sharp + blur[0] * (uu + vv) + blur[1], sharp
 
 
 @inline
@@ -253,7 +253,7 @@ def _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scr
 
 @part
 def _project_block(
-    first, means, quats, scales, opacities, camera, width, height, antialiased,
+    first, means, quats, scales, opacities, camera, blur, width, height, antialiased,
     screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
 ):  # fmt: skip
     """Projects Gaussians ``first`` to ``first + 15``; writes visible ids from ``place`` on, returns the place after."""
@@ -261,7 +261,7 @@ def _project_block(
     _, (x, y, z), (_, _, inverse_z), (_, length), _, _, turned, axes = _seen_from(
         camera, means, quats, scales, first, rows
     )
-    a, b, c, determinant, sharp = _covariance(_times(turned[0], axes), _times(turned[1], axes))
+    a, b, c, determinant, sharp = _covariance(blur, _times(turned[0], axes), _times(turned[1], axes))
     opacity = _largest_opacity(opacities, first, rows)
     if antialiased:
         opacity = opacity * sqrt(sharp / determinant)
@@ -327,9 +327,10 @@ def project(
     for chunk in prange(chunks):
         begin = chunk * CHUNK
         place = begin
+        blur = camera[BLUR], camera[BLUR_SQUARED]
         for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
             place = _project_block(
-                block, means, quats, scales, opacities, camera, width, height, antialiased,
+                block, means, quats, scales, opacities, camera, blur, width, height, antialiased,
                 screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
             )  # fmt: skip
         first_ranks[chunk] = place - begin
@@ -348,7 +349,7 @@ def project(
 
 
 @inline
-def _covariance_backward(u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased):
+def _covariance_backward(blur, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased):
     """Gradients of U and V, from the moments of g: with the whitening as a matrix L, the gradient of the covariance is
     L (sum of g u u^T) L^T / 2, of which twice the products with U and V follow."""
     one, mixed, two = whitening
@@ -359,7 +360,7 @@ def _covariance_backward(u, v, determinant, sharp, whitening, moments, v_log_opa
     if antialiased:
         # The opacity was multiplied by sqrt(|U x V|^2 / det); |U x V|^2 is far from 0, or nothing would have been seen.
         normal = _cross(u, v)
-        spread, shrink = v_log_opacity / sharp - v_log_opacity / determinant, v_log_opacity * BLUR / determinant
+        spread, shrink = v_log_opacity / sharp - v_log_opacity / determinant, v_log_opacity * blur[0] / determinant
         v_normal = (spread * normal[0], spread * normal[1], spread * normal[2])
         through_u, through_v = _cross(v, v_normal), _cross(v_normal, u)
         v_a, v_c = v_a - shrink, v_c - shrink
@@ -422,7 +423,7 @@ def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_her
 
 @part
 def _project_block_backward(
-    first, visible, sums, means, quats, scales, camera, antialiased,
+    first, visible, sums, means, quats, scales, camera, blur, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
     """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
@@ -431,14 +432,16 @@ def _project_block_backward(
         camera, means, quats, scales, first, rows
     )
     u, v = _times(turned[0], axes), _times(turned[1], axes)
-    a, b, c, determinant, sharp = _covariance(u, v)
+    a, b, c, determinant, sharp = _covariance(blur, u, v)
     whitening = _whitening(b, c, determinant)
 
     m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
     m1, m2 = m1 * INVERSE_WHITENING, m2 * INVERSE_WHITENING
     moments = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
     v_mean_x, v_mean_y = whitening[0] * m1, whitening[1] * m1 + whitening[2] * m2
-    v_u, v_v = _covariance_backward(u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased)
+    v_u, v_v = _covariance_backward(
+        blur, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased
+    )  # fmt: skip
 
     v_axes = _sum(_times(v_u, turned[0]), 1.0, _times(v_v, turned[1]), 1.0, (0.0, 0.0, 0.0))
     v_turned = _times(v_u, axes), _times(v_v, axes)
@@ -476,8 +479,9 @@ def project_backward(
         v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
     for chunk in prange(v_cameras.shape[0]):
+        blur = camera[BLUR], camera[BLUR_SQUARED]
         for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
             _project_block_backward(
-                block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, antialiased,
+                block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, blur, antialiased,
                 v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
             )  # fmt: skip

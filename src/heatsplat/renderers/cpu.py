@@ -225,4 +225,5 @@ def _camera_vector(inputs: RenderInputs) -> np.ndarray:
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     limits = -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
     numbers = (*viewmat[:3, :3].flat, *viewmat[:3, 3], fx, fy, cx, cy, *limits, inputs.near, inputs.far)
-    return np.array(numbers, np.float32)
+    blur = np.float32(inputs.blur)  # squared here: a square inside the kernel could melt into a fused multiply-add
+    return np.array((*numbers, blur, blur * blur), np.float32)

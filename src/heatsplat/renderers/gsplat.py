@@ -16,7 +16,7 @@ from torch import Tensor
 
 from heatsplat.contracts import RenderOutput
 from heatsplat.renderers import reference
-from heatsplat.renderers.base import BLUR, RenderInputs
+from heatsplat.renderers.base import RenderInputs
 
 TILE = 16  # the tile size that gsplat's kernels are tuned and tested for
 CHANNELS = 32  # composited in one go; gsplat's kernels slow down beyond, as they keep a pixel's channels in registers
@@ -60,7 +60,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
         inputs.K[None],
         width,
         height,
-        eps2d=BLUR,
+        eps2d=inputs.blur,
         near_plane=inputs.near,
         far_plane=inputs.far,
         calc_compensations=inputs.antialiased,

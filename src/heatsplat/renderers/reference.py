@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from heatsplat.contracts import RenderOutput
 from heatsplat.geometry.projection import ScreenGaussians, project_gaussians, to_camera
-from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, BLUR, FOV_MARGIN, TRANSMITTANCE_MIN, RenderInputs
+from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, FOV_MARGIN, TRANSMITTANCE_MIN, RenderInputs
 
 PAIRS = 2**20  # pixels times Gaussians held at once: 8 MiB per float64 tensor and about a dozen tensors
 
@@ -76,7 +76,7 @@ def channel_counts(inputs: RenderInputs, features: Tensor, count: int) -> tuple[
 def _project(inputs: RenderInputs, ids: Tensor) -> ScreenGaussians:
     means, quats, scales = (rows.index_select(0, ids) for rows in (inputs.means, inputs.quats, inputs.scales))
     return project_gaussians(
-        means, quats, scales, inputs.viewmat, inputs.K, inputs.width, inputs.height, BLUR, FOV_MARGIN
+        means, quats, scales, inputs.viewmat, inputs.K, inputs.width, inputs.height, inputs.blur, FOV_MARGIN
     )
 
 

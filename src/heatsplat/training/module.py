@@ -17,6 +17,7 @@ from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs
 from heatsplat.renderers.settings import Renderer
+from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, ThermalModel
@@ -45,6 +46,7 @@ class SplatTraining(pl.LightningModule):
         optim: learning rates and schedule.
         stages: which parameters stand still at which steps; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
+        smoothing: what is done to Gaussians before they are projected; None: nothing.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
         dtype: "float32" or "float64", of splats, heat, sensor, loss and optimiser; what the renderer makes of it is said
@@ -66,6 +68,7 @@ class SplatTraining(pl.LightningModule):
         optim: Optimisation,
         stages: Stages | None = None,
         composite: Composite | None = None,
+        smoothing: Smoothing | None = None,
         seed: int = 0,
         supersample: int = 1,
         dtype: str = "float32",
@@ -76,6 +79,7 @@ class SplatTraining(pl.LightningModule):
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
         self.stages = stages or Stages({})
         self.composite = composite or Composite()
+        self.smoothing = smoothing or Smoothing()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.recipe: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -107,6 +111,7 @@ class SplatTraining(pl.LightningModule):
         self.sensor.prepare(scene)
         self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed)
+        self.smoothing.prepare(scene, self.splats.means.detach())
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
@@ -176,7 +181,7 @@ class SplatTraining(pl.LightningModule):
         """Means, rotations, scales and opacities of all Gaussians at the time of ``frame``."""
         moved = self.thermal.geometry(self.splats, _query(frame))
         shown = self.splats if moved is None else moved
-        return shown.means, shown.quats, shown.scales, shown.opacities
+        return shown.means, shown.quats, *self.smoothing(shown.scales, shown.opacities)
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
@@ -218,10 +223,12 @@ class SplatTraining(pl.LightningModule):
         inner = getattr(optimizer, "optimizer", optimizer)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure)
-        cloud = Cloud(self.splats, inner, self._density_state)
+        cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
         for name, gone, instead in self.thermal.needless_rows(self.splats, step):
             cloud.drop(name, gone, instead)
-        if self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density")) is not None:
+        change = self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
+        self.smoothing.follow(self.splats.means.detach(), step, self.trainer.max_steps, change is not None)
+        if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
                     group["weight_decay"] = self._penalty(self._declared[group["name"]])
