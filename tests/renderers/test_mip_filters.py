@@ -57,5 +57,15 @@ def test_a_blur_that_is_none_is_refused(blur):
     means, quats, scales, opacities = sparks(3)
     with pytest.raises(ValueError, match="blur must be above 0 pixels²"):
         rasterization(
-            means, quats, scales, opacities, torch.ones(3, 1), torch.eye(4), torch.eye(3), 8, 8, backend="cpu", blur=blur
+            means,
+            quats,
+            scales,
+            opacities,
+            torch.ones(3, 1),
+            torch.eye(4),
+            torch.eye(3),
+            8,
+            8,
+            backend="cpu",
+            blur=blur,
         )
