@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.utils import JobStatus
+from omegaconf import OmegaConf
 from running import run
 
 from heatsplat.cli import cores
@@ -78,6 +80,32 @@ def alone(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("alone")
     run(folder, *SHORT, "seed=0", "test=false", "threads=2")
     return folder
+
+
+def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path):
+    """The job that has them is run and fails by itself, with the file's name; here it would end the sweep."""
+    from hydra_plugins.heatsplat_launchers._jobs import Job, JobLauncher
+
+    started = []
+
+    class Launcher(JobLauncher):
+        def outcomes(self, jobs):
+            started.extend(job.number for job in jobs)
+            return iter([RuntimeError("not tried")] * len(jobs))
+
+        def _job(self, number, overrides):
+            return Job(number, tuple(overrides), tmp_path / str(number), None)
+
+    for number, text in enumerate(('{"test": {"psnr": 3', None)):
+        (tmp_path / str(number)).mkdir()
+        if text is not None:
+            (tmp_path / str(number) / "metrics.json").write_text(text)
+    launcher = Launcher()
+    launcher.config = OmegaConf.create(
+        {"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": str(tmp_path)}}}
+    )
+    returned = launcher.launch([["seed=0"], ["seed=1"]], 0)
+    assert started == [0, 1] and [job.status for job in returned] == [JobStatus.FAILED] * 2
 
 
 @pytest.mark.skipif(find_spec("joblib") is None, reason="joblib is not installed: pip install -e '.[sweep]'")

@@ -153,9 +153,13 @@ def _finished(job: Job) -> JobReturn | None:
     file = job.folder / METRICS_FILE
     if not file.exists():
         return None
+    try:
+        results = RunResults.read(file)
+    except (ValueError, OSError):  # the job says so itself, and takes no other down
+        return None
     log.info("#%d has results already; skipped. Delete %s to run it again.", job.number, job.folder)
     done = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
-    done.return_value = RunResults.read(file).test.get("psnr")
+    done.return_value = results.test.get("psnr")
     return done
 
 
