@@ -94,7 +94,7 @@ class FakeModule(pl.LightningModule):
         self.thermal, self.sensor = Emitter(), SensorChain()
         self.modality = "thermal" if scene.train[0].thermal is not None else "rgb"
         self.channels = scene.train[0].image(self.modality).shape[-1]
-        self.results = RunResults()
+        self.results, self.density_change = RunResults(), None
         self.value = torch.nn.Parameter(torch.tensor(0.9))
         self.poison = poison or {}
         self.calls = 0

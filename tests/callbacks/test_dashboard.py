@@ -16,7 +16,13 @@ def test_the_layout_is_written_once_per_run(tmp_path):
 
 
 def test_every_panel_finds_curves_of_a_real_run(tmp_path):
-    often = ("trainer.val_check_interval=6", "callbacks.statistics.every=3", "callbacks.costs.every=3")
+    often = (
+        "trainer.val_check_interval=6",
+        "callbacks.statistics.every=3",
+        "callbacks.costs.every=3",
+        "density.start=2",
+        "density.every=4",
+    )
     run(tmp_path, *TINY, "method=3dgs", "data.downscale=2", "max_steps=12", *often)
     tags = events(tmp_path).Tags()["scalars"]
     panels = chain.from_iterable(category.items() for category in LAYOUT.values())

@@ -115,7 +115,7 @@ def test_tensorboard(run):
     module, folder, _ = run
     found = events(folder)
     scalars = set(found.Tags()["scalars"])
-    terms = {"loss/total", "loss/data", "loss/prior", "learning_rate/value", "learning_rate/means", "splats/count"}
+    terms = {"loss/total", "loss/data", "loss/prior", "learning_rate/value", "learning_rate/means", "density/count"}
     assert terms | {"cost/train_seconds", "cost/peak_memory_mb"} <= scalars
     for name in ("psnr", "ssim", "mae_c", "mae_roi_c"):
         assert {f"val/{name}", f"val_by_seconds/{name}", f"test/{name}", f"final/{name}"} <= scalars

@@ -1,19 +1,21 @@
 """The frontier of finished runs: what is read, who lies on the front, time to a quality, and what is written."""
 
 import csv
-import itertools
 import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 import yaml
+from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
-from heatsplat.studies.frontier import dominated, group, read_runs, run, seconds_to
+from heatsplat.studies import frontier
+from heatsplat.studies.frontier import asked_for, dominated, group, read_runs, run, seconds_to
 
 CONFIG = Path(cli.CONF) / "study" / "frontier.yaml"
 LEVELS = {"psnr_levels_db": [25, 30], "mae_levels_c": [15, 10]}
@@ -61,9 +63,11 @@ def test_runs_are_found_at_any_depth_and_grouped_over_seeds(runs):
 
 
 def test_the_front_is_what_nothing_beats_in_both(runs):
+    made(runs / "d", "ti3dgs", ["max_steps=9"], [(0.5, 10)], 0.9, 19.0)
     front = {recipe.name: recipe.on_front for recipe in group(read_runs(runs))}
-    assert front["3dgs"] == {"psnr": True, "mae_c": True}  # the quickest
+    assert front["ti3dgs"] == {"psnr": True, "mae_c": True}  # the quickest
     assert front["etgs"] == {"psnr": True, "mae_c": True}  # the best
+    assert front["3dgs"] == {"psnr": False, "mae_c": False}  # quicker than etgs at its end, which was better on its way
     assert front["3dgs thermal.sh_degree=2"] == {"psnr": False, "mae_c": False}
     assert not dominated(1.0, 2.0, [(1.0, 2.0)]) and dominated(1.0, 2.0, [(1.0, 2.5)])
     assert dominated(1.0, 2.0, [(0.9, 2.0)]) and not dominated(1.0, 2.0, [(0.9, 1.9), (1.1, 2.1)])
@@ -85,7 +89,9 @@ def test_tables_pictures_and_a_page_that_needs_nothing_else(runs, tmp_path):
     assert re.search(r"\| seconds to \|.* 25 dB \|.* 30 dB \|", text) and "| 3dgs |" in text
     with open(tmp_path / "out" / "frontier.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert sum(row["views"] == "test" for row in rows) == 8
+    ends = [row for row in rows if row["views"] == "test"]
+    assert [row["score"] for row in ends] == 4 * ["psnr", "mae_c", "peak_memory_mb"]
+    assert [row["on_front"] for row in ends[:3]] == ["False", "False", ""] and ends[2]["value"] == "700.0"
     assert sum(row["views"] == "validation" for row in rows) == 2 * (3 + 3 + 2 + 2)
     page = (tmp_path / "out" / "frontier.html").read_text()
     assert "data:image/svg+xml;base64," in page and not re.search(r'(?:src|href)="(?!data:)', page)
@@ -219,20 +225,42 @@ def test_levels_that_are_none_are_refused(runs, tmp_path, name, levels):
         run(tmp_path / "out", str(runs), **LEVELS | {name: levels})
 
 
+def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides, study):
+        if not place.exists():
+            asked.append(overrides)
+            settings = [text for text in overrides if not text.startswith("method=")]
+            made(place, overrides[1].partition("=")[2], settings, [(1, 20), (3, 28)], 5.0, 30.0 + len(asked))
+
+    monkeypatch.setattr(frontier, "trained", trained)
+    options = {
+        "methods": {"etgs": {"thermal.frequencies": [8, 24]}, "3dgs": {}},
+        "scenes": ["heated", "cooling"],
+        "seeds": [0, 1],
+        "knobs": {"dtype": ["float32", "float64"]},
+        "overrides": ["data.size=tiny"],
+    }
+    for _ in range(2):
+        recipes = run(tmp_path / "out", None, **LEVELS, **options, outputs=str(tmp_path / "nowhere"))
+    assert len(asked) == 2 * 2 * 2 * (2 + 1)
+    assert asked[0] == [
+        "data.size=tiny", "method=etgs", "data.scene=heated", "seed=0", "dtype=float32", "thermal.frequencies=8"
+    ]  # fmt: skip
+    assert {len(recipe.runs) for recipe in recipes} == {4}  # the stand-in says cooling of all: seeds and scenes are one
+    assert len(recipes) == 6
+
+
 def test_the_commands_in_the_configuration_make_runs_that_compose(tmp_path):
-    """Every combination of the sweeps that the file shows, as the sweeper makes them."""
-    commands = re.findall(r"^# +python src/train.py -m (.+)$", CONFIG.read_text(), re.MULTILINE)
-    assert len(commands) == 2
-    for command in commands:
-        given = [text.partition("=")[::2] for text in command.split() if not text.startswith("hydra.")]
-        jobs = list(itertools.product(*([f"{key}={value}" for value in values.split(",")] for key, values in given)))
-        for job in (jobs[0], jobs[-1], *[job for job in jobs if job[0] != jobs[0][0]][:1]):
-            assert compose_run(tmp_path, *job).max_steps in (1000, 3000)
-    (study,) = re.findall(
-        r"^# +python src/study.py (study=frontier study.runs=\w\S+)$", CONFIG.read_text(), re.MULTILINE
-    )
-    composed = compose_run(tmp_path, *study.split(), config_name="study")
-    assert (
-        f"hydra.sweep.dir={composed.study.runs}" in commands[0]
-        and f"hydra.sweep.dir={composed.study.runs}" in commands[1]
-    )
+    text = CONFIG.read_text()
+    (trains,) = re.findall(r"^# +python src/study.py (study=frontier study.methods.+)$", text, re.MULTILINE)
+    (own,) = re.findall(r'^# +\.\.\. ("study.methods=.+")$', text, re.MULTILINE)
+    for command, runs in ((trains, 2 * 2 * 2 * 4), (f"{trains} {own}", 2 * 2 * 4 * 3)):
+        study = compose_run(tmp_path, *shlex.split(command), config_name="study").study
+        plain = OmegaConf.to_container(study)
+        jobs = asked_for(plain["methods"], plain["scenes"], plain["seeds"], plain["knobs"])
+        assert len(jobs) == len(dict(jobs)) == runs
+        for _, overrides in (jobs[0], jobs[-1]):
+            config = compose_run(tmp_path, *overrides)
+            assert config.density.cap_max in (5000, 20000) and config.max_steps in (1000, 3000)

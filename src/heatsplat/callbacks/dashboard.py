@@ -20,8 +20,12 @@ LAYOUT = {
     "What is minimised": {
         "all terms": ["Multiline", ["^loss/.*"]],
     },
+    "How many Gaussians": {
+        "Gaussians": ["Multiline", ["^density/count$"]],
+        "added at once": ["Multiline", ["^density/added$"]],
+        "removed at once": ["Multiline", ["^density/removed$"]],
+    },
     "What it costs": {
-        "Gaussians": ["Multiline", ["^splats/count$"]],
         "steps per second": ["Multiline", ["^cost/steps_per_second$"]],
         "memory (MB)": ["Multiline", ["^cost/peak_memory_mb$"]],
     },

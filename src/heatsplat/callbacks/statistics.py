@@ -13,7 +13,8 @@ HISTOGRAM_ROWS = 20_000  # a histogram of more Gaussians looks the same and take
 
 
 class SplatStatistics(pl.Callback):
-    """Writes loss terms, learning rates by group, the number of Gaussians and, less often, histograms to TensorBoard.
+    """Writes loss terms, learning rates by group and, less often, histograms to TensorBoard; of the density the number of
+    Gaussians, and those that each refinement added and removed.
 
     Args:
         every: steps between entries.
@@ -26,11 +27,13 @@ class SplatStatistics(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: dict[str, Any], *_: Any
     ) -> None:
-        step = trainer.global_step
-        if step % self.every and step != 1:
-            return
-        writer = board(module)
+        step, writer = trainer.global_step, board(module)
         if writer is None:
+            return
+        if module.density_change is not None:
+            writer.add_scalar("density/added", module.density_change.added, step)
+            writer.add_scalar("density/removed", module.density_change.removed, step)
+        if step % self.every and step != 1:
             return
         terms = {"total": outputs["loss"], **outputs.get("terms", {})}
         # One transfer for all terms: on a GPU each would wait for the queue.
@@ -42,7 +45,7 @@ class SplatStatistics(pl.Callback):
             if group.get("weight_decay"):  # a penalty on squares, applied inside the optimiser and so in no loss term
                 squares = sum(parameter.detach().square().sum() for parameter in group["params"])
                 writer.add_scalar(f"loss/penalty/{group['name']}", 0.5 * group["weight_decay"] * squares.item(), step)
-        writer.add_scalar("splats/count", len(module.splats), step)
+        writer.add_scalar("density/count", len(module.splats), step)
         if self.histogram_every and step % self.histogram_every == 0:
             self._histograms(module, writer, step)
 

@@ -1,8 +1,9 @@
 """What accuracy costs in time: quality against seconds along finished runs, the Pareto front, and time to a quality.
 
 Rules: seconds are of training alone, evaluation excluded; a course is that of the validation views, its end mark that of
-the test views; runs of one recipe on one scene with different seeds are averaged at their ends. Only runs that measured
-alike views are compared. Runs are read, not made: any folder below outputs/ will do, old ones too.
+the test views; runs of one recipe on one scene with different seeds are averaged. The front is that of all points, those of
+courses too: an end is on it if no other recipe was as good sooner, at its end or on its way. Only runs that measured alike
+views are compared. Finished runs are read, old ones too; what ``methods`` asks for is trained before.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import base64
 import csv
 import html
 import io
+import itertools
 import logging
 import math
 import statistics
@@ -25,6 +27,7 @@ from matplotlib.figure import Figure
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, write_atomically
+from heatsplat.studies.child_runs import trained
 from heatsplat.studies.recorded import OVERRIDES, config_of, overrides_of
 from heatsplat.studies.sweeps import named_row, settings_of, unshared
 
@@ -69,7 +72,7 @@ class Recipe:
         scene: title of the panel: the scene, and what was measured of it where that differs between runs.
         name: of the recipe.
         runs: one per seed.
-        on_front: score -> whether no other recipe of the panel is as good in less time.
+        on_front: score -> whether no other recipe of the panel was as good in less time, at its end or on its way.
     """
 
     scene: str
@@ -87,6 +90,16 @@ class Recipe:
         values = [run.end[name] for run in self.runs if name in run.end]
         return statistics.stdev(values) if len(values) > 1 else 0.0
 
+    def course(self, name: str) -> list[tuple[float, float]]:
+        """Mean (seconds, value) of each validation of a score that all runs have."""
+        courses = zip(*(run.course.get(name, []) for run in self.runs), strict=False)
+        return [(statistics.fmean(s for s, _ in points), statistics.fmean(v for _, v in points)) for points in courses]
+
+    def points(self, name: str) -> list[tuple[float, float]]:
+        """``course`` and the end, (seconds, value)."""
+        seconds, value = self.mean("train_seconds"), self.mean(name)
+        return self.course(name) + ([(seconds, value)] if seconds is not None and value is not None else [])
+
     def seconds_to(self, name: str, level: float) -> float | None:
         """Mean seconds until a validation reaches a level of a score; None where a run never does."""
         found = [seconds_to(run.course.get(name, []), level, higher=name == "psnr") for run in self.runs]
@@ -94,24 +107,47 @@ class Recipe:
 
 
 def run(
-    output_dir: Path | str, runs: str | Sequence[str], psnr_levels_db: Sequence[float], mae_levels_c: Sequence[float]
+    output_dir: Path | str,
+    runs: str | Sequence[str] | None,
+    psnr_levels_db: Sequence[float],
+    mae_levels_c: Sequence[float],
+    methods: Sequence[str] | Mapping[str, Mapping[str, Sequence[Any]]] | None = None,
+    scenes: Sequence[str] = ("heated",),
+    seeds: Sequence[int] = (0,),
+    knobs: Mapping[str, Sequence[Any]] | None = None,
+    overrides: Sequence[str] = (),
+    train: str = "src/train.py",
+    outputs: str = "outputs",
 ) -> list[Recipe]:
     """The recipes found; writes frontier.md, .csv, .png, .svg and .html, and the picture to TensorBoard.
 
     Args:
-        output_dir: folder of the results.
-        runs: folders of runs or sweeps, searched to any depth.
+        output_dir: folder of the results, and of the runs that the study trains.
+        runs: folders of finished runs or sweeps that are shown, searched to any depth; None: ``outputs`` where there are no
+            methods, else no others.
         psnr_levels_db, mae_levels_c: qualities (dB; °C) until which the seconds of training are told.
+        methods: what to train, every combination of them with scenes, seeds and knobs; none: nothing. With a mapping each
+            has knobs of its own besides: {"etgs": {"thermal.frequencies": [8, 24]}, "3dgs": {}}.
+        scenes, seeds: on which they train.
+        knobs: override -> its values, of all methods.
+        overrides: of all these runs.
+        train: path of train.py.
+        outputs: where runs lie.
 
     Raises:
-        SceneError: there is no finished run in them, or levels are not positive numbers.
+        SceneError: there is no finished run in them, one of the study's failed, or levels are not positive numbers.
     """
     output_dir = Path(output_dir)
     levels = {
         "psnr": checked_levels("psnr_levels_db", psnr_levels_db),
         "mae_c": checked_levels("mae_levels_c", mae_levels_c)[::-1],
     }
+    if runs is None:
+        runs = [] if methods else outputs
     folders = [Path(text).expanduser() for text in ([runs] if isinstance(runs, str) else runs)]
+    for place, wanted in asked_for(methods or (), scenes, seeds, knobs or {}):
+        trained(output_dir / "runs" / place, train, [*overrides, *wanted], output_dir)
+        folders = [*folders, output_dir / "runs" / place]
     # Folders may lie in each other; a run counts once.
     found = list({one.folder.resolve(): one for folder in folders for one in read_runs(folder)}.values())
     if not found:
@@ -139,6 +175,23 @@ def run(
         writer.add_text("frontier", text)
     log.info("%d runs of %d recipes:\n%s", len(found), len(recipes), text)
     return recipes
+
+
+def asked_for(
+    methods: Sequence[str] | Mapping[str, Mapping[str, Sequence[Any]]],
+    scenes: Sequence[str],
+    seeds: Sequence[int],
+    knobs: Mapping[str, Sequence[Any]],
+) -> list[tuple[str, list[str]]]:
+    """Folder and overrides of every run that ``run`` trains."""
+    jobs = []
+    for method in methods:
+        grid = {**knobs, **(methods[method] or {} if isinstance(methods, Mapping) else {})}
+        for scene, seed, *values in itertools.product(scenes, seeds, *grid.values()):
+            settings = [f"{key}={value}" for key, value in zip(grid, values, strict=True)]
+            place = "_".join([method, scene, *(text.replace("/", "-") for text in settings), f"seed={seed}"])
+            jobs.append((place, [f"method={method}", f"data.scene={scene}", f"seed={seed}", *settings]))
+    return jobs
 
 
 def checked_levels(name: str, levels: Any) -> list[float]:
@@ -236,13 +289,11 @@ def group(runs: Iterable[Run]) -> list[Recipe]:
     for scene in {recipe.scene for recipe in recipes.values()}:
         of_scene = [recipe for recipe in recipes.values() if recipe.scene == scene]
         for name, sign in (("psnr", 1.0), ("mae_c", -1.0)):
-            points = [
-                (recipe, recipe.mean("train_seconds"), sign * recipe.mean(name))
-                for recipe in of_scene
-                if recipe.mean("train_seconds") is not None and recipe.mean(name) is not None
-            ]
-            for recipe, seconds, quality in points:
-                recipe.on_front[name] = not dominated(seconds, quality, [(s, q) for _, s, q in points])
+            points = {id(recipe): [(s, sign * value) for s, value in recipe.points(name)] for recipe in of_scene}
+            for recipe in of_scene:
+                others = [point for other in of_scene if other is not recipe for point in points[id(other)]]
+                if recipe.mean("train_seconds") is not None and recipe.mean(name) is not None:
+                    recipe.on_front[name] = not dominated(*points[id(recipe)][-1], others)
     return sorted(recipes.values(), key=lambda recipe: (recipe.scene, recipe.mean("train_seconds") or 0.0))
 
 
@@ -358,7 +409,7 @@ def tables(
                     cells[i] += f" ± {recipe.spread(name):,.{digits[name]}f}"
             marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
             rows.append([recipe.name, str(len(recipe.runs)), *cells, ", ".join(marks)])
-        found.append((f"{scene}: results beside their costs", head, rows))
+        found.append((f"{scene}: results beside their costs{_views_of(own)}", head, rows))
         psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
         if psnr or mae:
             head = ["seconds to", *(f"{level:g} dB" for level in psnr), *(f"{level:g} °C" for level in mae)]
@@ -374,6 +425,14 @@ def tables(
     return found
 
 
+def _views_of(recipes: Sequence[Recipe]) -> str:
+    """How many views were measured on the way and at the end, in brackets; empty where the runs of a panel do not tell."""
+    told = [(one.measured.get("validation views"), one.measured.get("test views")) for r in recipes for one in r.runs]
+    if len(set(told)) != 1 or None in told[0]:
+        return ""
+    return f" ({told[0][0]} validation views on the way, {told[0][1]} test views at the end)"
+
+
 def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -> str:
     """The tables for people."""
     lines = ["# Accuracy against training time", ""]
@@ -384,21 +443,23 @@ def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -
 
 
 def table_csv(recipes: Sequence[Recipe]) -> str:
-    """Every point of every course, and the ends, for programs."""
+    """Every point of every course, all scores and costs of the ends, and which ends are on the front, for programs."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scene", "recipe", "folder", "views", "seconds", "score", "value"])
+    writer.writerow(["scene", "recipe", "folder", "views", "seconds", "score", "value", "on_front"])
     for recipe, one in [(mean, one) for mean in recipes for one in mean.runs]:
         place = [recipe.scene, recipe.name, one.folder.name]
         for name, course in one.course.items():
-            writer.writerows([*place, "validation", s, name, v] for s, v in course)
-            if name in one.end and "train_seconds" in one.end:
-                writer.writerow([*place, "test", one.end["train_seconds"], name, one.end[name]])
+            writer.writerows([*place, "validation", s, name, v, ""] for s, v in course)
+        seconds = one.end.get("train_seconds")
+        for name in COLUMNS[1:]:
+            if name in one.end and seconds is not None:
+                writer.writerow([*place, "test", seconds, name, one.end[name], recipe.on_front.get(name, "")])
     return text.getvalue()
 
 
 def picture(recipes: Sequence[Recipe]) -> Figure:
-    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front.
+    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front of all.
 
     A recipe looks the same in all panels.
     """
@@ -422,7 +483,9 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
                         x, y, recipe.spread(name), color=color, marker=mark, markeredgecolor=edge, capsize=2,
                         linestyle="", label=recipe.name,
                     )  # fmt: skip
-            front = sorted((r.mean("train_seconds"), r.mean(name)) for r in own if r.on_front.get(name))
+            sign = 1.0 if name == "psnr" else -1.0
+            every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
+            front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
             if len(front) > 1:
                 axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
             axes.set(xlabel="seconds of training", ylabel=label, title=scene, xscale="log")
@@ -447,8 +510,8 @@ def page(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]], vecto
         "td:first-child,th:first-child{text-align:left}img{width:100%}</style>",
         "<h1>Accuracy against training time</h1>",
         f'<img alt="quality against seconds" src="data:image/svg+xml;base64,{picture_data}">',
-        "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end; black edges "
-        "lie on the Pareto front.</p>",
+        "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto "
+        "front of both; ends with a black edge are those that no other recipe equalled sooner.</p>",
     ]
     for title, head, rows in tables(recipes, levels):
         cells = "".join(f"<th>{html.escape(text)}</th>" for text in head)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, RenderOutput, SceneData, SceneError, View
-from heatsplat.density.base import DensityControl
+from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs
@@ -33,8 +33,9 @@ class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, and ``recipe``, the resolved configuration as plain
-    containers: it travels in the checkpoint, so that a checkpoint and its data are enough to evaluate or render.
+    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, ``density_change`` (what density control did in the last
+    step, None for nothing), and ``recipe``, the resolved configuration as plain containers: it travels in the checkpoint, so
+    that a checkpoint and its data are enough to evaluate or render.
 
     Args:
         thermal: what splats emit.
@@ -92,6 +93,7 @@ class SplatTraining(pl.LightningModule):
         self.splats: Splats | None = None
         self._declared: dict[str, PerGaussian] = {}
         self._density_state: dict[str, Tensor] = {}
+        self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, View] | None = None
 
     # Set-up ------------------------------------------------------------------------------------------
@@ -227,6 +229,7 @@ class SplatTraining(pl.LightningModule):
         for name, gone, instead in self.thermal.needless_rows(self.splats, step):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
+        self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.trainer.max_steps, change is not None)
         if change is not None:
             for group in optimizer.param_groups:
