@@ -1,4 +1,7 @@
 """Lists that parametrise the generic tests: whoever adds a variant adds one line here."""
 
 ALL_RENDERERS = ("reference", "cpu", "gsplat")
-ALL_METHODS = ("3dgs", "auto", "energy_balance", "etgs", "ntr_gaussian", "ravigs", "supirgs", "thermogs", "ti3dgs")
+ALL_METHODS = (
+    "3dgs", "3dgs_ir", "auto", "energy_balance", "etgs", "mftg", "mip_splatting", "msmg", "ntr_gaussian", "ommg", "ravigs",
+    "supirgs", "thermogs", "ti3dgs",
+)  # fmt: skip

@@ -266,7 +266,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 SMALL = [
     plain_scene(30, (3,), seed=3, width=16, height=12),
     plain_scene(30, (2, 1), seed=10, width=16, height=12, antialiased=True),
-    plain_scene(30, (1,), seed=12, width=16, height=12, antialiased=True, blur=0.1),
+    plain_scene(30, (1,), seed=27, width=16, height=12, antialiased=True, blur=0.1),
 ]
 
 
