@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -15,18 +17,21 @@ from heatsplat.thermal.harmonics import harmonics
 class Static(ThermalModel):
     """Emission max(0, 1/2 + sum of spherical harmonics of the direction of view), as in 3DGS.
 
-    Tensors: "sh0" [N, 1, C] and, from degree 1, "sh_rest" [N, B - 1, C]. Degree 0 computes no direction.
+    Tensors: "sh0" [N, 1, C] and, from degree 1, "sh_rest" [N, B - 1, C]. Degree 0 computes no direction. With
+    companions their channels follow those of the image, so that Gaussians have C channels in all.
 
     Args:
         degree: 0 (emission without direction) to 3.
-        channels: C; 1 for thermal images, 3 for RGB and pseudo-colour.
+        channels: of the image; 1 for thermal images, 3 for RGB and pseudo-colour.
         modality: the image that is explained, "thermal" or "rgb".
         degree_every: steps after which training adds the next degree; 0 trains all from the start.
         lr: learning rate of "sh0"; that of "sh_rest" is a twentieth.
         floor: False leaves values below zero as they are, for what comes after to decide.
+        companions: further images on the same Gaussians, modality -> channels, such as {"rgb": 3}.
+        shared_opacity: False gives each image opacities of its own.
 
     Raises:
-        ValueError: the degree is not 0 to 3.
+        ValueError: the degree is not 0 to 3, or the image is a companion of itself.
     """
 
     def __init__(
@@ -37,13 +42,19 @@ class Static(ThermalModel):
         degree_every: int = 1000,
         lr: float = 2.5e-3,
         floor: bool = True,
+        companions: Mapping[str, int] | None = None,
+        shared_opacity: bool = True,
     ) -> None:
         super().__init__()
         self.bands = spherical_harmonics.band_count(degree)
         self.degree = degree
         self.active_degree = degree  # after training all are active; the bands never reached are zero
-        self.modality = modality
-        self.modality_channels = (channels,)
+        companions = dict(companions or {})
+        if modality in companions:
+            raise ValueError(f"companions are images beside the {modality} one; leave {modality} out of them")
+        self.modality, self.companions = modality, tuple(companions)
+        self.modality_channels = (channels, *companions.values())
+        self.shared_opacity = shared_opacity
         self.degree_every = degree_every
         self.lr, self.floor = lr, floor
         self.register_buffer("range_c", torch.full((2,), torch.nan, dtype=torch.float64))
@@ -54,7 +65,7 @@ class Static(ThermalModel):
             self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
-        (channels,) = self.modality_channels
+        channels = sum(self.modality_channels)
         count = seeds.means.shape[0]
         if seeds.values.shape != (count, channels):
             raise ValueError(
@@ -76,7 +87,7 @@ class Static(ThermalModel):
         return Emission((values + 0.5).clamp(min=0.0) if self.floor else values + 0.5)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        if self.modality != "thermal" or self.modality_channels != (1,) or self.range_c.isnan().any():
+        if self.modality != "thermal" or self.modality_channels[0] != 1 or self.range_c.isnan().any():
             return None
         units = spherical_harmonics.C0 * splats["sh0"][:, 0, 0] + 0.5
         return ThermalRange(*self.range_c.tolist()).to_celsius(units) + KELVIN_AT_0_C
@@ -86,6 +97,6 @@ class Static(ThermalModel):
 
     @property
     def cost(self) -> int:
-        (channels,) = self.modality_channels
+        channels = sum(self.modality_channels)
         basis = {0: 0, 1: 12, 2: 27, 3: 48}[self.degree]  # normalising the direction and the polynomials in it
         return basis + self.bands * channels
