@@ -92,6 +92,28 @@ class Weighted:
         return {name: factor * value for name, value in _named(self.term(inputs)).items()}
 
 
+class During:
+    """A term that counts at some steps of the run only; at others it is not even evaluated.
+
+    Args:
+        term: what counts.
+        start: first step.
+        stop: the step before which it ends; None is the end of the run.
+    """
+
+    def __init__(self, term: LossTerm, start: int = 0, stop: int | None = None) -> None:
+        self.term, self.start, self.stop = term, start, stop
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Prepares the term."""
+        return prepare(self.term, scene, modality)
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        if inputs.step < self.start or (self.stop is not None and inputs.step >= self.stop):
+            return {}
+        return _named(self.term(inputs))
+
+
 class Loss:
     """The weighted scalars of all terms by name; their sum is the loss.
 

@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 NEIGHBOURS = 3  # a new splat is as large as the distance to its nearest points (Kerbl et al. 2023)
 MIN_SQUARED_DISTANCE = 1e-7
 LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
+ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gradient reaches
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
 
 
@@ -33,14 +34,24 @@ class Initialisation:
             draw. None takes all points.
         opacity: initial opacity in (0, 1).
         scale: factor on the initial size.
+        separate: each modality starts with Gaussians of its own, which the others do not see and never will: their
+            opacity there is ``ABSENT``. Needs a thermal model whose images have opacities of their own.
     """
 
-    def __init__(self, source: str = "sfm", count: int | None = None, opacity: float = 0.1, scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        source: str = "sfm",
+        count: int | None = None,
+        opacity: float = 0.1,
+        scale: float = 1.0,
+        separate: bool = False,
+    ) -> None:
         if source not in ("sfm", "random"):
             raise ValueError(f"init.source must be 'sfm' or 'random', got '{source}'")
         if not 0 < opacity < 1:
             raise ValueError(f"init.opacity must lie in (0, 1), got {opacity}")
         self.source, self.count, self.opacity, self.scale = source, count, opacity, scale
+        self.separate = separate
 
     def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
@@ -56,6 +67,8 @@ class Initialisation:
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             "opacity_logits": logit.repeat(count, len(thermal.opacity_channels)),
         }
+        if self.separate:
+            geometry = _separate(geometry)
         return with_heat(geometry, scene, thermal, seed)
 
     def _means(self, scene: SceneData, generator: torch.Generator) -> Tensor:
@@ -102,6 +115,19 @@ class Pretrained:
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
         return with_heat(geometry, scene, thermal, seed)
+
+
+def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The Gaussians [N] once for each of their M opacities, M N of them, of which each has only that one."""
+    count, modalities = geometry["opacity_logits"].shape
+    if modalities < 2:
+        raise SceneError(
+            "init.separate=true gives every image Gaussians of its own, but the thermal model has one opacity for all; give "
+            "it more (thermal.shared_opacity=false, or thermal.dual_opacity=true), or leave init.separate out"
+        )
+    several = {name: tensor.repeat(modalities, 1) for name, tensor in geometry.items()}
+    own = torch.eye(modalities, dtype=torch.bool).repeat_interleave(count, dim=0)
+    return several | {"opacity_logits": several["opacity_logits"].where(own, ABSENT)}
 
 
 def with_heat(

@@ -45,7 +45,7 @@ class SplatTraining(pl.LightningModule):
         loss: what is minimised.
         init: how splats start.
         optim: learning rates and schedule.
-        stages: which parameters stand still at which steps; None: all train throughout.
+        stages: which parameters stand still at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
         seed: seed of every random draw.
@@ -154,7 +154,7 @@ class SplatTraining(pl.LightningModule):
             for name, part in self.sensor.parts.items()
             for inner, parameter in part.named_parameters()
         ]
-        optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps)
+        optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps, self.stages.progress)
         self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -188,7 +188,7 @@ class SplatTraining(pl.LightningModule):
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
         view = view.to(self.device, self.dtype)
-        self.thermal.on_step(step)
+        self.thermal.on_step(self.stages.round_step(step))
         frame = self._fine(view.frame)
         output = self.render(frame, absgrad=self.density.absgrad)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
@@ -216,19 +216,24 @@ class SplatTraining(pl.LightningModule):
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
-        self.density.observe(self._density_state, output, camera, self.global_step)
+        self.density.observe(self._density_state, output, camera, self.stages.round_step(self.global_step))
         self._rendered = None
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
         inner = getattr(optimizer, "optimizer", optimizer)
+        if step in self.stages.restarts:
+            inner.state.clear()
+            for statistic in self._density_state.values():
+                statistic.zero_()
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
-        for name, gone, instead in self.thermal.needless_rows(self.splats, step):
+        here = self.stages.round_step(step)
+        for name, gone, instead in self.thermal.needless_rows(self.splats, here):
             cloud.drop(name, gone, instead)
-        change = self.density.refine(cloud, step, self.scene.extent, generator_for(self.seed, step, "density"))
+        change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.trainer.max_steps, change is not None)
         if change is not None:

@@ -1,4 +1,7 @@
-"""Stages of a run: which parameters stand still at which steps. A pure function of the step, so resuming is free."""
+"""Stages of a run: which parameters stand still at which steps, and where training begins anew.
+
+A pure function of the step, so resuming is free.
+"""
 
 from __future__ import annotations
 
@@ -64,12 +67,34 @@ class Rest:
 class Stages:
     """Holds parameters still while a step runs. They, their moments and their penalties are left as they were.
 
+    A run may be several rounds: a restart leaves the Gaussians as they are and begins training anew, with a fresh
+    optimiser, and with learning rates, density control and the schedules of the thermal model at their start. Steps of
+    ``rests`` and of losses are those of the run.
+
     Args:
         rests: name -> when which parameters stand still, or None for a stage that is absent.
+        restarts: first steps of all rounds but the first.
+
+    Raises:
+        ValueError: restarts do not increase from 1 on.
     """
 
-    def __init__(self, rests: Mapping[str, Rest | None]) -> None:
+    def __init__(self, rests: Mapping[str, Rest | None], restarts: Sequence[int] = ()) -> None:
         self.rests = {name: rest for name, rest in rests.items() if rest is not None}
+        self.restarts = tuple(restarts)
+        if any(after <= before for before, after in zip((0, *self.restarts), self.restarts, strict=False)):
+            raise ValueError(f"stages.restarts must be increasing steps from 1 on, got {list(restarts)}")
+
+    def round_step(self, step: int) -> int:
+        """The step counted from the first of its round."""
+        return step - max((first for first in self.restarts if first <= step), default=0)
+
+    def progress(self, step: float, max_steps: int) -> float:
+        """Share of its round that is done at a step of a run of ``max_steps``, in [0, 1]."""
+        firsts = [0, *self.restarts, max(max_steps, 1)]
+        number = max(number for number, first in enumerate(firsts[:-1]) if first <= step or number == 0)
+        first, after = firsts[number : number + 2]
+        return min(max(step - first, 0) / max(after - first, 1), 1.0)
 
     def check(self, optimizer: torch.optim.Optimizer) -> None:
         """Warns of stages that hold nothing still, as none of their names is a group of this run."""
