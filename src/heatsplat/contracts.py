@@ -314,6 +314,18 @@ class SceneData:
         low, high = torch.quantile(self.points.float(), torch.tensor([0.01, 0.99]), dim=0)
         return (low + high) / 2, max((high - low).max().item(), 1e-12)
 
+    @property
+    def record(self) -> tuple[float, float]:
+        """First training time in seconds and the span from there to the last; a span of 1 where all are the same.
+
+        Raises:
+            SceneError: a training view has no time.
+        """
+        if "time" not in self.metadata:
+            raise SceneError(f"scene '{self.name}' has training views without a time, so it has no record")
+        first, last = min(self.train.times_s), max(self.train.times_s)
+        return first, last - first if last > first else 1.0
+
     @cached_property
     def extent(self) -> float:
         """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""

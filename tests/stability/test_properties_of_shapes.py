@@ -19,7 +19,7 @@ from heatsplat.physics.ellipsoids import (
 )
 from heatsplat.physics.grey_body import radiance, temperature_of
 from heatsplat.renderers.base import BLUR, FOV_MARGIN
-from heatsplat.thermal.imaging_field import octaves
+from heatsplat.thermal.atmospheric_field import octaves
 
 axes = logarithmic(1e-8, 1e3)
 TYPES = [torch.float32, torch.float64]

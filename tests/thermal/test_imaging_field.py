@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ViewSet
 from heatsplat.splats import Splats
+from heatsplat.thermal.atmospheric_field import octaves
 from heatsplat.thermal.base import Emission, Query, Seeds
-from heatsplat.thermal.imaging_field import ImagingField, octaves
+from heatsplat.thermal.imaging_field import ImagingField
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.static import Static
 

@@ -185,12 +185,12 @@ MUTATIONS = (
         f"{IMAGES}::test_the_sensor_stays_within_its_bounds_wherever_training_takes_it",
     ),
     Mutation(
-        "An exponent without a bound", "thermal.imaging_field",
+        "An exponent without a bound", "thermal.atmospheric_field",
         "return self.exponent_max * torch.tanh(exponent / self.exponent_max)", "return exponent",
         "tests/thermal/test_imaging_field.py",
     ),
     Mutation(
-        "sin(2^k π p) of the rounded product", "thermal.imaging_field",
+        "sin(2^k π p) of the rounded product", "thermal.atmospheric_field",
         "phase = math.pi * (scaled - 2.0 * torch.round(scaled / 2.0))", "phase = math.pi * scaled",
         "tests/thermal/test_imaging_field.py -k octaves",
     ),

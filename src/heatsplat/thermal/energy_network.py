@@ -28,8 +28,8 @@ from heatsplat.physics.sky import LAWS, sky_temperature_k
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
+from heatsplat.thermal.atmospheric_field import BOX_EDGE, octaves
 from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
-from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
 from heatsplat.thermal.weather_drive import columns_at, source_of_sunlight, sunlight_at

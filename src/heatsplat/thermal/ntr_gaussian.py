@@ -9,9 +9,9 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData
 from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
 from heatsplat.splats import Splats
+from heatsplat.thermal.atmospheric_field import BOX_EDGE, octaves
 from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
-from heatsplat.thermal.imaging_field import BOX_EDGE, octaves
 from heatsplat.thermal.layers import draw_uniform
 
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from heatsplat.sensors.agc import EPSILON, GainControl
 from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
+from heatsplat.thermal.atmospheric_field import octaves
 from heatsplat.thermal.base import Query
-from heatsplat.thermal.imaging_field import ImagingField, octaves
+from heatsplat.thermal.imaging_field import ImagingField
 from heatsplat.thermal.static import Static
 
 COUNT = 200
