@@ -25,6 +25,9 @@ class Query:
         time_s: float64 seconds since the first training frame, or None.
         environment: weather at that time, or None.
         frame_id: id of the frame, or None for a view that no one took.
+        geometry: what the model answered when it was asked for the geometry of this very view: None where it answered
+            nothing or was not asked. A deforming model may return a subclass of ``Geometry`` that carries what its
+            features need too, so that nothing is computed twice.
     """
 
     ids: Tensor | None = None
@@ -32,6 +35,7 @@ class Query:
     time_s: float | None = None
     environment: Environment | None = None
     frame_id: int | None = None
+    geometry: Geometry | None = None
 
     def rows(self, tensor: Tensor) -> Tensor:
         """The rows of a per-Gaussian tensor that are asked for, [n, ...]."""

@@ -20,7 +20,7 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.rng import generator_for
@@ -164,12 +164,14 @@ class SplatTraining(pl.LightningModule):
         """The clean image that the splats send to the camera of ``frame`` at its time."""
 
         channels = self.thermal.modality_channels[0]
+        moved = self.thermal.geometry(self.splats, _query(frame))
 
         def emitted(ids: Tensor) -> Tensor:
-            return self.composite.carried(self.thermal.features(self.splats, _query(frame, ids)).features, channels)
+            query = _query(frame, ids, moved)
+            return self.composite.carried(self.thermal.features(self.splats, query).features, channels)
 
         output = self.renderer(
-            *self._geometry(frame),
+            *self._shapes(moved),
             emitted,
             frame.camera,
             self.background,
@@ -179,9 +181,8 @@ class SplatTraining(pl.LightningModule):
         )
         return replace(output, features=self.composite.shown(output.features, channels))
 
-    def _geometry(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, rotations, scales and opacities of all Gaussians at the time of ``frame``."""
-        moved = self.thermal.geometry(self.splats, _query(frame))
+    def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are."""
         shown = self.splats if moved is None else moved
         return shown.means, shown.quats, *self.smoothing(shown.scales, shown.opacities)
 
@@ -278,7 +279,7 @@ class SplatTraining(pl.LightningModule):
         told = self.attributes(frame)
         if not told:
             return {}
-        *shape, opacities = self._geometry(frame)
+        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
         values = torch.stack(list(told.values()), dim=1)
         output = self.renderer(*shape, opacities[:1], values, frame.camera, None, (len(told),))
         alpha = output.alpha[0, ..., None]
@@ -322,9 +323,9 @@ class SplatTraining(pl.LightningModule):
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 
 
-def _query(frame: Frame, ids: Tensor | None = None) -> Query:
-    """What is asked of the thermal model for a frame: the Gaussians ``ids``, or all."""
-    return Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id)
+def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = None) -> Query:
+    """What is asked of the thermal model for a frame: the Gaussians ``ids``, or all, with the geometry it gave them."""
+    return Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id, geometry)
 
 
 def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None:
