@@ -68,7 +68,7 @@ class HexPlane(ThermalModel):
         self,
         emission: ThermalModel,
         heads: Sequence[str] = ("radiance", "opacity"),
-        resolution: int = 64,
+        resolution: int = 32,
         time_resolution: int | None = None,
         scales: Sequence[int] = (1, 2),
         channels: int = 16,
