@@ -77,8 +77,8 @@ class HexPlane(ThermalModel):
         smooth_space: float = 1e-4,
         smooth_time: float = 1e-2,
         sparse_time: float = 1e-4,
-        lr: float = 1.6e-4,
-        lr_planes: float = 1.6e-3,
+        lr: float = 2e-3,
+        lr_planes: float = 1e-2,
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
