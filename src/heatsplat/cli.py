@@ -153,9 +153,12 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
 
     A run that was stopped in this folder goes on from its last checkpoint.
     """
+    from heatsplat.contracts import SceneError
     from heatsplat.io.results import METRICS_FILE, RunResults
     from heatsplat.training.session import fit, prepare_machine
 
+    if config.study is not None:
+        raise SceneError(f"a study has a command of its own: python src/study.py study={config.study}")
     if (output_dir / METRICS_FILE).exists():
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return RunResults.read(output_dir / METRICS_FILE).test.get("psnr")

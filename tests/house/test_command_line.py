@@ -97,7 +97,7 @@ def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ((), "method"),
+        (("study=work_precision",), "python src/study.py study=work_precision"),
         (("method=etgs", "max_stepz=10"), "max_stepz"),
         (("method=etgs", "data=rhd"), "data.root"),
         (("method=etgs", "data=rhd", "data.root=/nowhere/at/all"), "/nowhere/at/all"),

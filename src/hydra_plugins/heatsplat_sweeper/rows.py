@@ -136,7 +136,8 @@ class RowSweeper(BasicSweeper):
         try:
             return super().sweep(list(arguments)) if self.plan is None or self.plan.runs else None
         except BaseException:
-            log.warning("Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder)
+            if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
+                log.warning("Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder)
             raise
         finally:
             paper = {name: str(row["paper"]) for name, row in (self.rows or {}).items() if row.get("paper")}
