@@ -137,7 +137,9 @@ class RowSweeper(BasicSweeper):
             return super().sweep(list(arguments)) if self.plan is None or self.plan.runs else None
         except BaseException:
             if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
-                log.warning("Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder)
+                log.warning(
+                    "Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder
+                )
             raise
         finally:
             paper = {name: str(row["paper"]) for name, row in (self.rows or {}).items() if row.get("paper")}
