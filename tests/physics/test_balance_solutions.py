@@ -86,8 +86,6 @@ def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solutio
 
 
 OFF = {  # what a balance is without, and the same said by numbers to the balance that has everything
-    "wind": ({"wind": None}, {"wind": 0.0}),
-    "sun": ({"sun": None}, {"sun": 0.0}),
     "share": ({"share": None}, {"share": 0.0}),
     "sun and wind": ({"sun": None, "wind": None}, {"sun": 0.0, "wind": 0.0}),
     "normals": ({"normals": None}, {"normals": (0.0, 0.0, 1.0)}),

@@ -122,7 +122,7 @@ def test_a_run_on_an_unseen_scene_comes_after_one_on_all_others(tmp_path):
     rows = ["ntr_gaussian_cross_time", "thermogs_cross_scene", "thermogs_cross_time"]
     assert [run.row for run in plan.runs] == [row for row in rows for _ in range(4)]
     assert plan.absent["ntr_gaussian", "cross_scene"] == "its networks are of one scene"
-    assert plan.absent["thermalgs", "cross_scene"] == "heatsplat does not have it"
+    assert plan.absent["thermalgs", "cross_scene"] == "its features are of one scene"
     assert {run.after for run in plan.runs if run.setting == "cross_time"} == {None}
     second = plan.runs[5]
     assert second.job(["max_steps=5"]) == [

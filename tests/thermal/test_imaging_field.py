@@ -225,11 +225,9 @@ def test_companions_pass_untouched():
     class Joint(Static):
         """Two images on one geometry, as a joint method has them."""
 
-        companions = ("rgb",)
-
         def __init__(self):
             super().__init__()
-            self.modality_channels = (1, 3)
+            self.companions, self.modality_channels = ("rgb",), (1, 3)
 
         def features(self, splats, query):
             emitted = super().features(splats, query).features

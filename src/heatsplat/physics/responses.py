@@ -80,11 +80,11 @@ class ResponseTable:
         return self._advance(self._states[k], k, seconds, end)
 
     def at(self, time_s: float) -> Tensor:
-        """Coefficients of the cubics at a moment of the record, [A - 3, 4, J] float32, for ``interpolate``."""
+        """Coefficients of the cubics at a moment of the record, [A - 3, 4, J] float64, for ``interpolate``."""
         if time_s not in self._tables:
             if len(self._tables) >= MOMENTS_KEPT:
                 self._tables.clear()
-            self._tables[time_s] = cubics(self.exact(time_s)).float()
+            self._tables[time_s] = cubics(self.exact(time_s))
         return self._tables[time_s]
 
 

@@ -159,15 +159,15 @@ def newton_problem(
         source, ambient = g if frequencies else None, torch.tensor(AMBIENT_K)
         return lambda t: visible_temperature(torch.tensor(t, dtype=torch.float64), ambient, first, a, omega, source)
 
-    def table(size: int) -> Moment:
+    def table(dtype: torch.dtype, size: int) -> Moment:
         grid = log_rate_grid(size, *rates)
         cell, x = grid_position(rate.log(), grid)
-        x, flat, first = x.float(), gains.flatten(1).float(), initial.float()
+        x, flat, first = x.to(dtype), gains.flatten(1).to(dtype), initial.to(dtype)
 
         def at(t: float) -> Tensor:
             responses = harmonic_response(grid.exp(), omega, torch.tensor(t, dtype=torch.float64))
             rows = torch.cat((torch.exp(-grid.exp() * t)[:, None], *responses), 1)
-            found = interpolate(cubics(rows).float(), cell, x)
+            found = interpolate(cubics(rows).to(dtype), cell, x)
             return AMBIENT_K + (first - AMBIENT_K) * found[:, 0] + (flat * found[:, 1:]).sum(1)
 
         return at
@@ -178,8 +178,7 @@ def newton_problem(
             dtype = getattr(torch, kind)
             found += [Form("closed form, torch", "", kind, partial(plain, dtype), True)]
             found += [Form("printed formula", "", kind, partial(printed, dtype), False)]
-        if "float32" in types:
-            found += [Form("rate table", f"{n} rates", "float32", partial(table, n), False) for n in sizes]
+            found += [Form("rate table", f"{n} rates", kind, partial(table, dtype, n), False) for n in sizes]
         return found
 
     def reference(count: int) -> np.ndarray:
