@@ -157,8 +157,8 @@ def train(config: DictConfig, output_dir: Path) -> float | None:
     from heatsplat.io.results import METRICS_FILE, RunResults
     from heatsplat.training.session import fit, prepare_machine
 
-    if config.study is not None:
-        raise SceneError(f"a study has a command of its own: python src/study.py study={config.study}")
+    if (chosen := HydraConfig.get().runtime.choices.study) is not None:
+        raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
     if (output_dir / METRICS_FILE).exists():
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return RunResults.read(output_dir / METRICS_FILE).test.get("psnr")
