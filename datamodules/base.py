@@ -90,7 +90,9 @@ class SceneDataModule(pl.LightningDataModule, ABC):
     @cached_property
     def scene(self) -> SceneData:
         """The loaded scene, its training images reduced where that is asked for."""
-        return degraded(self.load(), self.degrade, self.upsample)
+        scene = degraded(self.load(), self.degrade, self.upsample)
+        log.info("scene %s: %d training, %d test views", scene.name, len(scene.train), len(scene.test))
+        return scene
 
     def change_weather(self, path: Path, zone: str | None = None) -> None:
         """Puts the scene under the weather of another table, for its place; ``datamodules.weather.with_weather``."""
@@ -98,7 +100,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
 
     def setup(self, stage: str | None = None) -> None:
         """Loads the scene, so that bad input is reported before anything else is built."""
-        log.info("scene %s: %d training, %d test views", self.scene.name, len(self.scene.train), len(self.scene.test))
+        _ = self.scene
 
     def train_dataloader(self) -> DataLoader:
         """One view per step, from the current step of the trainer to its last."""

@@ -1,13 +1,11 @@
-"""The commands as a user types them, in processes of their own, from another working directory."""
+"""The commands as a user types them, from another working directory."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import pytest
+from commands import succeeds
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ("data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1")
@@ -15,13 +13,7 @@ TINY = ("data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks
 
 def command(script: str, *overrides: str, cwd: Path, code: int = 0) -> str:
     """What ``python src/<script>.py`` prints; checks its exit code."""
-    environment = {**os.environ, "COLUMNS": "200"}
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "src" / f"{script}.py"), *overrides],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return succeeds([str(ROOT / "src" / f"{script}.py"), *overrides], cwd, code, COLUMNS="200")
 
 
 @pytest.fixture(scope="module")

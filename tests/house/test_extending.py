@@ -2,12 +2,11 @@
 
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import succeeds
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "extending.md").read_text()
@@ -27,15 +26,10 @@ def copy(tmp_path_factory) -> Path:
 
 
 def run(copy: Path, command: str) -> str:
-    done = subprocess.run(
-        [sys.executable, *command.split()[1:], "data.size=tiny", f"hydra.run.dir={copy}/run"]
-        if "data=" not in command
-        else [sys.executable, *command.split()[1:], f"hydra.run.dir={copy}/run"],
-        cwd=copy, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    size = [] if "data=" in command else ["data.size=tiny"]
+    printed = succeeds([*command.split()[1:], *size, f"hydra.run.dir={copy}/run"], copy)
     shutil.rmtree(copy / "run", ignore_errors=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return printed
 
 
 def test_the_page_adds_a_model_a_sensor_part_and_a_data_set():

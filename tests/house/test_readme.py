@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import succeeds
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "README.md").read_text()
@@ -31,7 +32,7 @@ def shell(arguments: list[str], cwd: Path, **environment: str) -> str:
 def trained(tmp_path_factory) -> Path:
     """The RUN of the README: a tiny finished run."""
     folder = tmp_path_factory.mktemp("readme") / "run"
-    shell([sys.executable, str(ROOT / "src/train.py"), "method=etgs", *SHORT, f"hydra.run.dir={folder}"], ROOT)
+    succeeds([str(ROOT / "src/train.py"), "method=etgs", *SHORT, f"hydra.run.dir={folder}"])
     return folder
 
 
@@ -58,7 +59,7 @@ def test_the_readme_names_its_main_commands():
 @pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("python")])
 def test_python_commands_run(command, trained, data, tmp_path):
     words = command.replace("RUN", f"{trained}").replace("/data/", f"{data}/").split()
-    words = [sys.executable, str(ROOT / words[1]), *words[2:]]
+    words = [str(ROOT / words[1]), *words[2:]]
     if "train.py" in command:
         words += SHORT if "data=" not in command and "experiment=" not in command else SHORT[1:]
         words += [f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep"]
@@ -72,7 +73,7 @@ def test_python_commands_run(command, trained, data, tmp_path):
         words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
     else:
         words += [f"hydra.run.dir={tmp_path}/done"]
-    output = shell(words, tmp_path)
+    output = succeeds(words, tmp_path)
     if "train.py" in command or "evaluate.py" in command:
         assert "psnr" in output
         jobs = {" -m ": 3, "ablation=": 5, "experiment=": 2}

@@ -1,9 +1,7 @@
 """Tables of the papers: what is planned, what is missing and told, and ours beside the paper's."""
 
 import csv
-import os
 import re
-import subprocess
 import sys
 from collections.abc import Collection
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from commands import succeeds
 from hydra.core.hydra_config import HydraConfig
 from running import compose_run
 
@@ -351,12 +350,7 @@ def write_fake(layout: str, root: Path, *scenes: str) -> Path:
 
 
 def command(*overrides: str, code: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "src" / "train.py"), *overrides],
-        capture_output=True, text=True, timeout=300, env={**os.environ, "COLUMNS": "200"},
-    )  # fmt: skip
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return succeeds([str(ROOT / "src" / "train.py"), *overrides], code=code, COLUMNS="200")
 
 
 SHORT = (

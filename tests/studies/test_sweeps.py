@@ -3,22 +3,22 @@
 import ast
 import csv
 import itertools
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from commands import succeeds
 from hydra.core.utils import JobReturn, JobStatus
 from running import compose_run
 
 from heatsplat import cli
 from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.studies.published import figures, quoted
 from heatsplat.studies.sweeps import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, collect, row_name, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
+TRAIN = str(ROOT / "src" / "train.py")
 ABLATIONS = sorted((ROOT / "conf" / "ablation").glob("*.yaml"))
 
 
@@ -58,15 +58,20 @@ def test_rows_have_means_spreads_and_reasons(sweep):
 
 
 def test_the_table_is_written_for_people_programs_and_eyes(sweep):
-    written = write_sweep(sweep, ["K = 24", "K = 8"], {"K = 24": "40.68 dB"})
+    written = write_sweep(sweep, ["K = 24", "K = 8"], {"K = 24": quoted("etgs", "4", "K=24", ["average"])})
     assert [path.name for path in written] == ["table.md", "table.csv", "table.png"]
     text = (sweep / "table.md").read_text()
-    assert "| row | runs | PSNR (dB) | MAE (°C) | train (s) | paper |" in text
-    assert "| K = 24 | 2 | 35.50 ± 2.12 | 4.500 ± 2.121 | 12.5 ± 0.7 | 40.68 dB |" in text
+    assert "| row | runs | PSNR (dB) | MAE (°C) | train (s) | paper: PSNR (dB) | paper: SSIM | paper: LPIPS |" in text
+    assert "| K = 24 | 2 | 35.50 ± 2.12 | 4.500 ± 2.121 | 12.5 ± 0.7 | 40.68 | 0.989 | 0.050 |" in text
     assert text.index("K = 24") < text.index("K = 8") and "- broken on cooling: SceneError: no points" in text
     with open(sweep / "table.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert float(rows[0]["psnr"]) == 35.5 and rows[0]["paper"] == "40.68 dB" and rows[2]["failed"] == "1"
+    assert (
+        float(rows[0]["psnr"]) == 35.5
+        and rows[0]["paper_psnr"] == "40.68"
+        and rows[1]["paper_psnr"] == ""
+        and rows[2]["failed"] == "1"
+    )
 
 
 def test_a_folder_without_jobs_has_no_table(tmp_path):
@@ -115,9 +120,9 @@ def test_jobs_of_one_row_with_other_settings_are_rows_of_their_own(tmp_path):
     rows = {row.label: row for row in collect(tmp_path)}
     assert list(rows) == ["K = 8, max_steps=9", "K = 8, max_steps=99", "K = 24"]
     assert [row.jobs for row in rows.values()] == [2, 1, 2] and rows["K = 8, max_steps=9"].mean("psnr") == 39.5
-    write_sweep(tmp_path, ["K = 24", "K = 8"], {"K = 8": "40.57 dB"})
+    write_sweep(tmp_path, ["K = 24", "K = 8"], {"K = 8": {"psnr": "40.57"}})
     text = (tmp_path / "table.md").read_text()
-    assert "| K = 8, max_steps=99 | 1 | 129.00 |" in text and text.count("40.57 dB") == 2
+    assert "| K = 8, max_steps=99 | 1 | 129.00 |" in text and text.count("40.57") == 2
     assert text.index("| K = 24 |") < text.index("| K = 8, max_steps=9 |")
 
 
@@ -232,6 +237,28 @@ def test_rows_of_an_ablation_are_different_recipes_that_compose(path, tmp_path):
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
+def test_rows_stand_beside_what_the_paper_prints_for_them(path):
+    """Every setting of the paper's table is printed for one row; of ETGS's terms no figure can be read."""
+    sweeper = yaml.safe_load(path.read_text())["hydra"]["sweeper"]
+    of, table, scenes = (sweeper["paper"][key] for key in ("of", "table", "scenes"))
+    printed = [row["printed"] for row in sweeper["rows"].values() if "printed" in row]
+    assert sorted(printed) == sorted({figure.setting for figure in figures(of, table)})
+    texts = [quoted(of, table, setting, scenes) for setting in printed]
+    assert [len(text) > 1 for text in texts] == [path.stem != "etgs_terms"] * len(printed)
+
+
+def test_what_is_quoted_of_several_scenes_stands_side_by_side():
+    found = quoted("ti3dgs", "IV", "no_tif", ["ti_nsd_indoor", "ti_nsd_outdoor"])
+    assert found == {"psnr": "32.12 / 28.09", "ssim": "0.951 / 0.897"}
+    assert quoted("ti3dgs", "IV", "no_tif", ["ti_nsd_indoor", "nowhere"]) == {}
+
+
+def test_an_ablation_says_whose_parts_it_takes_away(tmp_path):
+    command = [TRAIN, "ablation=etgs_frequencies", "method=3dgs", f"hydra.sweep.dir={tmp_path}"]
+    assert "parts of method=etgs, and method=3dgs lacks some" in succeeds(command, code=1)
+
+
+@pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
 def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
     assert compose_run(tmp_path, f"ablation={path.stem}").name == path.stem.partition("_")[0]
     assert compose_run(tmp_path, f"ablation={path.stem}", "method=3dgs").name == "3dgs"
@@ -239,19 +266,18 @@ def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
 
 def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(tmp_path):
     """One of three rows cannot be built; the others have results, and the second time only that one is tried again."""
-    rows = "{a:{set:[]},b:{set:['thermal.frequencies=2'],paper:'40 dB'},c:{set:['data.size=huge']}}"
+    rows = "{a:{set:[]},b:{set:['thermal.frequencies=2'],printed:'K=16'},c:{set:['data.size=huge']}}"
     command = [
-        sys.executable, str(ROOT / "src" / "train.py"), "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
+        TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
         "max_steps=4", "seed=0", "callbacks.images=null", "callbacks.probes=null", f"hydra.sweeper.rows={rows}",
+        "hydra.sweeper.paper={of:etgs,table:'4',scenes:[average]}",
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
-    first = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "HYDRA_FULL_ERROR": "0"})
-    assert first.returncode != 0 and "data.size=huge: choose one of" in first.stdout + first.stderr
+    assert "data.size=huge: choose one of" in succeeds(command, code=1, HYDRA_FULL_ERROR="0")
     table = (tmp_path / "sweep" / "table.md").read_text()
-    assert "| a | 1 |" in table and "| b | 1 |" in table and "40 dB" in table
+    assert "| a | 1 |" in table and "| b | 1 |" in table and "40.59" in table
     assert "- c on cooling:" in table and "data.size=huge" in table
-    again = subprocess.run(command, capture_output=True, text=True)
-    assert (again.stdout + again.stderr).count("has results already; skipped") == 2
+    assert succeeds(command, code=1).count("has results already; skipped") == 2
 
 
 def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
@@ -259,11 +285,10 @@ def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
         f"callbacks.{name}=null" for name in ("images", "probes", "attributes", "statistics", "dashboard", "checkpoint")
     ]
     command = [
-        sys.executable, str(ROOT / "src" / "train.py"), "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
+        TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
         "max_steps=2", "seed=0", *many, "thermal.source_l2=0.000000000000000000000000000000000001", "test=false",
         "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
+    succeeds(command)
     (folder,) = (path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert folder.name.startswith("etgs_cooling_0_") and len(folder.name) < 160

@@ -22,6 +22,7 @@ TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 SCORES = {
     "psnr": ("PSNR (dB)", 2),
     "ssim": ("SSIM", 4),
+    "lpips": ("LPIPS", 4),
     "mae_c": ("MAE (°C)", 3),
     "clean_psnr": ("clean PSNR (dB)", 2),
     "clean_mae_c": ("clean MAE (°C)", 3),
@@ -41,6 +42,8 @@ NAMES = {"method", "row", "ablation", "experiment"}
 HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
 NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra", "table"}  # these groups with all below
+
+Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
 
 
 @dataclass
@@ -77,13 +80,13 @@ class Row:
         return statistics.stdev(self.values[name]) if len(self.values.get(name, ())) > 1 else None
 
 
-def write_sweep(folder: Path, order: Sequence[str] = (), paper: Mapping[str, str] | None = None) -> list[Path]:
+def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None = None) -> list[Path]:
     """Writes table.md, table.csv and table.png into a sweep's folder, and returns their paths; none without jobs.
 
     Args:
         folder: the sweep's folder, in which every job has its own.
         order: names of rows in the order of the table; others follow as they come.
-        paper: what a paper prints for a row, by name of row.
+        paper: what a paper prints for a row: name of row -> score or cost -> text.
     """
     rows = collect(folder)
     if not rows:
@@ -205,12 +208,17 @@ def _columns(rows: Iterable[Row]) -> dict[str, tuple[str, int]]:
     return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in row.values for row in rows)}
 
 
-def markdown(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
+def _printed(paper: Printed) -> dict[str, tuple[str, int]]:
+    return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in texts for texts in paper.values())}
+
+
+def markdown(rows: Sequence[Row], paper: Printed) -> str:
     """The table for people: mean ± standard deviation over the seeds."""
     columns = _columns(rows)
+    printed = _printed(paper)
     several = len({row.scene for row in rows}) > 1
     head = [*(["scene"] if several else []), "row", "runs", *(title for title, _ in columns.values())]
-    head += ["paper"] if paper else []
+    head += [f"paper: {title}" for title, _ in printed.values()]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in rows:
         cells = [*([row.scene] if several else []), row.label, str(row.jobs)]
@@ -218,7 +226,7 @@ def markdown(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
             mean, spread = row.mean(name), row.spread(name)
             text = "–" if mean is None else f"{mean:,.{digits}f}"
             cells.append(text if spread is None else f"{text} ± {spread:,.{digits}f}")
-        cells += [paper.get(row.name, "–")] if paper else []
+        cells += [paper.get(row.name, {}).get(name, "–") for name in printed]
         lines.append("| " + " | ".join(cells) + " |")
     failed = [f"- {row.label} on {row.scene}: {reason}" for row in rows for reason in row.failed]
     if failed:
@@ -227,17 +235,22 @@ def markdown(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
     return "\n".join([f"# Sweep on {scenes}", "", "Mean ± standard deviation over seeds.", "", *lines, ""])
 
 
-def table_csv(rows: Sequence[Row], paper: Mapping[str, str]) -> str:
+def table_csv(rows: Sequence[Row], paper: Printed) -> str:
     """The table for programs: full precision, mean and standard deviation in columns of their own."""
     columns = _columns(rows)
-    spread = [f"{name}_std" for name in columns]
+    spread, printed = [f"{name}_std" for name in columns], _printed(paper)
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, ["scene", "row", "runs", "failed", *columns, *spread, "paper"], lineterminator="\n")
+    writer = csv.DictWriter(
+        text,
+        ["scene", "row", "runs", "failed", *columns, *spread, *map("paper_{}".format, printed)],
+        lineterminator="\n",
+    )
     writer.writeheader()
     for row in rows:
         numbers = {name: row.mean(name) for name in columns} | {f"{name}_std": row.spread(name) for name in columns}
         counts = {"scene": row.scene, "row": row.label, "runs": row.jobs, "failed": len(row.failed)}
-        writer.writerow(counts | numbers | {"paper": paper.get(row.name)})
+        texts = {f"paper_{name}": paper.get(row.name, {}).get(name) for name in printed}
+        writer.writerow(counts | numbers | texts)
     return text.getvalue()
 
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn
+from hydra.errors import ConfigCompositionException
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from hydra_plugins.heatsplat_launchers._jobs import planned
+from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
 
 if TYPE_CHECKING:
     from heatsplat.studies.published import Plan
@@ -79,13 +80,15 @@ class RowSweeper(BasicSweeper):
     Args:
         max_batch_size: jobs handed to the launcher at a time, all batches one after the other; None for all at once.
         params: the grid: key -> values with commas, as on the command line.
-        rows: name of a row -> {"set": overrides of the row, "paper": what the paper prints for it}; None for a grid alone.
+        paper: the paper's table that the rows are beside: {"of": paper, "table": label, "scenes": whose figures}; None without.
+        rows: name of a row -> {"set": overrides of the row, "printed": its setting in that table}; None for a grid alone.
     """
 
     def __init__(
         self,
         max_batch_size: int | None = None,
         params: Mapping[str, str] | None = None,
+        paper: Mapping[str, Any] | None = None,
         rows: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         if max_batch_size is not None and max_batch_size < 1:
@@ -93,6 +96,7 @@ class RowSweeper(BasicSweeper):
         # Hydra's own batches end with the first one in which a job failed, so to Hydra all jobs are one.
         super().__init__(None, None if params is None else dict(params))
         self.batch = max_batch_size
+        self.paper = paper
         self.rows = rows
         self.plan: Plan | None = None
 
@@ -135,6 +139,13 @@ class RowSweeper(BasicSweeper):
             return None
         try:
             return super().sweep(list(arguments)) if self.plan is None or self.plan.runs else None
+        except ConfigCompositionException as error:
+            of, chosen = (self.paper or {}).get("of"), self.config.hydra.runtime.choices.method
+            if of in (None, chosen):
+                raise
+            raise ConfigCompositionException(
+                f"The rows of this ablation are parts of method={of}, and method={chosen} lacks some: {error}"
+            ) from error
         except BaseException:
             if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
                 log.warning(
@@ -142,8 +153,7 @@ class RowSweeper(BasicSweeper):
                 )
             raise
         finally:
-            paper = {name: str(row["paper"]) for name, row in (self.rows or {}).items() if row.get("paper")}
-            written = write_sweep(folder, list(self.rows or ()), paper)
+            written = write_sweep(folder, list(self.rows or ()), self._printed())
             if self.plan is not None:
                 from heatsplat.studies.published import write_comparison
 
@@ -151,6 +161,21 @@ class RowSweeper(BasicSweeper):
                 log.info("%s", written[-2].read_text(encoding="utf-8"))
             for path in written:
                 log.info("%s", path)
+
+    def _printed(self) -> dict[str, dict[str, str]]:
+        """What the paper prints for the rows: name of row -> score or cost -> text."""
+        from heatsplat.studies.published import quoted
+
+        if self.paper is None:
+            return {}
+        of, table, scenes = (self.paper[key] for key in ("of", "table", "scenes"))
+        settings = {name: row["printed"] for name, row in (self.rows or {}).items() if "printed" in row}
+        return {name: quoted(of, table, setting, scenes) for name, setting in settings.items()}
+
+    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
+        """Composes every job before any starts, unless the launcher does so by itself: a hundred take a minute."""
+        if not isinstance(self.launcher, JobLauncher):
+            super().validate_batch_is_legal(batch)
 
     def _plan(self, arguments: list[str]) -> bool:
         """Plans the runs of a published table and tells them, with what is missing; False where nothing is to be done.

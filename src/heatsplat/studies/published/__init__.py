@@ -5,6 +5,7 @@ from heatsplat.studies.published.figures import METRICS as METRICS
 from heatsplat.studies.published.figures import TITLES as TITLES
 from heatsplat.studies.published.figures import Figure as Figure
 from heatsplat.studies.published.figures import figures as figures
+from heatsplat.studies.published.figures import quoted as quoted
 from heatsplat.studies.published.figures import tables as tables
 from heatsplat.studies.published.plans import Plan as Plan
 from heatsplat.studies.published.plans import Run as Run

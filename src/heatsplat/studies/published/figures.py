@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -134,6 +134,22 @@ def figures(paper: str, table: str) -> list[Figure]:
     if not found:
         raise SceneError(f"table.number={table}: {TITLES[paper]} has {', '.join(tables(paper))}")
     return found
+
+
+def quoted(paper: str, table: str, setting: str, scenes: Sequence[str]) -> dict[str, str]:
+    """What a table prints for a setting: score or cost in metrics.json -> text, for several scenes such as "36.61 / 32.78".
+
+    Metrics that heatsplat does not measure, or in another unit, are left out, and so is what is not printed for every scene.
+    """
+    found = {
+        (figure.metric, figure.scene): figure.printed for figure in figures(paper, table) if figure.setting == setting
+    }
+    texts: dict[str, str] = {}
+    for key in dict.fromkeys(key for key, _ in found):
+        metric, printed = METRICS[key], [found.get((key, scene)) for scene in scenes]
+        if metric.ours is not None and metric.convert is float and all(printed):
+            texts[metric.ours] = " / ".join(map(str, printed))
+    return texts
 
 
 def doubts(paper: str, table: str) -> list[str]:

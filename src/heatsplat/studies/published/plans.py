@@ -183,7 +183,7 @@ def make_plan(
         config: the section ``table`` of an experiment (conf/experiment/shared/table.yaml has its keys).
         root: folder of the data set.
         methods: those that heatsplat has.
-        ablation: rows of the ablation that ``config`` names: name -> {"set": overrides}.
+        ablation: rows of the ablation that ``config`` names: name -> {"set": overrides, "printed": setting}.
         given: keys that the command line sets; they win over the table's settings.
 
     Raises:
@@ -282,10 +282,12 @@ def _protocol(config: Mapping[str, Any], setting: str, ablation: Mapping[str, Ma
         return ()
     if setting in config["protocols"]:
         return config["protocols"][setting]
-    row = config["rows"].get(setting)
-    if row not in ablation:
-        raise SceneError(f"the table's setting {setting} is in none of table.protocols, table.rows and table.absent")
-    return ablation[row].get("set") or ()
+    for row in ablation.values():
+        if row.get("printed") == setting:
+            return row.get("set") or ()
+    raise SceneError(
+        f"the table's setting {setting} is in none of table.protocols, table.absent and rows of table.ablation"
+    )
 
 
 def _overruled(override: str, given: Collection[str]) -> bool:
