@@ -145,6 +145,184 @@ def power(x, reference):
     return x * (1.0 + z * (1.5 + z * (1.0 + 0.25 * z))), (1.0 + z) * (1.0 + z) * (1.0 + z)
 
 
+@inline
+def march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
+    """``march`` for the Gaussian ``i``; ``final`` is the sample before ``time``.
+
+    On its own, because Numba takes the body of a parallel loop through its passes twice, and this one is long.
+    """
+    r = math.exp(float(parameters[i, LOG_RATE]))
+    p, g, v, f = 0.0, 0.0, 0.0, 1.0
+    nx, ny, nz = 0.0, 0.0, 0.0
+    if radiates(balance):
+        p = float(parameters[i, share_column(balance)])
+    if sunny(balance):
+        g = float(parameters[i, sun_column(balance)])
+    if windy(balance):
+        v = float(parameters[i, wind_column(balance)])
+    if oriented(balance):
+        column = normal_column(balance)
+        nx, ny = float(parameters[i, column]), float(parameters[i, column + 1])
+        nz = float(parameters[i, column + 2])
+        f = 0.5 * (1.0 + nx * up[0] + ny * up[1] + nz * up[2])
+    x = float(parameters[i, START])
+    # Start at the last sample that is MEMORY time constants old (0.7: of T³ in kelvin, down to -10 % of T).
+    k, age = final, 0.0
+    while k > 0 and age < MEMORY:
+        k -= 1
+        slowest = 1.0
+        if windy(balance):
+            slowest += v * min(drivers[BREEZE, k], drivers[BREEZE, k + 1])
+        if radiates(balance):
+            slowest = (1.0 - p) * slowest + 0.7 * p
+        age += r * slowest * (times[k + 1] - times[k])
+    remembers = k == 0 and age < MEMORY
+    air = drivers[AIR, k]
+    c, tilt, sky, light, sun, w, w_slope = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    breeze, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+    if windy(balance):
+        breeze = drivers[BREEZE, k]
+        c = 1.0 + v * breeze
+    if sunny(balance):
+        light = drivers[LIGHT, k]
+        sun = f * light
+        if oriented(balance):
+            bx, by, bz = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
+            beam = nx * bx + ny * by + nz * bz
+            if beam <= 0.0:
+                beam, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+            sun += beam
+    if not remembers:
+        x = air
+        if sunny(balance):
+            x += g * sun
+    if radiates(balance):
+        c *= 1.0 - p
+        tilt = drivers[SKY, k] - drivers[AROUND, k]
+        sky = drivers[AROUND, k] + f * tilt
+        w, w_slope = power(x, reference)
+    d_start, d_rate, d_share, d_sun, d_wind, dx, dy, dz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    while k <= final:
+        interval = times[k + 1] - times[k]
+        ending = 1.0
+        if k == final:
+            ending = (time - times[k]) / interval
+        seconds = interval * ending
+        # Differences to the end of the interval, and the fastest that the body can be within it.
+        d_air = drivers[AIR, k + 1] - air
+        d_breeze, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
+        ex, ey, ez = 0.0, 0.0, 0.0
+        fastest = 1.0
+        if windy(balance):
+            d_breeze = drivers[BREEZE, k + 1] - breeze
+            fastest += v * max(breeze, breeze + d_breeze)
+        if radiates(balance):
+            fastest = (1.0 - p) * fastest + p * w_slope
+            tilt_2 = drivers[SKY, k + 1] - drivers[AROUND, k + 1]
+            d_tilt, d_sky = tilt_2 - tilt, drivers[AROUND, k + 1] + f * tilt_2 - sky
+        if sunny(balance):
+            light_2 = drivers[LIGHT, k + 1]
+            sun_2 = f * light_2
+            if oriented(balance):
+                cx, cy, cz = drivers[BEAM_X, k + 1], drivers[BEAM_Y, k + 1], drivers[BEAM_Z, k + 1]
+                beam = nx * cx + ny * cy + nz * cz
+                if beam <= 0.0:
+                    beam, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
+                sun_2 += beam
+                ex, ey, ez = cx - bx, cy - by, cz - bz
+            d_level, d_light = light_2 - light, sun_2 - sun
+        substeps = min(SUBSTEPS, 1 + int(r * fastest * seconds / STEP))
+        share = ending / substeps
+        h = seconds / substeps
+        for _ in range(substeps):
+            # Linear part: the slope of w here, and the wind halfway.
+            air_2, c_2 = air + share * d_air, c
+            breeze_2, tilt_2, sky_2, light_2, sun_2 = breeze, tilt, sky, light, sun
+            if windy(balance):
+                breeze_2 = breeze + share * d_breeze
+                c_2 = 1.0 + v * breeze_2
+                if radiates(balance):
+                    c_2 *= 1.0 - p
+            slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
+            if sunny(balance):
+                light_2, sun_2 = light + share * d_level, sun + share * d_light
+                force += g * sun
+                ahead += g * sun_2
+            if radiates(balance):
+                tilt_2, sky_2 = tilt + share * d_tilt, sky + share * d_sky
+                slope += p * w_slope
+                force += p * (sky - w)
+                ahead += p * (sky_2 - w)
+            decay, phi, second, third = weights(r * slope * h)
+            new = x + h * r * (phi * force + second * (ahead - force))
+            rest = (slope - c_2) * (new - x)
+            w_2, slope_2 = 0.0, 0.0
+            if radiates(balance):
+                w_2, slope_2 = power(new, reference)
+                rest -= p * (w_2 - w)
+            if windy(balance) or radiates(balance):
+                new += 2.0 * third * h * r * rest
+            slope = c + c_2
+            if radiates(balance):
+                w_2, slope_2 = power(new, reference)
+                slope += p * (w_slope + slope_2)
+            # Sensitivities: the linearised balance, along the trajectory from its beginning to its end.
+            decay, phi, second, _ = weights(h * r * 0.5 * slope)
+            one, two = h * r * (phi - second), h * r * second
+            change = c_2 * (air_2 - new)
+            if sunny(balance):
+                change += g * sun_2
+            if radiates(balance):
+                change += p * (sky_2 - w_2)
+            d_rate = decay * d_rate + one * force + two * change
+            d_start *= decay
+            if radiates(balance):
+                calm, calm_2 = air - x, air_2 - new
+                if windy(balance):
+                    calm *= 1.0 + v * breeze
+                    calm_2 *= 1.0 + v * breeze_2
+                d_share = decay * d_share + one * (sky - w - calm) + two * (sky_2 - w_2 - calm_2)
+            if sunny(balance):
+                d_sun = decay * d_sun + one * sun + two * sun_2
+            if windy(balance):
+                gust = one * breeze * (air - x) + two * breeze_2 * (air_2 - new)
+                if radiates(balance):
+                    gust *= 1.0 - p
+                d_wind = decay * d_wind + gust
+            if oriented(balance):
+                lean = 0.0
+                if radiates(balance):
+                    lean += p * (one * tilt + two * tilt_2)
+                if sunny(balance):
+                    lean += g * (one * light + two * light_2)
+                lean *= 0.5
+                dx = decay * dx + lean * up[0]
+                dy = decay * dy + lean * up[1]
+                dz = decay * dz + lean * up[2]
+                if sunny(balance):
+                    cx, cy, cz = bx + share * ex, by + share * ey, bz + share * ez
+                    dx += g * (one * bx + two * cx)
+                    dy += g * (one * by + two * cy)
+                    dz += g * (one * bz + two * cz)
+                    bx, by, bz = cx, cy, cz
+            x, air, c = new, air_2, c_2
+            w, w_slope, breeze, tilt, sky, light, sun = w_2, slope_2, breeze_2, tilt_2, sky_2, light_2, sun_2
+        k += 1
+    temperatures[i] = x
+    sensitivities[i, START] = d_start if remembers else 0.0
+    sensitivities[i, LOG_RATE] = d_rate
+    if radiates(balance):
+        sensitivities[i, share_column(balance)] = d_share
+    if sunny(balance):
+        sensitivities[i, sun_column(balance)] = d_sun
+    if windy(balance):
+        sensitivities[i, wind_column(balance)] = d_wind
+    if oriented(balance):
+        column = normal_column(balance)
+        sensitivities[i, column], sensitivities[i, column + 1] = dx, dy
+        sensitivities[i, column + 2] = dz
+
+
 @kernel
 def march(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
     """Temperatures at a time under the full balance: T⁴ as it is, wind as it blows.
@@ -172,173 +350,4 @@ def march(balance, parameters, times, drivers, up, reference, time, temperatures
         final -= 1
     for block in prange((count + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            r = math.exp(float(parameters[i, LOG_RATE]))
-            p, g, v, f = 0.0, 0.0, 0.0, 1.0
-            nx, ny, nz = 0.0, 0.0, 0.0
-            if radiates(balance):
-                p = float(parameters[i, share_column(balance)])
-            if sunny(balance):
-                g = float(parameters[i, sun_column(balance)])
-            if windy(balance):
-                v = float(parameters[i, wind_column(balance)])
-            if oriented(balance):
-                column = normal_column(balance)
-                nx, ny = float(parameters[i, column]), float(parameters[i, column + 1])
-                nz = float(parameters[i, column + 2])
-                f = 0.5 * (1.0 + nx * up[0] + ny * up[1] + nz * up[2])
-            x = float(parameters[i, START])
-            # Start at the last sample that is MEMORY time constants old (0.7: of T³ in kelvin, down to -10 % of T).
-            k, age = final, 0.0
-            while k > 0 and age < MEMORY:
-                k -= 1
-                slowest = 1.0
-                if windy(balance):
-                    slowest += v * min(drivers[BREEZE, k], drivers[BREEZE, k + 1])
-                if radiates(balance):
-                    slowest = (1.0 - p) * slowest + 0.7 * p
-                age += r * slowest * (times[k + 1] - times[k])
-            remembers = k == 0 and age < MEMORY
-            air = drivers[AIR, k]
-            c, tilt, sky, light, sun, w, w_slope = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            breeze, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-            if windy(balance):
-                breeze = drivers[BREEZE, k]
-                c = 1.0 + v * breeze
-            if sunny(balance):
-                light = drivers[LIGHT, k]
-                sun = f * light
-                if oriented(balance):
-                    bx, by, bz = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
-                    beam = nx * bx + ny * by + nz * bz
-                    if beam <= 0.0:
-                        beam, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-                    sun += beam
-            if not remembers:
-                x = air
-                if sunny(balance):
-                    x += g * sun
-            if radiates(balance):
-                c *= 1.0 - p
-                tilt = drivers[SKY, k] - drivers[AROUND, k]
-                sky = drivers[AROUND, k] + f * tilt
-                w, w_slope = power(x, reference)
-            d_start, d_rate, d_share, d_sun, d_wind, dx, dy, dz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            while k <= final:
-                interval = times[k + 1] - times[k]
-                ending = 1.0
-                if k == final:
-                    ending = (time - times[k]) / interval
-                seconds = interval * ending
-                # Differences to the end of the interval, and the fastest that the body can be within it.
-                d_air = drivers[AIR, k + 1] - air
-                d_breeze, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
-                ex, ey, ez = 0.0, 0.0, 0.0
-                fastest = 1.0
-                if windy(balance):
-                    d_breeze = drivers[BREEZE, k + 1] - breeze
-                    fastest += v * max(breeze, breeze + d_breeze)
-                if radiates(balance):
-                    fastest = (1.0 - p) * fastest + p * w_slope
-                    tilt_2 = drivers[SKY, k + 1] - drivers[AROUND, k + 1]
-                    d_tilt, d_sky = tilt_2 - tilt, drivers[AROUND, k + 1] + f * tilt_2 - sky
-                if sunny(balance):
-                    light_2 = drivers[LIGHT, k + 1]
-                    sun_2 = f * light_2
-                    if oriented(balance):
-                        cx, cy, cz = drivers[BEAM_X, k + 1], drivers[BEAM_Y, k + 1], drivers[BEAM_Z, k + 1]
-                        beam = nx * cx + ny * cy + nz * cz
-                        if beam <= 0.0:
-                            beam, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
-                        sun_2 += beam
-                        ex, ey, ez = cx - bx, cy - by, cz - bz
-                    d_level, d_light = light_2 - light, sun_2 - sun
-                substeps = min(SUBSTEPS, 1 + int(r * fastest * seconds / STEP))
-                share = ending / substeps
-                h = seconds / substeps
-                for _ in range(substeps):
-                    # Linear part: the slope of w here, and the wind halfway.
-                    air_2, c_2 = air + share * d_air, c
-                    breeze_2, tilt_2, sky_2, light_2, sun_2 = breeze, tilt, sky, light, sun
-                    if windy(balance):
-                        breeze_2 = breeze + share * d_breeze
-                        c_2 = 1.0 + v * breeze_2
-                        if radiates(balance):
-                            c_2 *= 1.0 - p
-                    slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
-                    if sunny(balance):
-                        light_2, sun_2 = light + share * d_level, sun + share * d_light
-                        force += g * sun
-                        ahead += g * sun_2
-                    if radiates(balance):
-                        tilt_2, sky_2 = tilt + share * d_tilt, sky + share * d_sky
-                        slope += p * w_slope
-                        force += p * (sky - w)
-                        ahead += p * (sky_2 - w)
-                    decay, phi, second, third = weights(r * slope * h)
-                    new = x + h * r * (phi * force + second * (ahead - force))
-                    rest = (slope - c_2) * (new - x)
-                    w_2, slope_2 = 0.0, 0.0
-                    if radiates(balance):
-                        w_2, slope_2 = power(new, reference)
-                        rest -= p * (w_2 - w)
-                    if windy(balance) or radiates(balance):
-                        new += 2.0 * third * h * r * rest
-                    slope = c + c_2
-                    if radiates(balance):
-                        w_2, slope_2 = power(new, reference)
-                        slope += p * (w_slope + slope_2)
-                    # Sensitivities: the linearised balance, along the trajectory from its beginning to its end.
-                    decay, phi, second, _ = weights(h * r * 0.5 * slope)
-                    one, two = h * r * (phi - second), h * r * second
-                    change = c_2 * (air_2 - new)
-                    if sunny(balance):
-                        change += g * sun_2
-                    if radiates(balance):
-                        change += p * (sky_2 - w_2)
-                    d_rate = decay * d_rate + one * force + two * change
-                    d_start *= decay
-                    if radiates(balance):
-                        calm, calm_2 = air - x, air_2 - new
-                        if windy(balance):
-                            calm *= 1.0 + v * breeze
-                            calm_2 *= 1.0 + v * breeze_2
-                        d_share = decay * d_share + one * (sky - w - calm) + two * (sky_2 - w_2 - calm_2)
-                    if sunny(balance):
-                        d_sun = decay * d_sun + one * sun + two * sun_2
-                    if windy(balance):
-                        gust = one * breeze * (air - x) + two * breeze_2 * (air_2 - new)
-                        if radiates(balance):
-                            gust *= 1.0 - p
-                        d_wind = decay * d_wind + gust
-                    if oriented(balance):
-                        lean = 0.0
-                        if radiates(balance):
-                            lean += p * (one * tilt + two * tilt_2)
-                        if sunny(balance):
-                            lean += g * (one * light + two * light_2)
-                        lean *= 0.5
-                        dx = decay * dx + lean * up[0]
-                        dy = decay * dy + lean * up[1]
-                        dz = decay * dz + lean * up[2]
-                        if sunny(balance):
-                            cx, cy, cz = bx + share * ex, by + share * ey, bz + share * ez
-                            dx += g * (one * bx + two * cx)
-                            dy += g * (one * by + two * cy)
-                            dz += g * (one * bz + two * cz)
-                            bx, by, bz = cx, cy, cz
-                    x, air, c = new, air_2, c_2
-                    w, w_slope, breeze, tilt, sky, light, sun = w_2, slope_2, breeze_2, tilt_2, sky_2, light_2, sun_2
-                k += 1
-            temperatures[i] = x
-            sensitivities[i, START] = d_start if remembers else 0.0
-            sensitivities[i, LOG_RATE] = d_rate
-            if radiates(balance):
-                sensitivities[i, share_column(balance)] = d_share
-            if sunny(balance):
-                sensitivities[i, sun_column(balance)] = d_sun
-            if windy(balance):
-                sensitivities[i, wind_column(balance)] = d_wind
-            if oriented(balance):
-                column = normal_column(balance)
-                sensitivities[i, column], sensitivities[i, column + 1] = dx, dy
-                sensitivities[i, column + 2] = dz
+            march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
