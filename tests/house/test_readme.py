@@ -64,7 +64,7 @@ def test_python_commands_run(command, trained, data, tmp_path):
         words += SHORT if "data=" not in command and "experiment=" not in command else SHORT[1:]
         words += [f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep"]
         if "budget=" in command:  # which counts the steps itself
-            words = [word for word in words if not word.startswith(("max_steps=", "budget="))] + ["budget=40s"]
+            words = [word for word in words if not word.startswith(("max_steps=", "budget="))] + ["budget=20s"]
         if "experiment=" in command:  # some of its methods
             words += ["table.methods=[3dgs,etgs]"]
         if "ablation=" in command:  # one seed
