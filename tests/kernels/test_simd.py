@@ -102,6 +102,44 @@ def test_columns_are_read_and_written_up_to_the_last_row(rows):
 
 
 @serial_kernel
+def of_doubles(x, y, out):
+    a, b = simd.load(x, 0), simd.load(y, 0)
+    simd.store_vector(out, 0, simd.minimum(a, b))
+    simd.store_vector(out, 1, simd.maximum(a, b))
+    simd.store_vector(out, 2, simd.select(a < b, a, simd.filled(x, 0.1)))
+    simd.store_vector(out, 3, 2.0 * a - b / 3.0)
+    simd.store_vector(out, 4, -a)
+    simd.store_vector(out, 5, simd.exp(-b))
+    return simd.total(a)
+
+
+def test_doubles_keep_all_their_digits():
+    x, y = np.random.default_rng(0).normal(size=(2, 16))
+    y *= 300
+    out = np.zeros((6, 16))
+    total = of_doubles(x, y, out)
+    expected = [np.minimum(x, y), np.maximum(x, y), np.where(x < y, x, 0.1), 2 * x - y / 3, -x, np.exp(-y)]
+    for found, wanted in zip(out, expected, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=5e-16)
+    assert total == pytest.approx(x.sum(), rel=1e-14)
+    columns = np.arange(48, dtype=np.float64).reshape(16, 3) / 3
+    transpose(columns, moved := np.full((16, 3), -1.0), 7)
+    np.testing.assert_array_equal(moved[:7], columns[:7][:, [2, 0, 1]])
+    assert (moved[7:] == -1).all()
+
+
+@serial_kernel
+def exponentials(x, out):
+    simd.store(out, 0, simd.exp(simd.load(x, 0)))
+
+
+def test_exp_of_floats_ends_at_the_smallest_number():
+    x = np.array([0, 1, -1, 10, -10, 80, -80, -87, -88, -1e3, -1e30, 0.5, -0.5, 2, -2, -50], np.float32)
+    exponentials(x, found := np.empty_like(x))
+    np.testing.assert_allclose(found, np.maximum(np.exp(x.astype(np.float64)), 2.0**-126), rtol=8e-6)
+
+
+@serial_kernel
 def words(x):
     return simd.bytes_of(simd.load(x, 0))
 

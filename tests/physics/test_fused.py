@@ -1,4 +1,4 @@
-"""The fused kernel against its plain twin in float64 and against 200 digits, on any K, rows, threads and moment."""
+"""The fused kernel, in float32 and float64, against its plain twin and 200 digits, on any K, rows, threads and moment."""
 
 import math
 
@@ -12,6 +12,7 @@ from heatsplat.physics import fused
 from heatsplat.physics.fused import visible_temperature
 
 DOUBLE = torch.float64
+KINDS = {torch.float32: 1e-6, DOUBLE: 2e-15}  # errors allowed
 
 
 def case(count, frequencies, seed=0, scaled=False, span=2.0):
@@ -36,18 +37,24 @@ def run(function, leaves, omega, time, ids, weights, dtype):
     return values.detach(), {k: v.grad for k, v in copies.items() if v is not None and v.numel() > 0}
 
 
+def twin(time, ambient, initial, rate, gains, omega, inverse_capacity=None, ids=None):
+    """The plain form, called as ``visible_temperature`` is."""
+    return fused._reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, None)
+
+
+@pytest.mark.parametrize("dtype", KINDS, ids=str)
 @pytest.mark.parametrize("frequencies", [0, 1, 2, 15, 16, 17, 24, 32, 40])
 @pytest.mark.parametrize("time", [0.0, 1e-4, 1.0, 30.0, -0.5])
-def test_kernel_equals_the_twin(frequencies, time):
+def test_kernel_equals_the_twin(frequencies, time, dtype):
     leaves, omega = case(300, frequencies, scaled=frequencies in (2, 16, 24))
-    weights = torch.linspace(-1, 2, 300)
-    values, gradients = run(visible_temperature, leaves, omega, time, None, weights, torch.float32)
-    expected, truth = run(visible_temperature, leaves, omega, time, None, weights, DOUBLE)
-    assert fused._fits_kernel(leaves["rate"], omega)
-    torch.testing.assert_close(values.double(), expected, rtol=1e-6, atol=1e-6 * (1 + expected.abs().max().item()))
+    weights, error = torch.linspace(-1, 2, 300), KINDS[dtype]
+    values, gradients = run(visible_temperature, leaves, omega, time, None, weights, dtype)
+    expected, truth = run(twin, leaves, omega, time, None, weights, DOUBLE)
+    assert fused._fits_kernel(leaves["rate"], omega) and values.dtype == dtype
+    torch.testing.assert_close(values.double(), expected, rtol=error, atol=error * (1 + expected.abs().max().item()))
     for name, gradient in gradients.items():
         scale = truth[name].abs().max().item()
-        torch.testing.assert_close(gradient.double(), truth[name], rtol=2e-6, atol=1e-6 * scale, msg=name)
+        torch.testing.assert_close(gradient.double(), truth[name], rtol=2 * error, atol=error * scale, msg=name)
 
 
 @pytest.mark.parametrize("fall", [80.0, 87.4, 90.2, 103.0, 1e3, 1e13])
@@ -57,7 +64,7 @@ def test_a_body_that_has_long_forgotten_its_start(fall):
     leaves["rate"] = torch.full((40,), fall).requires_grad_()
     weights = torch.ones(40)
     values, gradients = run(visible_temperature, leaves, omega, 1.0, None, weights, torch.float32)
-    expected, truth = run(visible_temperature, leaves, omega, 1.0, None, weights, DOUBLE)
+    expected, truth = run(twin, leaves, omega, 1.0, None, weights, DOUBLE)
     torch.testing.assert_close(values.double(), expected, rtol=1e-6, atol=1e-6)
     for name, gradient in gradients.items():
         scale = truth[name].abs().max().item()
@@ -70,7 +77,7 @@ def test_only_rows_in_view_are_read_and_written(count):
     ids = torch.randperm(count, generator=torch.Generator().manual_seed(1))[: (count + 1) // 2]
     unseen = torch.ones(count, dtype=torch.bool).index_fill(0, ids, False)
     weights = torch.ones(len(ids))
-    expected, truth = run(visible_temperature, leaves, omega, 0.8, ids, weights, DOUBLE)
+    expected, truth = run(twin, leaves, omega, 0.8, ids, weights, DOUBLE)
     with torch.no_grad():
         for name in ("initial", "rate", "gains"):
             leaves[name][unseen] = torch.nan
@@ -107,34 +114,36 @@ def test_one_and_two_threads_and_reruns_give_the_same_bits():
         assert all(torch.equal(gradients[name], results[0][1][name]) for name in gradients)
 
 
-def test_responses_over_the_whole_range_against_many_digits():
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 6e-7), (DOUBLE, 1e-15)], ids=str)
+def test_responses_over_the_whole_range_against_many_digits(dtype, error):
     """The ranges of the plain form: gains of one sixteen-lane row pick single responses, gradients pick slopes."""
     worst = 0.0
     rates, omegas, times = (x[:400] for x in draw(400, seed=3))
     for rate, omega, time in zip(rates.tolist(), omegas.tolist(), times.tolist(), strict=True):
         reference = exact(rate, omega, time)
-        gains = torch.zeros(2, 2, 1)
+        gains = torch.zeros(2, 2, 1, dtype=dtype)
         gains[0, 0], gains[1, 1] = 1, 1
-        a = torch.full((2,), rate).requires_grad_()
-        still = torch.zeros(2)
+        a = torch.full((2,), rate, dtype=dtype).requires_grad_()
+        still, none = torch.zeros(2, dtype=dtype), torch.zeros((), dtype=dtype)
         values = visible_temperature(
-            torch.tensor(time, dtype=DOUBLE), torch.tensor(0.0), still, a, torch.tensor([omega], dtype=DOUBLE), gains
+            torch.tensor(time, dtype=DOUBLE), none, still, a, torch.tensor([omega], dtype=DOUBLE), gains
         )
         values.sum().backward()
         worst = max(worst, joint_error(values.tolist(), reference[:2]), joint_error(a.grad.tolist(), reference[2:]))
-    assert worst <= 6e-7
+    assert worst <= error
 
 
+@pytest.mark.parametrize("dtype", KINDS, ids=str)
 @pytest.mark.parametrize("rate", [0.0, 1e-45, 1e-30, 1e18, 1e30, math.inf])
 @pytest.mark.parametrize("time", [-3.0, 0.0, 1e-3, 50.0])
-def test_extreme_rates_are_finite(rate, time):
+def test_extreme_rates_are_finite(rate, time, dtype):
     leaves, omega = case(20, 24)
     leaves["rate"].data.fill_(rate)
-    values, gradients = run(visible_temperature, leaves, omega, time, None, torch.ones(20), torch.float32)
+    values, gradients = run(visible_temperature, leaves, omega, time, None, torch.ones(20), dtype)
     assert values.isfinite().all()
     assert all(gradient.isfinite().all() for gradient in gradients.values())
     if time == 0:
-        assert torch.equal(values, leaves["initial"])
+        assert torch.equal(values, leaves["initial"].to(dtype))
 
 
 def test_a_frequency_of_zero_takes_the_plain_path():

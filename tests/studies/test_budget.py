@@ -430,10 +430,11 @@ def test_the_grid_trains_every_combination_and_leaves_the_curves_of_other_scenes
     longer = replace(POINTS[4], steps=9000)
     write_points([replace(POINTS[0], scene="cooling"), POINTS[3], longer], tmp_path / "curves.csv")
     settings = {"train": "train.py", "steps": [250, 500], "caps": [8000, None], "decays": [1.0, 0.25], "seeds": [0]}
-    settings |= {"budgets": [], "overrides": ["data.size=demo"], "curves": str(tmp_path / "curves.csv")}
+    settings |= {"budgets": [], "density": {}, "overrides": ["data.size=demo"], "curves": str(tmp_path / "curves.csv")}
     budget_grid.run(tmp_path / "study", scenes=["etgs/heated"], **settings)
     assert len(asked) == 8 and len({tuple(overrides) for overrides in asked}) == 8
     assert sum("optim.decay=0.25" in one and "density.cap_max=8000" in one for one in asked) == 2
+    assert all("density.reset_every=null" in one for one in asked)
     assert not any("threads" in override for one in asked for override in one)
     points = read_points(tmp_path / "curves.csv")
     assert [point.scene for point in points] == ["cooling"] + 9 * ["heated"]
@@ -459,7 +460,15 @@ def test_planned_runs_read_the_curves_just_written_on_the_threads_asked_for(tmp_
     monkeypatch.setattr(budget_grid, "trained", trained)
     monkeypatch.chdir(tmp_path)
     write_points([POINTS[5]], tmp_path / "curves.csv")
-    settings = {"train": "train.py", "steps": [250], "caps": [None], "decays": [1.0], "seeds": [0], "budgets": [30.0]}
+    settings = {
+        "train": "train.py",
+        "steps": [250],
+        "caps": [None],
+        "decays": [1.0],
+        "seeds": [0],
+        "budgets": [30.0],
+        "density": {},
+    }
     curves = "curves.csv" if named else None
     budget_grid.run("study", scenes=["etgs/heated"], overrides=["data.size=demo"], curves=curves, threads=1, **settings)
     (grid, none), (planned, points) = asked.values()
@@ -483,10 +492,42 @@ def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
     assert {point.decay for point in points} <= set(study.decays)
 
 
+def test_options_of_growth_are_where_the_study_sets_them(tmp_path):
+    study = running.compose_run(tmp_path, "study=budget", config_name="study").study
+    for method in sorted(path.stem for path in (Path(cli.CONF) / "method").glob("*.yaml")):
+        density = running.compose_run(tmp_path, f"method={method}").density
+        place = "density.recipe" if "recipe" in density else "density"
+        assert study.density.get(method, "density") == place, method
+
+
+def test_caps_go_to_the_recipe_that_a_density_control_extends(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides, study):
+        asked.append(overrides)
+        place.mkdir(parents=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        return a_run(0, None, 0, 20.0, 5.0).results
+
+    monkeypatch.setattr(budget_grid, "trained", trained)
+    settings = {"train": "train.py", "steps": [250], "caps": [8000], "decays": [1.0], "seeds": [0], "budgets": []}
+    settings |= {"density": {"ti3dgs": "density.recipe"}, "overrides": [], "curves": None}
+    budget_grid.run(tmp_path / "study", scenes=["ti3dgs/haze"], **settings)
+    assert asked[0][-2:] == ["density.recipe.reset_every=null", "density.recipe.cap_max=8000"]
+
+
 def test_curves_that_are_none_are_told_before_anything_is_trained(tmp_path, monkeypatch):
     monkeypatch.setattr(budget_grid, "trained", lambda *_: pytest.fail("trained"))
     (tmp_path / "notes.txt").write_text("not curves")
-    settings = {"steps": [250], "caps": [None], "decays": [1.0], "seeds": [0], "budgets": [], "overrides": []}
+    settings = {
+        "steps": [250],
+        "caps": [None],
+        "decays": [1.0],
+        "seeds": [0],
+        "budgets": [],
+        "density": {},
+        "overrides": [],
+    }
     with pytest.raises(SceneError, match="notes.txt holds no curves"):
         budget_grid.run(tmp_path, "train.py", ["etgs/heated"], curves=str(tmp_path / "notes.txt"), **settings)
 

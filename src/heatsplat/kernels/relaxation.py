@@ -19,13 +19,13 @@ from numba import njit, prange
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.simd import (
     LANES,
-    exp2,
+    exp,
+    filled,
     load,
     load_columns,
     maximum,
     minimum,
     select,
-    splat,
     store,
     store_columns,
 )
@@ -47,8 +47,8 @@ SCRATCH_ROWS = 13
 
 _f = np.float32
 _LARGEST_RATE = _f(1e18)  # its square still fits
-_LOG2_E = _f(math.log2(math.e))
-_SERIES = tuple(_f((-1) ** j / math.factorial(j + 3)) for j in range(10))  # of θ2; the next term is below 2e-10
+_SERIES = tuple((-1) ** j / math.factorial(j + 3) for j in range(17))  # of θ2; the next term is below 5e-19
+_LAST = len(_SERIES) - 1
 _SPLIT = 134217729.0  # 2^27 + 1 (Dekker 1971)
 
 
@@ -76,7 +76,7 @@ def _series(square, first):
 
 @njit(cache=True)  # without contraction, which would spoil the exact product
 def fill_table(omega, time, table):
-    """Fills ``table`` [TABLE_ROWS, padded K] float32 with functions of ω [K] at a time, computed in float64.
+    """Fills ``table`` [TABLE_ROWS, padded K] with functions of ω [K] at a time, computed in float64.
 
     Twin: heatsplat.physics.relaxation.phases.
     """
@@ -117,16 +117,16 @@ def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch
         scratch[INITIAL, j] = initial[row]
     for j in range(0, stop - start, LANES):
         y = load(scratch, RATE * BLOCK + j) * time
-        near, far = minimum(y, _f(1.0)), maximum(y, _f(1.0))
-        theta2 = splat(_SERIES[9])
-        for term in range(9):
-            theta2 = theta2 * near + _SERIES[8 - term]
-        theta = _f(0.5) - near * theta2
-        phi_near = _f(1.0) - near * theta
-        fall_far = exp2(maximum(far * -_LOG2_E, _f(-126.0)))  # 1e-38: exp2 knows no smaller number
-        phi_far = (_f(1.0) - fall_far) / far
-        small = y < _f(1.0)
-        fall = select(small, _f(1.0) - near * phi_near, fall_far)
+        near, far = minimum(y, 1.0), maximum(y, 1.0)
+        theta2 = filled(scratch, _SERIES[_LAST])
+        for term in range(_LAST):
+            theta2 = theta2 * near + _SERIES[_LAST - 1 - term]
+        theta = 0.5 - near * theta2
+        phi_near = 1.0 - near * theta
+        fall_far = exp(-far)
+        phi_far = (1.0 - fall_far) / far
+        small = y < 1.0
+        fall = select(small, 1.0 - near * phi_near, fall_far)
         phi = select(small, phi_near, phi_far)
         first = load(scratch, INITIAL * BLOCK + j)
         above = first - ambient
@@ -139,7 +139,7 @@ def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch
         store(scratch, CHI * BLOCK + j, select(small, phi_near - theta, (phi_far - fall_far) / far))
         store(scratch, THETA * BLOCK + j, theta)
         store(scratch, THETA2 * BLOCK + j, theta2)
-        store(scratch, CHI2 * BLOCK + j, _f(0.5) - (_f(1.0) + near) * theta2)
+        store(scratch, CHI2 * BLOCK + j, 0.5 - (1.0 + near) * theta2)
 
 
 @inline
@@ -158,7 +158,7 @@ def _heated(places, ids, start, stop, heated):
 @inline
 def _responses(table, k, width, a, phi, offset, difference_row):
     """Responses to sin and to cos over time, for sixteen frequencies from ``k``; and 1/(a² + ω²)."""
-    inverse = _f(1.0) / (load(table, OMEGA_SQUARED * width + k) + a * a)
+    inverse = 1.0 / (load(table, OMEGA_SQUARED * width + k) + a * a)
     damped = load(table, OMEGA_COSC * width + k)
     sine = load(table, OMEGA * width + k) * (a * (load(table, difference_row * width + k) - offset) + damped)
     cosine = a * (a * phi - damped) + load(table, OMEGA_SQUARED_SINC * width + k)
@@ -172,22 +172,22 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
     Gaussians without a row of gains only relax: their frequencies are passed over.
 
     Args:
-        rate, initial: [N] float32.
-        ambient: float32.
-        gains: [M, 2, K] float32.
+        rate, initial: [N] float32 or float64, as is every real number here.
+        ambient: a number.
+        gains: [M, 2, K].
         places: [N] int64 row of ``gains`` of every Gaussian, -1 for none; or empty, M = N: each has its own.
-        scale: [N] float32 factors on the sources, or empty for 1.
+        scale: [N] factors on the sources, or empty for 1.
         ids: [n] int64.
-        time: float32.
-        limit: float32, the largest rate used (see relaxation.bounded_rate).
+        time: a number.
+        limit: the largest rate used (see relaxation.bounded_rate).
         table: of ``fill_table``.
-        values: [n] float32, output.
+        values: [n] output.
     """
     count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
     for block in prange((count + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         stop = min(start + BLOCK, count)
-        scratch = np.empty((SCRATCH_ROWS, BLOCK), np.float32)
+        scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
         _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
         heated = np.empty(BLOCK, np.int64)
         for j in range(stop - start):
@@ -196,9 +196,9 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
             j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-            difference_row = NEAR if y < _f(1.0) else FAR
+            difference_row = NEAR if y < 1 else FAR
             place = places[row] if places.shape[0] > 0 else row
-            source = splat(_f(0.0))
+            source = filled(scratch, 0.0)
             first = place * (2 * frequencies)
             for k in range(0, frequencies, LANES):
                 sine, cosine, _ = _responses(table, k, width, a, phi, offset, difference_row)
@@ -227,7 +227,7 @@ def clear_others(ids, written, v_gains):
     for block in prange((count + BLOCK - 1) // BLOCK):
         for row in range(block * BLOCK, min((block + 1) * BLOCK, count)):
             if not written[row]:
-                v_gains[row] = _f(0.0)
+                v_gains[row] = 0
 
 
 @kernel
@@ -261,21 +261,21 @@ def backward(
     for block in prange((count + BLOCK - 1) // BLOCK):
         start = block * BLOCK
         stop = min(start + BLOCK, count)
-        scratch = np.empty((SCRATCH_ROWS, BLOCK), np.float32)
+        scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
         _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
-        scratch[SOURCE] = _f(0.0)
-        scratch[SLOPE] = _f(0.0)
+        scratch[SOURCE] = 0
+        scratch[SLOPE] = 0
         heated = np.empty(BLOCK, np.int64)
         for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
             j = heated[i]
             row = ids[start + j]
             a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-            fall, small = scratch[FALL, j], scratch[Y, j] < _f(1.0)
+            fall, small = scratch[FALL, j], scratch[Y, j] < 1
             difference_row = NEAR if small else FAR
             v_gain = v_values[start + j] * time
             if scale.shape[0] > 0:
                 v_gain = v_gain * scale[row]
-            source, slope = splat(_f(0.0)), splat(_f(0.0))
+            source, slope = filled(scratch, 0.0), filled(scratch, 0.0)
             place = places[row] if places.shape[0] > 0 else row
             first = place * (2 * frequencies)
             for k in range(0, frequencies, LANES):
@@ -290,9 +290,9 @@ def backward(
                     sinc2 = load(table, SINC2 * width + k)
                     theta, theta2 = scratch[THETA, j], scratch[THETA2, j]
                     inner = (q - o) * (q * theta2 + o * sinc2) - q * scratch[CHI2, j]
-                    inner = inner + o * o * (load(table, COSC3 * width + k) * (_f(2.0) * y))
+                    inner = inner + o * o * (load(table, COSC3 * width + k) * (2.0 * y))
                     sine_slope = load(table, X * width + k) * inner
-                    cosine_slope = (q - o) * load(table, COSC1 * width + k) + _f(2.0) * (o * sinc2 * y - q * theta)
+                    cosine_slope = (q - o) * load(table, COSC1 * width + k) + 2.0 * (o * sinc2 * y - q * theta)
                     cosine_slope = cosine_slope * o - q * scratch[CHI, j]
                     slope = slope + (sin_gain * sine_slope + cos_gain * cosine_slope) * time
                 else:
@@ -302,7 +302,7 @@ def backward(
                     )
             scratch[SOURCE, j] = sum_of_lanes(source)
             scratch[SLOPE, j] = v_gain * sum_of_lanes(slope)
-        ambient_sum = _f(0.0)
+        ambient_sum = _f(0.0)  # becomes a double among doubles
         for j in range(stop - start):
             row, v, fall = ids[start + j], v_values[start + j], scratch[FALL, j]
             above = scratch[INITIAL, j] - ambient
@@ -313,5 +313,5 @@ def backward(
             if rate[row] <= limit:
                 v_rate[row] = scratch[SLOPE, j] - v * above * time * fall
             else:
-                v_rate[row] = _f(0.0)
+                v_rate[row] = 0
         v_ambient[block] = ambient_sum

@@ -3,7 +3,7 @@
 Numba does not vectorise these kernels by itself (rounding, exp and early exits stop it), so vectors are spelled out.
 A value of type ``float32x16`` adds, multiplies and compares like a number; numbers mix in as if copied to all lanes; a
 comparison gives a ``mask16``, which ``select``, ``bits`` and ``first_lanes`` deal in. LLVM lowers sixteen lanes to one
-AVX-512 register, two of AVX or four of SSE and NEON, so nothing here names a machine.
+AVX-512 register, two of AVX or four of SSE and NEON (twice as many of ``float64x16``), so nothing here names a machine.
 
 **Convention:** lane k of a load is element ``offset + k`` of the flat array; lane k of a mask is bit k of its ``bits``.
 
@@ -22,6 +22,7 @@ from numba.extending import (
     intrinsic,
     lower_builtin,
     models,
+    overload,
     register_model,
     type_callable,
 )
@@ -30,7 +31,8 @@ from heatsplat.kernels.compilation import inline
 
 LANES = 16
 
-_f32, _i1, _i16, _i32, _i64 = ir.FloatType(), ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntType(64)
+_f32, _f64 = ir.FloatType(), ir.DoubleType()
+_i1, _i16, _i32, _i64 = ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntType(64)
 _ALIGN_4 = ir.Constant(_i32, 4)
 
 
@@ -49,11 +51,14 @@ class _LaneModel(models.PrimitiveModel):
 
 
 float32x16 = LaneType("float32x16", _f32)
+float64x16 = LaneType("float64x16", _f64)
 int32x16 = LaneType("int32x16", _i32)
 mask16 = LaneType("mask16", _i1)
 
-_NUMBERS = {float32x16: types.float32, int32x16: types.int32}
-_DTYPES = {types.float32: float32x16, types.int32: int32x16}
+_NUMBERS = {float32x16: types.float32, float64x16: types.float64, int32x16: types.int32}
+_DTYPES = {number: lane_type for lane_type, number in _NUMBERS.items()}
+_FLOATS = float32x16, float64x16
+_SUFFIXES = {float32x16: "f32", float64x16: "f64", int32x16: "i32"}  # of LLVM's intrinsics
 
 
 # ---- building blocks of the code generation ----
@@ -144,17 +149,19 @@ def _define_operator(function, emit: dict[LaneType, object], result: LaneType | 
 
 
 def _compare(predicate: str):
-    return {
-        float32x16: lambda builder, a, b: builder.fcmp_ordered(predicate, a, b),
+    return dict.fromkeys(_FLOATS, lambda builder, a, b: builder.fcmp_ordered(predicate, a, b)) | {
         int32x16: lambda builder, a, b: builder.icmp_signed(predicate, a, b),
     }
 
 
-_define_operator(operator.add, {float32x16: lambda b, x, y: b.fadd(x, y), int32x16: lambda b, x, y: b.add(x, y)})
-_define_operator(operator.sub, {float32x16: lambda b, x, y: b.fsub(x, y), int32x16: lambda b, x, y: b.sub(x, y)})
-_define_operator(operator.mul, {float32x16: lambda b, x, y: b.fmul(x, y), int32x16: lambda b, x, y: b.mul(x, y)})
-_define_operator(operator.truediv, {float32x16: lambda b, x, y: b.fdiv(x, y)})
-_define_operator(operator.neg, {float32x16: lambda b, x: b.fneg(x)}, arity=1)
+for _function, _of_floats, _of_integers in (
+    (operator.add, lambda b, x, y: b.fadd(x, y), lambda b, x, y: b.add(x, y)),
+    (operator.sub, lambda b, x, y: b.fsub(x, y), lambda b, x, y: b.sub(x, y)),
+    (operator.mul, lambda b, x, y: b.fmul(x, y), lambda b, x, y: b.mul(x, y)),
+):
+    _define_operator(_function, dict.fromkeys(_FLOATS, _of_floats) | {int32x16: _of_integers})
+_define_operator(operator.truediv, dict.fromkeys(_FLOATS, lambda b, x, y: b.fdiv(x, y)))
+_define_operator(operator.neg, dict.fromkeys(_FLOATS, lambda b, x: b.fneg(x)), arity=1)
 _define_operator(operator.lshift, {int32x16: lambda b, x, y: b.shl(x, y)})
 _define_operator(operator.rshift, {int32x16: lambda b, x, y: b.ashr(x, y)})
 _define_operator(operator.and_, {kind: lambda b, x, y: b.and_(x, y) for kind in (mask16, int32x16)})
@@ -178,6 +185,19 @@ def splat(typing_context, value):
         return _as_lanes(context, builder, values[0], signature.args[0], lane_type)
 
     return lane_type(value), generate
+
+
+@intrinsic
+def filled(typing_context, array, value):
+    """A number in all lanes, of the type of an array's elements."""
+    lane_type = _flat(array)
+    if lane_type is None:
+        raise TypingError(f"filled needs a contiguous array whose elements are lanes, got {array}")
+
+    def generate(context, builder, signature, values):
+        return _as_lanes(context, builder, values[1], signature.args[1], lane_type)
+
+    return lane_type(array, value), generate
 
 
 @intrinsic
@@ -262,7 +282,7 @@ def first_lanes(typing_context, count):
 @intrinsic
 def total(typing_context, x):
     """The sum over lanes, in a fixed order (halves folded onto each other)."""
-    if x != float32x16:
+    if x not in _FLOATS:
         return None
 
     def generate(context, builder, signature, values):
@@ -274,13 +294,13 @@ def total(typing_context, x):
             vector = builder.fadd(low, high)
         return builder.extract_element(vector, ir.Constant(_i32, 0))
 
-    return types.float32(x), generate
+    return _NUMBERS[x](x), generate
 
 
 @intrinsic
 def lane(typing_context, x, index):
     """One lane as a number."""
-    number = {float32x16: types.float32, int32x16: types.int32}.get(x)
+    number = _NUMBERS.get(x)
     if number is None:
         return None
     return number(x, index), lambda context, builder, signature, values: builder.extract_element(*values)
@@ -358,7 +378,7 @@ def load(typing_context, array, offset):
     """Sixteen elements of a contiguous array, from ``offset`` of its flat order."""
     lane_type = _flat(array)
     if lane_type is None:
-        raise TypingError(f"load needs a contiguous float32 or int32 array, got {array}")
+        raise TypingError(f"load needs a contiguous array of float32, float64 or int32, got {array}")
 
     def generate(context, builder, signature, values):
         pointer = _pointer(context, builder, array, values[0], values[1], signature.args[1], LANES)
@@ -450,8 +470,7 @@ def load_columns(typing_context, array, row, columns, rows):
         pointer = _pointer(context, builder, array, values[0], offset, types.int64, count)
         mask = _rows_mask(builder, context, values[3], signature.args[3], width)
         wide = _vector(count, lane_type.element)
-        kind = "f32" if lane_type == float32x16 else "i32"
-        name = f"llvm.masked.load.v{count}{kind}.p0"
+        name = f"llvm.masked.load.v{count}{_SUFFIXES[lane_type]}.p0"
         loaded = _llvm(builder, name, wide, pointer, _ALIGN_4, mask, ir.Constant(wide, None))
         picked = [
             builder.shuffle_vector(loaded, loaded, _constant(range(column, count, width), _i32))
@@ -478,8 +497,7 @@ def store_columns(typing_context, array, row, columns, rows):
         mask = _rows_mask(builder, context, values[3], signature.args[3], width)
         vectors = cgutils.unpack_tuple(builder, values[2], width)
         wide = _interleaved(builder, vectors)
-        kind = "f32" if lane_type == float32x16 else "i32"
-        name = f"llvm.masked.store.v{count}{kind}.p0"
+        name = f"llvm.masked.store.v{count}{_SUFFIXES[lane_type]}.p0"
         _llvm(builder, name, ir.VoidType(), wide, pointer, _ALIGN_4, mask)
         return context.get_dummy_value()
 
@@ -629,6 +647,7 @@ def lowest_bit(typing_context, number):
 
 # ---- functions of lanes ----
 
+_LOG2_E = np.float32(1.4426950408889634)
 _ROUND = np.float32(1.5 * 2**23)  # adding it leaves the nearest integer in the low bits
 _SQRT_HALF_BITS = np.int32(0x3F3504F3)
 
@@ -645,6 +664,24 @@ def exp2(x):
     high = x * np.float32(1.32647e-3) + np.float32(9.67151e-3)
     power = (high * square + middle) * square + low
     return floats_of_bits(bits_of_floats(power) + (bits_of_floats(shifted) << 23))
+
+
+@intrinsic
+def _exp_of_doubles(typing_context, x):
+    vector = _vector(LANES, _f64)
+    return x(x), lambda context, builder, signature, values: _llvm(builder, "llvm.exp.v16f64", vector, values[0])
+
+
+def exp(x):
+    """e to the power of x: float32 to 3e-7 for -87 <= x < 88 and 1e-38 below; float64 as the C library has it."""
+    raise NotImplementedError("exp of lanes exists in kernels only")
+
+
+@overload(exp)
+def _exp(x):
+    if x == float32x16:
+        return lambda x: exp2(maximum(x * _LOG2_E, np.float32(-126.0)))
+    return (lambda x: _exp_of_doubles(x)) if x == float64x16 else None
 
 
 @inline

@@ -1,6 +1,6 @@
 """Temperatures of the Gaussians in view: the closed form of relaxation.py for rows of per-Gaussian tensors.
 
-On a CPU in float32 it runs in a fused kernel (heatsplat.kernels.relaxation), elsewhere in plain torch.
+On a CPU it runs in a fused kernel (heatsplat.kernels.relaxation), elsewhere in plain torch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from heatsplat.kernels.simd import LANES
 from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, harmonic_response, relax
 
 SMALLEST_OMEGA = 1e-15  # below it the kernel's a² + ω² could vanish in float32
-CACHE_LINE = 16  # float32 numbers; rows of gains are read by whole lines
+CACHE_LINE = 64  # bytes; rows of gains are read by whole lines
+NUMPY_TYPES = {torch.float32: np.float32, torch.float64: np.float64}
 COMPILING = "compiling the kernels of heat: some seconds, once"
 
 
@@ -72,8 +73,8 @@ def visible_temperature(
 
 
 def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
-    """Whether the kernel can be used: float32 on a CPU, and no ω of (almost) zero."""
-    if rate.device.type != "cpu" or rate.dtype != torch.float32:
+    """Whether the kernel can be used: on a CPU, and no ω of (almost) zero."""
+    if rate.device.type != "cpu" or rate.dtype not in NUMPY_TYPES:
         return False
     return omega.numel() == 0 or omega.abs().min().item() >= SMALLEST_OMEGA
 
@@ -108,8 +109,8 @@ class _SpareMemory:
     the kernel that fills them.
     """
 
-    def __init__(self) -> None:
-        self._array = np.empty(0, np.float32)
+    def __init__(self, dtype: type) -> None:
+        self._array = np.empty(0, dtype)
         self._references_unused = self._references()
 
     def _references(self) -> int:
@@ -117,15 +118,16 @@ class _SpareMemory:
         return sys.getrefcount(self._array)
 
     def take(self, shape: torch.Size) -> Tensor:
-        """A float32 tensor of that shape with undefined values."""
+        """A tensor of that shape with undefined values."""
         if self._array.shape != tuple(shape) or self._references() > self._references_unused:
-            memory = np.empty(shape.numel() + CACHE_LINE, np.float32)
-            start = -(memory.ctypes.data // memory.itemsize) % CACHE_LINE
+            line = CACHE_LINE // self._array.itemsize
+            memory = np.empty(shape.numel() + line, self._array.dtype)
+            start = -(memory.ctypes.data // memory.itemsize) % line
             self._array = memory[start : start + shape.numel()].reshape(tuple(shape))
         return torch.from_numpy(self._array)
 
 
-_gain_gradients = _SpareMemory()
+_gain_gradients = {dtype: _SpareMemory(plain) for dtype, plain in NUMPY_TYPES.items()}
 
 
 class _VisibleTemperature(torch.autograd.Function):
@@ -142,8 +144,9 @@ class _VisibleTemperature(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         seconds, frequencies = time.item(), gains.shape[2]
         limit = BACKWARD_TIME_CONSTANTS / -seconds if seconds < 0 else math.inf
-        ctx.table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), np.float32)
-        ctx.numbers = np.float32(ambient.item()), np.float32(seconds), np.float32(limit)
+        kind = NUMPY_TYPES[rate.dtype]
+        ctx.table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), kind)
+        ctx.numbers = kind(ambient.item()), kind(seconds), kind(limit)
         values = rate.new_empty(ids.shape[0])
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
             kernels.fill_table(omega.numpy()[:frequencies], seconds, ctx.table)
@@ -155,9 +158,9 @@ class _VisibleTemperature(torch.autograd.Function):
     def backward(ctx, v_values: Tensor):
         tensors = ctx.saved_tensors
         rate, initial, gains, places, scale, ids = tensors
-        v_rate, v_initial, v_scale = (torch.zeros(x.shape) for x in (rate, initial, scale))
-        v_gains = _gain_gradients.take(gains.shape)
-        v_ambient = torch.empty(-(-ids.shape[0] // kernels.BLOCK))
+        v_rate, v_initial, v_scale = (torch.zeros_like(x) for x in (rate, initial, scale))
+        v_gains = _gain_gradients[rate.dtype].take(gains.shape)
+        v_ambient = rate.new_empty(-(-ids.shape[0] // kernels.BLOCK))
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
         with announced(COMPILING), kernels.threads_for(ids.shape[0]):
             rows = ids

@@ -154,9 +154,9 @@ def newton_problem(
             torch.tensor(t, dtype=torch.float64), ambient, first, a, omega, sin_gain, cos_gain
         )  # fmt: skip
 
-    def fused() -> Moment:
-        a, g, first = (x.float().contiguous() for x in (rate, gains, initial))
-        source, ambient = g if frequencies else None, torch.tensor(AMBIENT_K)
+    def fused(dtype: torch.dtype) -> Moment:
+        a, g, first = (x.to(dtype).contiguous() for x in (rate, gains, initial))
+        source, ambient = g if frequencies else None, torch.tensor(AMBIENT_K, dtype=dtype)
         return lambda t: visible_temperature(torch.tensor(t, dtype=torch.float64), ambient, first, a, omega, source)
 
     def table(dtype: torch.dtype, size: int) -> Moment:
@@ -173,9 +173,10 @@ def newton_problem(
         return at
 
     def forms(types: tuple[str, ...], sizes: tuple[int, ...]) -> list[Form]:
-        found = [Form("closed form, fused kernel", "", "float32", fused, True)] if "float32" in types else []
+        found = []
         for kind in types:
             dtype = getattr(torch, kind)
+            found += [Form("closed form, fused kernel", "", kind, partial(fused, dtype), True)]
             found += [Form("closed form, torch", "", kind, partial(plain, dtype), True)]
             found += [Form("printed formula", "", kind, partial(printed, dtype), False)]
             found += [Form("rate table", f"{n} rates", kind, partial(table, dtype, n), False) for n in sizes]

@@ -288,13 +288,16 @@ def _verdict(rows: Sequence[Any], name: str, title: str) -> list[str]:
 
 
 def _chosen(done: Sequence[Any]) -> list[Any]:
-    """One point for each of our solvers that the product would take here: its first type, with the product's size of tables."""
+    """One point for each of our solvers that the product would take here: its first type, with the product's size of tables.
+
+    The fused kernel, which it takes on a CPU, comes in both types: float64 is a choice of the user (dtype=float64).
+    """
     groups = _groups([r for r in done if r.ours])
     first = {points[0].solver: points for points in reversed(groups.values())}
-    if "closed form, fused kernel" in first:  # which is float32 on a CPU; in float64 the product takes the other
+    if "closed form, fused kernel" in first:
         first.pop("closed form, torch", None)
-        if ("closed form, torch", "float64") in groups:
-            first["closed form, torch"] = groups["closed form, torch", "float64"]
+        if double := groups.get(("closed form, fused kernel", "float64")):
+            first["closed form, fused kernel, float64"] = double
     chosen = (next((r for r in points if r.setting == f"{RATES} rates"), points[-1]) for points in first.values())
     return sorted(chosen, key=lambda r: r.us)
 
