@@ -32,7 +32,8 @@ UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 MIN_STEPS = 100  # below, the schedule loses its shape: growth, which comes every 50 steps or more, has no time
 CALIBRATION_SHARE = 0.05  # of the budget at most
 CALIBRATION_SECONDS = 4.0  # and at most this long
-CALIBRATION_ROUNDS = (3, 20)  # fewest and most timed steps of each size; fewer than three have no middle
+CALIBRATION_ROUNDS = (3, 200)  # fewest and most timed steps of each size; fewer than three have no middle
+CALIBRATION_VIEWS = 20  # that take turns in them
 WARM_UP = 2  # steps before them: kernels compile and memory is found
 HEADROOM = 20  # a run has room for so many times its planned steps: where the pace was misjudged, it may need them
 DENSER = 4  # the second size of the calibration, in Gaussians of the start
@@ -296,7 +297,7 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
         for factor in (1, DENSER)
     ]
     times: list[list[float]] = [[] for _ in steppers]
-    views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_ROUNDS[1]))]
+    views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_VIEWS))]
     for turn in range(WARM_UP):
         for stepper in steppers:
             stepper.step(views[turn % len(views)])
