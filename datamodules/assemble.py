@@ -16,9 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-
-from datamodules.formats.images import (
+from heatsplat.datamodules.formats.images import (
     PSEUDO_COLOUR_LEVELS,
     colour_levels,
     resized,
@@ -28,8 +26,10 @@ from datamodules.formats.images import (
     undistorted,
     undistorted_mask,
 )
-from datamodules.formats.lens import Lens
-from datamodules.splits import SplitRule
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.splits import SplitRule
+from torch import Tensor
+
 from heatsplat.contracts import (
     Camera,
     Environment,

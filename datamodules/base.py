@@ -1,6 +1,6 @@
 """The Lightning side of a scene: the options that all loaders share, and the data loaders.
 
-``RawFrame``, ``Lens``, ``Counts`` and ``build_scene`` (``datamodules.assemble``) are what a loader works with.
+``RawFrame``, ``Lens``, ``Counts`` and ``build_scene`` (``heatsplat.datamodules.assemble``) are what a loader works with.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
+from heatsplat.datamodules.assemble import CELSIUS, Counts, RawFrame, build_scene
+from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.lowres import degraded
+from heatsplat.datamodules.splits import SplitRule
+from heatsplat.datamodules.weather import with_weather
 from torch.utils.data import DataLoader
 
-from datamodules.assemble import CELSIUS, Counts, RawFrame, build_scene
-from datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
-from datamodules.formats.lens import Lens
-from datamodules.lowres import degraded
-from datamodules.splits import SplitRule
-from datamodules.weather import with_weather
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
 
@@ -37,7 +37,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         root: folder of the data set, relative to the caller's working directory.
         scene: name of the scene below ``root``; None when ``root`` is the scene itself.
         downscale: factor by which images shrink, 1 or larger.
-        split: every_8th, quarter_centre, block, names, folders, json or list (``datamodules.splits``).
+        split: every_8th, quarter_centre, block, names, folders, json or list (``heatsplat.datamodules.splits``).
         split_fraction: share of the frames that ``block`` holds out.
         split_position: where its stretch lies in time, 0 (start) to 1 (end).
         split_file: file of test names for ``list``.
@@ -46,7 +46,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule); used where it exists.
         mask_keep: "white" when white pixels count (COLMAP), "black" when they are left out.
         alpha_mask: True to leave out transparent pixels.
-        degrade, upsample: how training images lose resolution, and are enlarged again (``datamodules.lowres``).
+        degrade, upsample: how training images lose resolution, and are enlarged again (``heatsplat.datamodules.lowres``).
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         return scene
 
     def change_weather(self, path: Path, zone: str | None = None) -> None:
-        """Puts the scene under the weather of another table, for its place; ``datamodules.weather.with_weather``."""
+        """Puts the scene under the weather of another table, for its place; ``heatsplat.datamodules.weather.with_weather``."""
         self.scene = with_weather(self.scene, path, zone)
 
     def setup(self, stage: str | None = None) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
+from heatsplat.datamodules.bounds import read_bounds
+from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
+from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
-from datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
-from datamodules.bounds import read_bounds
-from datamodules.formats.colmap import SparseModel, find_model, read_model
-from datamodules.formats.images import ImageIndex, read_image
-from datamodules.formats.radiometric import has_temperatures, read_celsius
-from datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 BOUNDS_FILE = "temperature_bounds.json"

@@ -8,13 +8,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.points import obj_vertices, random_points
+from heatsplat.datamodules.surroundings import OutdoorDataModule
+from heatsplat.datamodules.weather import utc_seconds
 
-from datamodules.base import RawFrame, SceneDataModule
-from datamodules.formats.images import ImageIndex, read_image
-from datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
-from datamodules.points import obj_vertices, random_points
-from datamodules.surroundings import OutdoorDataModule
-from datamodules.weather import utc_seconds
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}

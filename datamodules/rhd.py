@@ -8,12 +8,13 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from datamodules.base import RawFrame, SceneDataModule
-from datamodules.bounds import number_in, range_in, read_json
-from datamodules.colmap import image_index, match_model
-from datamodules.formats.colmap import find_model, read_model
-from datamodules.formats.images import ImageIndex, read_image
-from datamodules.timestamps import seconds_of_day, unrolled_midnight
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.bounds import number_in, range_in, read_json
+from heatsplat.datamodules.colmap import image_index, match_model
+from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.timestamps import seconds_of_day, unrolled_midnight
+
 from heatsplat.contracts import SceneData, ThermalRange
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
+from heatsplat.datamodules.base import SceneDataModule
 from torch import Tensor
 
-from datamodules.base import SceneDataModule
 from heatsplat.contracts import WEATHER_COLUMNS, Camera, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
 
 DAY_S = 86400.0

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.weather import make_weather, read_weather, site_of
 
-from datamodules.base import RawFrame, SceneDataModule
-from datamodules.weather import make_weather, read_weather, site_of
 from heatsplat.contracts import WEATHER_COLUMNS, Environment, SceneError, Weather
 
 WEATHER_FILE, LABELS_FILE, FEATURES_FILE = "weather.csv", "labels.npy", "space_features.npy"
@@ -21,10 +21,10 @@ class Surroundings:
     """Options of loaders whose scenes have weather. Files are relative to the scene.
 
     Args:
-        weather: table of the weather (``datamodules.weather``), or None for none; weather.csv may be absent.
+        weather: table of the weather (``heatsplat.datamodules.weather``), or None for none; weather.csv may be absent.
         zone: time zone of its times where they have no offset.
         max_gap_h: longest gap in it that is interpolated, in hours.
-        site: latitude, longitude, altitude_m, up and north where they are known (``datamodules.sun``).
+        site: latitude, longitude, altitude_m, up and north where they are known (``heatsplat.datamodules.sun``).
         labels: classes of the points [P] as .npy, or None; labels.npy may be absent.
         features: features of the points [P, D] as .npy, or None; space_features.npy may be absent.
     """

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from heatsplat.datamodules.assemble import RawFrame
+from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 
-from datamodules.assemble import RawFrame
-from datamodules.base import SceneDataModule
-from datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
-from datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
-from datamodules.synthetic_scene.presets import PRESETS
-from datamodules.synthetic_scene.scene import Scene
 from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.geometry.resampling import resampled
 
@@ -23,7 +23,7 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: name of a preset: static, cooling, heated, glass, ... (``datamodules.synthetic_scene.presets``), or outdoor.
+        scene: outdoor, or the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, cooling, ...
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.base import RawFrame
+from heatsplat.datamodules.bounds import number_in, range_in, read_json
+from heatsplat.datamodules.colmap import image_index, match_model
+from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.ntr import FILES, listed_frames, mesh_points
+from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
+from heatsplat.datamodules.timestamps import stem_of
+from heatsplat.datamodules.weather import utc_seconds
 
-from datamodules.base import RawFrame
-from datamodules.bounds import number_in, range_in, read_json
-from datamodules.colmap import image_index, match_model
-from datamodules.formats.colmap import find_model, read_model
-from datamodules.formats.images import ImageIndex, read_image
-from datamodules.ntr import FILES, listed_frames, mesh_points
-from datamodules.surroundings import OutdoorDataModule, environment_of
-from datamodules.timestamps import stem_of
-from datamodules.weather import utc_seconds
 from heatsplat.contracts import SceneData, SceneError
 
 META_FILE = "meta.json"

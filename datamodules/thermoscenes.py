@@ -8,16 +8,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.bounds import read_bounds
+from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.points import ply_points, random_points
+from heatsplat.datamodules.rgbt_scenes import is_paired, paired_frames
+from heatsplat.datamodules.splits import SplitRule
+from heatsplat.datamodules.timestamps import stem_of
 
-from datamodules.base import RawFrame, SceneDataModule
-from datamodules.bounds import read_bounds
-from datamodules.formats.colmap import find_model, read_model
-from datamodules.formats.images import ImageIndex, read_image
-from datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
-from datamodules.points import ply_points, random_points
-from datamodules.rgbt_scenes import is_paired, paired_frames
-from datamodules.splits import SplitRule
-from datamodules.timestamps import stem_of
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 BOUNDS_FILE = "temperature_bounds.json"

@@ -19,9 +19,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 import torch
+from heatsplat.datamodules.assemble import on_clock, weather_of
+from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 
-from datamodules.assemble import on_clock, weather_of
-from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
 
 log = logging.getLogger(__name__)

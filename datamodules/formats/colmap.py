@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2  # noqa: F401, I001
 import numpy as np
 import pycolmap
+from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
-from datamodules.formats.lens import MODELS, Lens, lens_of
 from heatsplat.contracts import SceneError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")

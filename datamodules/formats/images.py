@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
 
-from datamodules.formats.lens import Lens, undistortion_maps
 from heatsplat.contracts import SceneError
 
 # What is wrong with a file is said by the exceptions below; OpenCV would add a line for every unknown TIFF tag.

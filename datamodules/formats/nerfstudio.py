@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from heatsplat.datamodules.bounds import read_json
+from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
-from datamodules.bounds import read_json
-from datamodules.formats.lens import MODELS, Lens, lens_of
 from heatsplat.contracts import SceneError
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.

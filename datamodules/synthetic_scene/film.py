@@ -11,10 +11,10 @@ from functools import partial
 
 import numpy as np
 import torch
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 from torch import Tensor
 
-from datamodules.formats.lens import Lens
-from datamodules.synthetic_scene.scene import Scene
 from heatsplat.contracts import ThermalRange
 from heatsplat.training.rng import generator_for
 

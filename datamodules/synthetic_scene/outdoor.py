@@ -13,10 +13,8 @@ from functools import cache
 
 import numpy as np
 import torch
-from torch import Tensor
-
-from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
-from datamodules.synthetic_scene.outdoor_heat import (
+from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     STEFAN_BOLTZMANN,
     Forcing,
     History,
@@ -25,9 +23,11 @@ from datamodules.synthetic_scene.outdoor_heat import (
     march,
     solve,
 )
-from datamodules.synthetic_scene.presets import Pattern, Preset, Surface
-from datamodules.synthetic_scene.scene import Scene
-from datamodules.synthetic_scene.shapes import Box, Plane
+from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
+from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
+from torch import Tensor
+
 from heatsplat.contracts import KELVIN_AT_0_C, SceneError, ThermalRange, Weather
 from heatsplat.training.rng import generator_for
 

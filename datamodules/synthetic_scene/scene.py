@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from heatsplat.datamodules.synthetic_scene import heat
+from heatsplat.datamodules.synthetic_scene.presets import Preset, Surface
+from heatsplat.datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
 from torch import Tensor
 
-from datamodules.synthetic_scene import heat
-from datamodules.synthetic_scene.presets import Preset, Surface
-from datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
 from heatsplat.contracts import ThermalRange, Weather
 
 # Where the visible light comes from (unit length), and its share that comes from everywhere.

@@ -1,3 +1,11 @@
 """heatsplat: thermal-infrared scenes as 3D Gaussians whose appearance is a physical model of heat."""
 
+from pathlib import Path
+
 __version__ = "0.1.0"
+
+# A wheel has conf/ and datamodules/ inside the package. In a checkout they lie beside src/, where setup.py takes them from,
+# and the package looks for them there: with or without an editable install, and in any copy of the sources.
+CHECKOUT = next((root for root in [Path(__file__).resolve().parents[2]] if (root / "datamodules").is_dir()), None)
+if CHECKOUT is not None:
+    __path__.append(str(CHECKOUT))

@@ -20,10 +20,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from heatsplat import CHECKOUT
 from heatsplat.training.machine import cores
 
-ROOT = Path(__file__).resolve().parents[2]
-CONF = str(ROOT / "conf")
+ROOT = CHECKOUT or Path.cwd()  # outputs/ goes there
+CONF = str((CHECKOUT or Path(__file__).resolve().parent) / "conf")
 
 log = logging.getLogger("heatsplat")
 build = functools.partial(hydra.utils.instantiate, _convert_="all")

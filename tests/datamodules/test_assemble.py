@@ -3,11 +3,11 @@ import logging
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, build_scene
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.splits import SplitRule
 from layouts import FOCAL, HEIGHT, WIDTH, grey, points, viewmats
 
-from datamodules.base import CELSIUS, Counts, RawFrame, build_scene
-from datamodules.formats.lens import Lens
-from datamodules.splits import SplitRule
 from heatsplat.contracts import SceneError, ThermalRange
 
 LENS = Lens(fx=FOCAL, fy=FOCAL + 2, cx=20.5, cy=15.0, width=WIDTH, height=HEIGHT)

@@ -4,6 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import find_model, read_model
 from layouts import (
     BOUNDS,
     FOCAL,
@@ -17,8 +19,6 @@ from layouts import (
     write_json,
 )
 
-from datamodules.colmap import Colmap
-from datamodules.formats.colmap import find_model, read_model
 from heatsplat.contracts import SceneError
 
 M3T = Path(__file__).parents[3] / "shared" / "data" / "m3t_heath"

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-
-from datamodules.synthetic import Synthetic
-from datamodules.synthetic_scene.film import Size, film
-from datamodules.synthetic_scene.flaws import CameraFlaws, Haze
-from datamodules.synthetic_scene.presets import PRESETS
-from datamodules.synthetic_scene.scene import Scene
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.film import Size, film
+from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws, Haze
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 
 SMALL = Size(64, 52, 3, 600)
 

@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, pixel_rays
+from heatsplat.datamodules.synthetic_scene.presets import PANE, PRESETS, TABLE_TOP, Pattern, Preset
+from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.datamodules.synthetic_scene.shapes import Box
 from running import TINY, run
 
-from datamodules.synthetic import Synthetic
-from datamodules.synthetic_scene.film import SIZES, Recording, film, pixel_rays
-from datamodules.synthetic_scene.presets import PANE, PRESETS, TABLE_TOP, Pattern, Preset
-from datamodules.synthetic_scene.scene import Scene
-from datamodules.synthetic_scene.shapes import Box
 from heatsplat.contracts import SceneError
 from heatsplat.metrics import psnr
 

@@ -1,10 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from layouts import write_image
-from PIL import Image
-
-from datamodules.formats.images import (
+from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
     read_image,
@@ -13,6 +10,9 @@ from datamodules.formats.images import (
     split_alpha,
     to_grey,
 )
+from layouts import write_image
+from PIL import Image
+
 from heatsplat.contracts import SceneError
 
 

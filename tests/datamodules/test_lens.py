@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from heatsplat.datamodules.formats.images import undistorted, undistorted_mask
+from heatsplat.datamodules.formats.lens import Lens, lens_of, undistortion_maps
 
-from datamodules.formats.images import undistorted, undistorted_mask
-from datamodules.formats.lens import Lens, lens_of, undistortion_maps
 from heatsplat.contracts import SceneError
 
 WIDTH, HEIGHT = 64, 48

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from heatsplat.datamodules.lowres import Reduction, degraded
 
-from datamodules.lowres import Reduction, degraded
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.geometry.resampling import resampled
 

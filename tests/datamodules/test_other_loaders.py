@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+from heatsplat.datamodules.ntr import NTR
+from heatsplat.datamodules.rgbt_scenes import RGBTScenes
+from heatsplat.datamodules.ti_nsd import TINSD, frame_number
 from layouts import HEIGHT, WIDTH, grey, names, points, viewmats, write_colmap, write_image, write_json
 
-from datamodules.ntr import NTR
-from datamodules.rgbt_scenes import RGBTScenes
-from datamodules.ti_nsd import TINSD, frame_number
 from heatsplat.contracts import SceneError
 
 

@@ -8,12 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
-
-from datamodules.synthetic import Synthetic
-from datamodules.synthetic_scene import heat
-from datamodules.synthetic_scene.film import pixel_rays
-from datamodules.synthetic_scene.outdoor import (
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene import heat
+from heatsplat.datamodules.synthetic_scene.film import pixel_rays
+from heatsplat.datamodules.synthetic_scene.outdoor import (
     CLASSES,
     DAY_S,
     METAL_ROOF,
@@ -26,7 +24,7 @@ from datamodules.synthetic_scene.outdoor import (
     outdoor_weather,
     sky_long_waves,
 )
-from datamodules.synthetic_scene.outdoor_heat import (
+from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     STEFAN_BOLTZMANN,
     Forcing,
     OutdoorMaterial,
@@ -34,6 +32,8 @@ from datamodules.synthetic_scene.outdoor_heat import (
     march,
     solve,
 )
+from scipy.integrate import solve_ivp
+
 from heatsplat.contracts import KELVIN_AT_0_C, SceneError
 
 SOUTH_WALL, ROOF = (0.0, -1.0, 0.0), (0.0, -(0.5**0.5), 0.5**0.5)
@@ -227,7 +227,7 @@ def test_images_show_the_truth_and_every_surface_is_seen():
 
 def test_no_ray_of_a_drone_meets_the_sky():
     scene = world()
-    from datamodules.formats.lens import Lens
+    from heatsplat.datamodules.formats.lens import Lens
 
     lens = Lens(fx=72.0, fy=72.0, cx=32.0, cy=26.0, width=64, height=52, model="PINHOLE")
     corners = pixel_rays(lens, torch.tensor([[0.0, 0.0], [64.0, 0.0], [0.0, 52.0], [64.0, 52.0]], dtype=torch.float64))

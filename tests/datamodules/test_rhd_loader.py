@@ -2,9 +2,9 @@ import logging
 
 import numpy as np
 import pytest
+from heatsplat.datamodules.rhd import RHD
 from layouts import grey, names, rhd_names, write_colmap, write_image, write_rhd
 
-from datamodules.rhd import RHD
 from heatsplat.contracts import SceneError
 
 INFO = {"T_env": 32.9, "min_value": 31, "max_value": 56}

@@ -1,8 +1,8 @@
 import json
 
 import pytest
+from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
-from datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 from heatsplat.contracts import SceneError
 
 

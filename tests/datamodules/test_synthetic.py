@@ -10,13 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.film import (
+    SIZES,
+    Recording,
+    camera_path,
+    expose,
+    film,
+    frame_times,
+    hits,
+    pixel_rays,
+)
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS, TABLE_TOP, Pattern, Preset
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from datamodules.synthetic import Synthetic
-from datamodules.synthetic_scene.film import SIZES, Recording, camera_path, expose, film, frame_times, hits, pixel_rays
-from datamodules.synthetic_scene.presets import PRESETS, TABLE_TOP, Pattern, Preset
-from datamodules.synthetic_scene.scene import Scene
 from heatsplat.contracts import SceneError
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 from heatsplat.physics.relaxation import harmonic_response

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from heatsplat.datamodules.synthetic_scene import presets
+from heatsplat.datamodules.synthetic_scene.heat import CONSTANT, Material, Waveform, march, periodic, solve
 from scipy.special import erfcx
-
-from datamodules.synthetic_scene import presets
-from datamodules.synthetic_scene.heat import CONSTANT, Material, Waveform, march, periodic, solve
 
 DURATION_S = 1800.0
 EXCESS_K, FLUX_W_M2 = 40.0, 1000.0

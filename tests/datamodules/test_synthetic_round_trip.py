@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.ntr import NTR
+from heatsplat.datamodules.rgbt_scenes import RGBTScenes
+from heatsplat.datamodules.rhd import RHD
+from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, expose, film, pixel_rays
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.datamodules.synthetic_scene.writers import APPLIED_TRANSFORM, LAYOUTS, PALETTE, clock_digits, write_rhd
+from heatsplat.datamodules.thermo import Thermo
+from heatsplat.datamodules.thermoscenes import ThermoScenes
+from heatsplat.datamodules.ti_nsd import TINSD
 from matplotlib import colormaps
 
-from datamodules.colmap import Colmap
-from datamodules.ntr import NTR
-from datamodules.rgbt_scenes import RGBTScenes
-from datamodules.rhd import RHD
-from datamodules.synthetic_scene.film import SIZES, Recording, expose, film, pixel_rays
-from datamodules.synthetic_scene.presets import PRESETS
-from datamodules.synthetic_scene.scene import Scene
-from datamodules.synthetic_scene.writers import APPLIED_TRANSFORM, LAYOUTS, PALETTE, clock_digits, write_rhd
-from datamodules.thermo import Thermo
-from datamodules.thermoscenes import ThermoScenes
-from datamodules.ti_nsd import TINSD
 from heatsplat.contracts import SceneData, View
 
 SIZE = replace(SIZES["tiny"], frames=17, points=200)

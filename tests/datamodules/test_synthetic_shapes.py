@@ -6,9 +6,8 @@ import math
 
 import pytest
 import torch
-
-from datamodules.synthetic_scene.presets import TABLE_TOP
-from datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Sphere, nearest_surface, trace
+from heatsplat.datamodules.synthetic_scene.presets import TABLE_TOP
+from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Sphere, nearest_surface, trace
 
 BOX = Box((0.3, -0.2, 0.5), (0.8, 0.5, 1.1), 33.0)
 SPHERE = Sphere((-0.2, 0.4, 0.1), 0.6)

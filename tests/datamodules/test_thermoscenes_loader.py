@@ -1,5 +1,8 @@
 import numpy as np
 import pytest
+from heatsplat.datamodules.formats.lens import lens_of
+from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.thermoscenes import ThermoScenes
 from layouts import (
     BOUNDS,
     FOCAL,
@@ -16,9 +19,6 @@ from layouts import (
 )
 from plyfile import PlyData, PlyElement
 
-from datamodules.formats.lens import lens_of
-from datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
-from datamodules.thermoscenes import ThermoScenes
 from heatsplat.contracts import SceneError
 
 STEMS = [f"frame_train_{i:05d}" for i in range(1, 7)] + [f"frame_eval_{i:05d}" for i in range(1, 3)]
@@ -51,7 +51,7 @@ def test_cameras_split_bounds_and_pixels(tmp_path, file):
 
 def test_distortion_is_taken_out(tmp_path):
     """The same picture through the same lens as written by COLMAP's conventions."""
-    from datamodules.formats.images import undistorted
+    from heatsplat.datamodules.formats.images import undistorted
 
     write_thermoscenes(tmp_path, STEMS, distortion=DISTORTION)
     scene = loaded(tmp_path)

@@ -1,6 +1,5 @@
 import pytest
-
-from datamodules.timestamps import (
+from heatsplat.datamodules.timestamps import (
     dji_time,
     seconds_of_day,
     stem_of,
@@ -8,6 +7,7 @@ from datamodules.timestamps import (
     times_from_csv,
     unrolled_midnight,
 )
+
 from heatsplat.contracts import SceneError
 
 

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
 
-from datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
-from datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
 from heatsplat.contracts import SceneData, SceneError, Weather
 
 SITE = Site(47.0, 9.0, 500.0)
@@ -303,7 +303,7 @@ def test_a_record_that_cannot_be_interpolated_is_refused(times, air, message):
 
 @pytest.fixture(scope="module")
 def yard() -> SceneData:
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     return Synthetic(scene="outdoor", size="tiny", frames=6).scene
 

@@ -111,7 +111,7 @@ def test_what_is_set_by_hand_wins_over_the_evidence():
 @pytest.mark.parametrize("paper", ["etgs", "supirgs", "ravigs", "ti3dgs", "thermogs"])
 def test_a_papers_effects_are_a_selection(paper):
     """The selection simulates what the method reports of itself; grey-body emission of RaViGS is a law of emission."""
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     method = config(f"method={paper}", "max_steps=10")
     thermal, sensor = cli.build(method["thermal"]), cli.build(method["sensor"])
@@ -186,7 +186,7 @@ def test_what_the_scene_cannot_give_is_refused_where_it_was_asked_for():
 
 
 def test_an_opacity_for_each_image_needs_two_images():
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     scene = Synthetic(scene="static", size="tiny").scene
     assert assembly.possible(verdicts("thermal_opacity", "agc"), scene) == verdicts("thermal_opacity", "agc")

@@ -3,10 +3,10 @@
 from functools import partial
 
 import pytest
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 
-from datamodules.synthetic import Synthetic
-from datamodules.synthetic_scene.outdoor import OUTDOOR
-from datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.contracts import SceneError
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.studies.evidence import judged, run, written

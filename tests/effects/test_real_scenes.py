@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.images import read_image
 
-from datamodules.colmap import Colmap
-from datamodules.formats.images import read_image
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
 from heatsplat.effects.catalogue import decide
 from heatsplat.effects.noise import noise_of

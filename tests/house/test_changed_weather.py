@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from heatsplat.datamodules.base import SceneDataModule
 from running import compose_run
 from weathered import HOUR_S, make_scene
 
-from datamodules.base import SceneDataModule
 from heatsplat import cli
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.shots import plan

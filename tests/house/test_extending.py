@@ -44,7 +44,7 @@ def test_its_commands_run(command, copy):
 
 
 def test_its_data_set_loads(copy, tmp_path):
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     scene = Synthetic(scene="cooling", size="tiny").scene
     camera = scene.train.frames[0].camera

@@ -39,10 +39,10 @@ def trained(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     """The /data of the README: the synthetic scene written in the layouts that it names."""
-    from datamodules.synthetic_scene.film import SIZES, film
-    from datamodules.synthetic_scene.presets import PRESETS
-    from datamodules.synthetic_scene.scene import Scene
-    from datamodules.synthetic_scene.writers import LAYOUTS
+    from heatsplat.datamodules.synthetic_scene.film import SIZES, film
+    from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+    from heatsplat.datamodules.synthetic_scene.scene import Scene
+    from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
 
     folder = tmp_path_factory.mktemp("data")
     recording = film(Scene(PRESETS["cooling"]), SIZES["tiny"], seed=0, noise_k=0.05)

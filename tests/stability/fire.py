@@ -9,11 +9,11 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from heatsplat.datamodules.base import SceneDataModule
 from omegaconf import OmegaConf
 from running import compose_run
 from torch import Tensor
 
-from datamodules.base import SceneDataModule
 from heatsplat import cli
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet, Weather
 from heatsplat.geometry.projection import look_at

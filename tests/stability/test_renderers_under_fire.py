@@ -147,7 +147,7 @@ def test_images_of_extreme_shapes(backend, size):
 
 
 def test_a_scene_at_a_million_metres_is_a_matter_of_its_origin(backend):
-    """In float32 a millimetre is lost at 1e6 m: loaders recentre such scenes (datamodules.assemble), and then agree."""
+    """In float32 a millimetre is lost at 1e6 m: loaders recentre such scenes (heatsplat.datamodules.assemble), and then agree."""
     scene = sound(5)
     away = torch.tensor([4e5, 5e6, 300.0], dtype=torch.float64)
     viewmat = scene.viewmat.clone()

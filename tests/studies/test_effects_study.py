@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 
-from datamodules.synthetic_scene.outdoor import OUTDOOR
-from datamodules.synthetic_scene.presets import PRESETS as ROOMS
 from heatsplat.effects import assembly
 from heatsplat.effects.assembly import falls_with
 from heatsplat.io.results import RunResults

@@ -25,7 +25,7 @@ SHORT = (
 @pytest.fixture(scope="module", autouse=True)
 def one_yard():
     """The yard is filmed once for all runs of this file."""
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     loaded, kept = Synthetic.load, {}
 

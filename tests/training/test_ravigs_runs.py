@@ -96,7 +96,7 @@ def test_a_run_without_any_part_has_none_of_them(tmp_path):
 @pytest.mark.parametrize(("kept", "told"), [(0, "16 of the views"), (5, "11 of the views")])
 def test_views_without_colour_are_refused_before_training(tmp_path, monkeypatch, kept, told):
     """None of the 16 training views has a colour image, or not every one."""
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     loaded = Synthetic.load
 

@@ -92,7 +92,8 @@ def test_a_missing_checkpoint_is_named_with_those_that_exist(tmp_path):
 def test_a_method_that_needs_time_refuses_a_scene_without(tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
+
     from heatsplat.contracts import ViewSet
 
     def timeless(views: ViewSet) -> ViewSet:

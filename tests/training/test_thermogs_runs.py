@@ -37,7 +37,7 @@ NETWORK = "thermal.network.own.weight"
 @pytest.fixture(scope="module", autouse=True)
 def one_yard(tmp_path_factory):
     """The yard is filmed once for all runs of this file."""
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     loaded, kept = Synthetic.load, {}
 
@@ -128,7 +128,7 @@ def test_files_without_splats_are_refused(tmp_path, name, content, message):
 
 
 def test_a_scene_without_weather_is_refused_before_training(tmp_path, monkeypatch):
-    from datamodules.synthetic import Synthetic
+    from heatsplat.datamodules.synthetic import Synthetic
 
     loaded = Synthetic.load
     monkeypatch.setattr(Synthetic, "load", lambda self: replace(loaded(self), weather=None))

@@ -255,7 +255,7 @@ def first_failure(mutation: Mutation) -> str | None:
 
     torch.set_num_threads(1)
     sys.meta_path.insert(0, _Finder(f"heatsplat.{mutation.module}", mutation.source()))
-    for name in [name for name in sys.modules if name.split(".")[0] in ("heatsplat", "datamodules")]:
+    for name in [name for name in sys.modules if name.split(".")[0] == "heatsplat"]:
         if name != __name__:
             del sys.modules[name]
     words = mutation.tests.split(" ")

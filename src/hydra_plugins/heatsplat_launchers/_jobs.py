@@ -97,8 +97,7 @@ def planned(context: HydraContext, config: DictConfig, number: int, overrides: S
 
 def python_path() -> str:
     """PYTHONPATH with which other processes import what this one did, installed or not."""
-    root = Path(__file__).resolve().parents[3]
-    return os.pathsep.join(filter(None, [str(root / "src"), str(root), os.environ.get("PYTHONPATH")]))
+    return os.pathsep.join(filter(None, [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]))
 
 
 def execute(
