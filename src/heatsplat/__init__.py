@@ -1,11 +1,24 @@
-"""heatsplat: thermal-infrared scenes as 3D Gaussians whose appearance is a physical model of heat."""
+"""heatsplat: thermal-infrared scenes as 3D Gaussians whose appearance is a physical model of heat.
 
+In Python: ``config = heatsplat.compose(["method=etgs", "data.scene=heated"])``, ``heatsplat.train(config)`` and
+``heatsplat.load("outputs/.../checkpoints/last.ckpt")``. Each brings what it needs when it is first asked for.
+"""
+
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 __version__ = "0.1.0"
+__all__ = ["compose", "load", "train"]
 
 # A wheel has conf/ and datamodules/ inside the package. In a checkout they lie beside src/, where setup.py takes them from,
 # and the package looks for them there: with or without an editable install, and in any copy of the sources.
 CHECKOUT = next((root for root in [Path(__file__).resolve().parents[2]] if (root / "datamodules").is_dir()), None)
 if CHECKOUT is not None:
     __path__.append(str(CHECKOUT))
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("heatsplat.composition" if name == "compose" else "heatsplat.runs.run"), name)

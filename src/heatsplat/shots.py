@@ -49,21 +49,26 @@ def plan(
     if trajectory in ("test", "train"):
         taken = getattr(scene, trajectory).frames
         moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
-        return [_at(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
+        return [at_time(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
     cameras = _cameras(scene, trajectory, view, count)
     if time is None:
         record = [t for t in scene.train.times_s if t is not None]
         if record:
             time = (min(record), max(record)) if trajectory == "view" else (min(record) + max(record)) / 2
     moments = [None] * count if time is None else _moments(time, count)
-    first_free = 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
+    first_free = first_free_id(scene)
     return [
-        _at(scene, Frame(f"{trajectory}_{i:04d}", first_free + i, camera), moment)
+        at_time(scene, Frame(f"{trajectory}_{i:04d}", first_free + i, camera), moment)
         for i, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
     ]
 
 
-def _at(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
+def first_free_id(scene: SceneData) -> int:
+    """The first ``frame_id`` that no frame of the scene has."""
+    return 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
+
+
+def at_time(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
     """The frame at a moment, with the weather of that moment where the scene has a record."""
     if moment == frame.time_s or scene.weather is None:
         return replace(frame, time_s=moment)

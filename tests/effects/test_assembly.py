@@ -9,12 +9,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from running import compose_run
 
-from heatsplat import cli
+from heatsplat.composition import build
 from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE
-from heatsplat.studies.prices import Price
+from heatsplat.runs.prices import Price
 
 
 @cache
@@ -114,7 +114,7 @@ def test_a_papers_effects_are_a_selection(paper):
     from heatsplat.datamodules.synthetic import Synthetic
 
     method = config(f"method={paper}", "max_steps=10")
-    thermal, sensor = cli.build(method["thermal"]), cli.build(method["sensor"])
+    thermal, sensor = build(method["thermal"]), build(method["sensor"])
     if paper in ("etgs", "thermogs"):
         thermal.prepare(Synthetic(scene=method["synthetic_preset"], size="tiny").scene)
     own = set(thermal.effects()) | set(sensor.effects())
@@ -140,14 +140,14 @@ def test_the_selection_of_supirgs_has_its_camera():
 def test_every_selection_of_one_effect_can_be_built():
     for name in assembly.NAMES:
         found = recipe(*{name, assembly.STANDS_ON.get(name, name)})
-        thermal, sensor = cli.build(found["thermal"]), cli.build(found["sensor"])
+        thermal, sensor = build(found["thermal"]), build(found["sensor"])
         assert thermal.modality == "thermal" and len(sensor.parts) == (name in assembly.SENSOR)
         simulated = set(sensor.effects())
         assert simulated == ({name} if name in assembly.SENSOR else set())
 
 
 def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
-    thermal = cli.build(recipe(*set(assembly.NAMES) - set(assembly.WEATHER_DRIVEN))["thermal"])
+    thermal = build(recipe(*set(assembly.NAMES) - set(assembly.WEATHER_DRIVEN))["thermal"])
     assert set(thermal.effects()) <= set(assembly.NAMES)
     assert {"relaxation", "conduction", *assembly.ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
 

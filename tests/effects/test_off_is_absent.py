@@ -19,7 +19,7 @@ from running import compose_run
 from torch.profiler import ProfilerActivity, profile
 from weathered import HOUR_S, make_weather
 
-from heatsplat import cli
+from heatsplat.composition import build
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, ViewSet
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
@@ -88,7 +88,7 @@ class Built:
     """What a recipe of assembly builds."""
 
     def __init__(self, found):
-        self.thermal, self.sensor = cli.build(found["thermal"]), cli.build(found["sensor"])
+        self.thermal, self.sensor = build(found["thermal"]), build(found["sensor"])
         self.thermal.prepare(scene())
         self.sensor.prepare(scene())
         self.modules = {"thermal": self.thermal, "sensor": self.sensor}

@@ -24,18 +24,20 @@ ALLOWED = {
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
+    "composition": {"training", "heatsplat"},
+    "runs": {"contracts", "composition", "effects", "io", "shots", "training"},
     "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}
-    | {"effects", "sensors", "thermal", "training"},
+    | {"effects", "sensors", "thermal", "training", "runs"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "effects", "io", "training", "shots", "studies", "heatsplat"},
+    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
     "datamodules": {"contracts", "geometry", "sensors", "training"},
 }
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
 # Third-party package -> places that may import it.
 DOORS = {
-    "hydra": {"cli"},
-    "omegaconf": {"cli"},
+    "hydra": {"cli", "composition"},
+    "omegaconf": {"cli", "composition"},
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
     "pycolmap": {"datamodules/formats"},
     "pvlib": {"datamodules"},

@@ -8,12 +8,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 from heatsplat.datamodules.base import SceneDataModule
-from running import compose_run
 from weathered import HOUR_S, make_scene
 
 from heatsplat import cli
+from heatsplat.composition import compose
 from heatsplat.contracts import SceneData, SceneError
+from heatsplat.runs import run
 from heatsplat.shots import plan
+from heatsplat.training.module import CHECKPOINT_KEY
 
 
 class Yard(SceneDataModule):
@@ -39,17 +41,16 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
         return torch.full((8, 8, 1), 0.5)
 
     data = Yard()
-    module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict, scene=None)
-    monkeypatch.setattr(cli, "_restored", lambda config, output_dir: (module, data, {"checkpoint": None}))
-
-    def restore(module, data, checkpoint):
-        module.scene = data.scene
-
-    monkeypatch.setattr("heatsplat.training.session.restore", restore)
+    module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict)
+    stored = {CHECKPOINT_KEY: {"recipe": {"module": {}, "data": {}}}}
+    monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
+    monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
+    monkeypatch.setattr(run, "build", lambda settings: data)
+    monkeypatch.setattr(run, "restore", lambda *_: None)
     monkeypatch.setattr("heatsplat.training.session.prepare_machine", lambda threads: None)
     options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", *overrides)
-    cli.render.__wrapped__.__wrapped__(compose_run(folder, *options, config_name="render"), folder)
-    return seen, module.scene
+    cli.render.__wrapped__.__wrapped__(compose(options, "render"), folder)
+    return seen, data.scene
 
 
 def test_a_shot_has_the_weather_of_its_moments(monkeypatch, tmp_path):
@@ -81,13 +82,11 @@ def test_without_a_record_frames_keep_what_they_had():
     assert [f.environment for f in plan(scene, "view", 10.0, 0, 2)] == [None, None]
 
 
-def test_a_data_set_without_weather_refuses_the_choice(monkeypatch, tmp_path):
-    from heatsplat.training.module import CHECKPOINT_KEY
-
+def test_a_data_set_without_weather_refuses_the_choice(monkeypatch):
     stored = {CHECKPOINT_KEY: {"recipe": {"data": {"root": "x"}, "module": {}}}}
-    monkeypatch.setattr("heatsplat.training.session.load_checkpoint", lambda ckpt: stored)
-    config = compose_run(tmp_path, "ckpt=any.ckpt", "data.weather=windy", config_name="evaluate")
+    monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
+    config = compose(["ckpt=any.ckpt", "data.weather=windy"], "evaluate")
     with pytest.raises(
         SceneError, match="data.weather=windy: the data set of this checkpoint has no weather to choose"
     ):
-        cli._restored(config, tmp_path)
+        run.load(config["ckpt"], config["data"])

@@ -13,7 +13,7 @@ from hydra.core.utils import JobStatus
 from omegaconf import OmegaConf
 from running import run
 
-from heatsplat.cli import cores
+from heatsplat.training.machine import cores
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = (

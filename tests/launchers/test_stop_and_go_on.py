@@ -6,10 +6,10 @@ import signal
 import pytest
 import torch
 from hydra.core.utils import JobStatus
-from omegaconf import OmegaConf
 from running import TINY, compose_run
 
-from heatsplat import cli
+from heatsplat import cli, composition
+from heatsplat.runs.resume import resumed
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
 
 
@@ -47,15 +47,15 @@ def test_ctrl_c_is_nobody_elses():
 
 @pytest.mark.parametrize(("jobs", "expected"), [(1, 6), (2, 3), (4, 1), (9, 1), (-1, 1)])
 def test_jobs_side_by_side_get_fair_shares_of_the_cores(jobs, expected, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "cores", lambda: 6)
+    monkeypatch.setattr(composition, "cores", lambda: 6)
     sweep = ("method=3dgs", "launcher=joblib", f"hydra.launcher.n_jobs={jobs}")
     assert compose_run(tmp_path, *sweep).threads is None, "a single run has all cores"
     assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN").threads == expected
     assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN", "threads=5").threads == 5
 
 
-def configured(folder, *overrides):
-    return OmegaConf.to_container(compose_run(folder, *TINY, "method=3dgs", "max_steps=8", *overrides), resolve=True)
+def configured(*overrides):
+    return composition.compose([*TINY, "method=3dgs", "max_steps=8", *overrides])
 
 
 def stored(folder, name, step, recipe):
@@ -66,22 +66,23 @@ def stored(folder, name, step, recipe):
 
 
 def test_a_run_goes_on_from_the_newest_checkpoint_that_can_be_read_and_is_not_the_last(tmp_path):
-    plain = configured(tmp_path)
-    assert cli.begun(plain, None, tmp_path) is None
+    plain = configured()
+    assert resumed(plain, tmp_path) == plain
     stored(tmp_path, "step_000002.ckpt", 2, plain)
     stored(tmp_path, "step_000004.ckpt", 4, plain | {"threads": 1, "ckpt": "elsewhere"})
     stored(tmp_path, "last.ckpt", 8, plain)
     broken = tmp_path / "checkpoints" / "step_000006.ckpt"
     broken.write_bytes(b"half a file")
     os.utime(broken, (6, 6))
-    assert cli.begun(plain, None, tmp_path) == plain | {"ckpt": str(tmp_path / "checkpoints" / "step_000004.ckpt")}
-    assert cli.begun(plain | {"ckpt": "given.ckpt"}, None, tmp_path) is None
+    assert resumed(plain, tmp_path) == plain | {"ckpt": str(tmp_path / "checkpoints" / "step_000004.ckpt")}
+    given = plain | {"ckpt": str(tmp_path / "checkpoints" / "step_000002.ckpt")}
+    assert resumed(given, tmp_path) == given
 
 
 def test_a_run_with_other_settings_starts_from_the_beginning_and_says_so(tmp_path, caplog):
-    stored(tmp_path, "last.ckpt", 4, configured(tmp_path, "optim.means=1e-3"))
-    assert cli.begun(configured(tmp_path), None, tmp_path) is None
-    assert "has other settings (module, optim); starting from the beginning" in caplog.text
+    stored(tmp_path, "last.ckpt", 4, configured("optim.means=1e-3"))
+    assert resumed(configured(), tmp_path) == configured()
+    assert "has other settings (optim.means); starting from the beginning" in caplog.text
 
 
 def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from running import compose_run
 from skimage.feature import corner_harris
 
-from heatsplat import cli
+from heatsplat.composition import build
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.corner import Corner, harris_response
 from heatsplat.losses.photometric import Photometric
@@ -125,7 +125,7 @@ def test_loss_and_gradient_are_finite_whatever_the_images(level, contrast, weigh
 
 def test_the_recipe_is_the_published_sum_and_its_ramp_ends_after_a_sixth_of_the_run(tmp_path):
     plain = OmegaConf.to_container(compose_run(tmp_path, "method=thermal3dgs").loss, resolve=True)
-    loss, target, prediction = cli.build(plain), noise(), noise(seed=1)
+    loss, target, prediction = build(plain), noise(), noise(seed=1)
     full = Photometric(1.0)(inputs(prediction, target))["dssim"].item()
     for step, share in ((0, 1.0), (2500, 0.5), (4999, 0.0002), (5002, None)):
         terms = loss(inputs(prediction, target, step=step, max_steps=30000))

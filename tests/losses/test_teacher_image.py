@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from running import TINY, compose_run, run
+from running import TINY, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.nn import functional
 
-from heatsplat.cli import build, resolved
+from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, View
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.photometric import l1, ssim_map
@@ -124,6 +124,6 @@ def test_a_run_renders_finely_and_learns_from_both(tmp_path):
 
 
 def test_what_the_published_code_optimises_is_one_word(tmp_path):
-    config = compose_run(tmp_path, "method=srgs", "sr_only=true")
-    (term,) = build(resolved(config)["loss"]).terms.values()
+    config = compose(["method=srgs", "sr_only=true"])
+    (term,) = build(config["loss"]).terms.values()
     assert term.record_weight == 0.0

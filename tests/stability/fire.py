@@ -10,13 +10,12 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from heatsplat.datamodules.base import SceneDataModule
-from omegaconf import OmegaConf
-from running import compose_run
 from torch import Tensor
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet, Weather
 from heatsplat.geometry.projection import look_at
+from heatsplat.runs.run import build_callbacks
 from heatsplat.training.rng import generator_for
 from heatsplat.training.session import fit, load_checkpoint, prepare_machine
 
@@ -91,8 +90,7 @@ def with_views(scene: SceneData, change) -> SceneData:
 def plain_config(output_dir: Path, method: str, **overrides: Any) -> dict[str, Any]:
     """The resolved configuration of a run of ``method`` over STEPS steps, as nested dicts."""
     arguments = [f"{name}={value}" for name, value in overrides.items()]
-    config = compose_run(output_dir, f"method={method}", f"max_steps={STEPS}", "threads=1", *arguments)
-    return OmegaConf.to_container(config, resolve=True)
+    return compose([f"method={method}", f"max_steps={STEPS}", "threads=1", *arguments])
 
 
 def everywhere(tree: Any, change) -> Any:
@@ -114,9 +112,9 @@ def train(scene: SceneData, plain: dict[str, Any], output_dir: Path):
     trainer = pl.Trainer(
         accelerator="cpu", devices=1, max_steps=plain["max_steps"], logger=False, enable_progress_bar=False,
         enable_model_summary=False, num_sanity_val_steps=0, limit_val_batches=0, use_distributed_sampler=False,
-        callbacks=[*cli.build_callbacks(kept), shown],
+        callbacks=[*build_callbacks(kept, output_dir), shown],
     )  # fmt: skip
-    module = cli.build(plain["module"], output_dir=str(output_dir))
+    module = build(plain["module"], output_dir=str(output_dir))
     module.recipe = plain
     fit(module, Given(scene), trainer, test=False)
     return module, shown

@@ -11,29 +11,26 @@ import pytorch_lightning as pl
 import running
 import torch
 
-from heatsplat import cli
 from heatsplat.callbacks.budget import BudgetClock
 from heatsplat.callbacks.timing import CostMeter
+from heatsplat.composition import CONF, compose
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.io.results import RunResults
-from heatsplat.studies import budget_grid
-from heatsplat.studies.budget import (
-    CALIBRATION_SHARE,
+from heatsplat.runs.budget import CALIBRATION_SHARE, Pace, Plan, _denser, plan, seconds_of
+from heatsplat.runs.curves import (
     CURVES_FILE,
     Choice,
     Curve,
     Outlook,
-    Pace,
-    Plan,
     Point,
-    _denser,
     curves_of,
     merged,
-    plan,
     read_points,
-    seconds_of,
     write_points,
 )
+from heatsplat.runs.resume import resumed
+from heatsplat.runs.run import begin
+from heatsplat.studies import budget_grid
 from heatsplat.studies.budget_grid import Trained, mean_gaussians, means, picture, tables
 from heatsplat.training.module import SplatTraining
 
@@ -370,21 +367,21 @@ def test_a_budget_needs_the_clock_of_the_costs():
 
 
 def left_by(folder: Path, recipe: dict, step: int, end: float | None) -> dict:
-    """The configuration that goes on in a folder with one checkpoint, of a run that its clock ends at ``end``."""
+    """The configuration of a run in a folder with one checkpoint, of a run that its clock ends at ``end``."""
     (folder / "checkpoints").mkdir(parents=True)
     clock = {} if end is None else {"callbacks": {"BudgetClock": {"from": [0, 0.0], "end": end, "held": None}}}
     torch.save({"global_step": step, "heatsplat": {"recipe": recipe}} | clock, folder / "checkpoints" / "last.ckpt")
-    return cli.begun(recipe, None, folder)
+    return resumed(recipe, folder)
 
 
 def test_a_run_that_was_stretched_or_shrunk_goes_on_until_its_clock_ends_it(tmp_path):
-    plain = cli.resolved(running.compose_run(tmp_path, "method=3dgs", *running.TINY, "max_steps=1000"))
-    plain["trainer"]["max_steps"] = 20_000  # as budgeted leaves room
+    plain = compose(["method=3dgs", *running.TINY, "max_steps=1000"])
+    plain["trainer"]["max_steps"] = 20_000  # as a budget leaves room
     cases = ((1500, 2000.0, True), (2000, 2000.3, False), (600, 600.2, False), (600, 1000.0, True))
     for i, (step, end, goes_on) in enumerate(cases):
-        assert (left_by(tmp_path / str(i), plain, step, end) is not None) == goes_on, (step, end)
+        assert (left_by(tmp_path / str(i), plain, step, end)["ckpt"] is not None) == goes_on, (step, end)
     plain["trainer"]["max_steps"] = 500  # without a budget the trainer ends it
-    assert left_by(tmp_path / "over", plain, 500, None) is None
+    assert left_by(tmp_path / "over", plain, 500, None)["ckpt"] is None
     assert left_by(tmp_path / "stopped", plain, 499, None)["ckpt"].endswith("last.ckpt")
 
 
@@ -497,7 +494,7 @@ def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
 
 def test_options_of_growth_are_where_the_study_sets_them(tmp_path):
     study = running.compose_run(tmp_path, "study=budget", config_name="study").study
-    for method in sorted(path.stem for path in (Path(cli.CONF) / "method").glob("*.yaml")):
+    for method in sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml")):
         density = running.compose_run(tmp_path, f"method={method}").density
         place = "density.recipe" if "recipe" in density else "density"
         assert study.density.get(method, "density") == place, method
@@ -576,7 +573,7 @@ class Hours:
 
     def __init__(self, monkeypatch, slower: float) -> None:
         self.now, self.slower, self.dies_at = 0.0, slower, None
-        for module in ("studies.stepping", "studies.budget", "callbacks.timing"):
+        for module in ("runs.stepping", "runs.budget", "callbacks.timing"):
             monkeypatch.setattr(f"heatsplat.{module}.time", self)
         monkeypatch.setattr(SplatTraining, "training_step", lambda module, *_: self.step(module))
         monkeypatch.setattr(SplatTraining, "on_after_backward", lambda _: None)
@@ -595,6 +592,11 @@ class Hours:
 BLIND = ("method=etgs", *running.TINY, "threads=1", "budget=4s", "trainer.limit_val_batches=0", "test=false")
 
 
+def prepared(folder: Path, *overrides: str) -> dict:
+    """The configuration of a run that is ready to train in a folder."""
+    return begin(compose([*BLIND, *overrides]), folder).config
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("slower", [0.4, 1.0, 2.5])
 def test_whole_runs_end_within_a_tenth_of_their_time_whatever_the_calibration_saw(tmp_path, monkeypatch, slower):
@@ -610,14 +612,12 @@ def test_whole_runs_end_within_a_tenth_of_their_time_whatever_the_calibration_sa
 @pytest.mark.filterwarnings("ignore")
 def test_a_stretched_run_that_died_goes_on_from_its_newest_checkpoint(tmp_path, monkeypatch):
     hours = Hours(monkeypatch, 0.4)
-    config = running.compose_run(tmp_path, *BLIND)
-    data = cli.build(cli.resolved(config)["data"])
-    planned = cli.budgeted(config, data, tmp_path)["max_steps"]
+    planned = prepared(tmp_path)["max_steps"]
     hours.dies_at = round(1.6 * planned)
     with pytest.raises(Died):
         running.run(tmp_path, *BLIND)
     before = hours.now
-    plain = cli.begun(cli.budgeted(config, data, tmp_path), data, tmp_path)
+    plain = prepared(tmp_path)
     stopped = torch.load(plain["ckpt"], weights_only=True)
     assert planned < stopped["global_step"] < hours.dies_at < stopped["callbacks"]["BudgetClock"]["end"]
     assert plain["budget"]["steps"] == plain["max_steps"] and hours.now == before  # not planned anew
@@ -626,9 +626,7 @@ def test_a_stretched_run_that_died_goes_on_from_its_newest_checkpoint(tmp_path, 
     told = again.results.run["budget"]
     assert told["train_s"] + told["calibration_s"] == pytest.approx(4.0, rel=0.03)
     assert again.trainer.global_step == pytest.approx(planned / 0.4, rel=0.1)
-    assert cli.begun(cli.budgeted(config, data, tmp_path), data, tmp_path)["ckpt"] != str(
-        tmp_path / "checkpoints" / "last.ckpt"
-    )  # which is of the end
+    assert prepared(tmp_path)["ckpt"] != str(tmp_path / "checkpoints" / "last.ckpt")  # which is of the end
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -637,10 +635,8 @@ def test_a_budget_is_planned_from_the_curves_that_it_is_pointed_at(tmp_path, mon
     write_points([replace(point, decay=0.4) for point in POINTS], tmp_path / "curves.csv")
     monkeypatch.chdir(tmp_path)
 
-    data = cli.build(cli.resolved(running.compose_run(tmp_path, *BLIND))["data"])
-
     def planned(*overrides):
-        return cli.budgeted(running.compose_run(tmp_path, *BLIND, *overrides), data, tmp_path)
+        return prepared(tmp_path, *overrides)
 
     own, other = planned(), planned("budget_curves=curves.csv")
     assert own["budget_curves"] is None and own["budget"]["decay"] in {
@@ -682,6 +678,5 @@ def test_a_resumed_run_keeps_its_plan(tmp_path):
 
 
 def test_a_budget_and_a_number_of_steps_contradict_each_other(tmp_path):
-    config = running.compose_run(tmp_path, "method=etgs", *running.TINY, "budget=30s", "max_steps=100")
     with pytest.raises(SceneError, match="budget chooses the number of steps, and max_steps gives it"):
-        cli.budgeted(config, None, tmp_path)
+        begin(compose(["method=etgs", *running.TINY, "budget=30s", "max_steps=100"]), tmp_path)

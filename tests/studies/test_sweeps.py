@@ -11,8 +11,8 @@ from commands import succeeds
 from hydra.core.utils import JobReturn, JobStatus
 from running import compose_run
 
-from heatsplat import cli
 from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.runs.resume import NOT_LEARNED
 from heatsplat.studies.published import figures, quoted
 from heatsplat.studies.sweeps import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, collect, row_name, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
@@ -100,7 +100,7 @@ def test_what_makes_no_other_recipe_is_not_in_a_name():
 
 def test_what_runs_may_differ_in_when_they_go_on_and_what_folders_leave_out_makes_no_row():
     known = NOT_A_ROW | NOT_WHAT_WAS_LEARNED
-    assert known >= cli.NOT_LEARNED
+    assert known >= NOT_LEARNED
     train = yaml.safe_load((ROOT / "conf" / "train.yaml").read_text())
     left_out = train["hydra"]["job"]["config"]["override_dirname"]["exclude_keys"]
     assert {key for key in left_out if key not in known and key.partition(".")[0] not in known} == set()

@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from omegaconf import OmegaConf
-from running import TINY, compose_run, run
+from running import TINY, run
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.io.results import RunResults
+from heatsplat.runs.checks import checked
 from heatsplat.training.session import load_checkpoint, restore
 
 SHORT = (*TINY, "max_steps=12", "density=fixed", "trainer.val_check_interval=12", "trainer.limit_test_batches=1")
@@ -79,23 +79,23 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
     stored = load_checkpoint(last)
     recipe = stored["heatsplat"]["recipe"]
     assert "states" not in recipe["effects"] and recipe["thermal"] == recipe["module"]["thermal"]
-    restored = cli.build(recipe["module"], output_dir=str(tmp_path))
+    restored = build(recipe["module"], output_dir=str(tmp_path))
     restored.recipe = recipe
     frame = module.scene.test.frames[0]
-    assert torch.equal(restore(restored, cli.build(recipe["data"]), stored).predict(frame), module.predict(frame))
+    assert torch.equal(restore(restored, build(recipe["data"]), stored).predict(frame), module.predict(frame))
     assert len(scene_says) == 1
     half = tmp_path / "whole" / "checkpoints" / "step_000006.ckpt"
-    resumed, _ = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
+    second, _ = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
     assert len(scene_says) == 1  # the choice is the checkpoint's
-    weights, again = module.state_dict(), resumed.state_dict()
+    weights, again = module.state_dict(), second.state_dict()
     assert weights.keys() == again.keys() and all(torch.equal(weights[name], again[name]) for name in weights)
     for other in ("effects.agc=off", "loss.terms.photometric.dssim_weight=0.9"):
         with pytest.raises(SceneError, match=f"step_000006.ckpt was trained with another {other.partition('=')[0]}"):
             run(tmp_path / "other", *overrides, f"ckpt={half}", other)
     last.unlink()  # as if it had been stopped after step 6
     for more, goes_on in (((), True), (("effects.agc=off",), False)):
-        config = cli.resolved(compose_run(tmp_path / "whole", *overrides, *more))
-        assert (cli.begun(config, cli.build(config["data"]), tmp_path / "whole") is not None) == goes_on
+        config = resumed(checked(compose([*overrides, *more])), tmp_path / "whole")
+        assert (config["ckpt"] is not None) == ("verdicts" in config) == goes_on
 
 
 def test_what_the_choice_would_replace_is_refused(scene_says, tmp_path):
@@ -135,7 +135,6 @@ def test_everything_at_once_trains(scene_says, tmp_path):
     assert found["run"]["parameters"] == sum(parameter.numel() for parameter in module.parameters())
 
 
-def test_a_method_with_parts_of_its_own_cannot_choose(tmp_path):
-    config = OmegaConf.to_container(compose_run(tmp_path, *SHORT, "method=3dgs", "effects=auto"), resolve=True)
+def test_a_method_with_parts_of_its_own_cannot_choose():
     with pytest.raises(SceneError, match="effects=auto chooses the parts of method=auto, but method=3dgs"):
-        cli.with_effects(config, None)
+        checked(compose([*SHORT, "method=3dgs", "effects=auto"]))

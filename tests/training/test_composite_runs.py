@@ -6,7 +6,7 @@ import torch
 from physics.planck_reference import band_radiance
 from running import TINY, compose_run, run
 
-from heatsplat import cli
+from heatsplat.composition import build
 from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.sensors.band_composite import BandComposite
 from heatsplat.sensors.base import Composite
@@ -100,4 +100,4 @@ def test_a_run_blends_what_it_is_told(tmp_path):
 
 def test_the_default_is_that_of_a_module_without_one(tmp_path):
     config = compose_run(tmp_path, "method=etgs")
-    assert type(cli.build(config.composite)) is Composite
+    assert type(build(config.composite)) is Composite

@@ -4,25 +4,25 @@ from pathlib import Path
 
 import pytest
 import torch
-from running import TINY, compose_run, run
+from running import TINY, run
 
-from heatsplat import cli
+from heatsplat.composition import CONF, build, compose
 from heatsplat.contracts import SceneError
-from heatsplat.studies.stepping import Stepper
+from heatsplat.runs.stepping import Stepper
 
 FOUND_OUT = {"auto"}  # its parts depend on the scene
 SAME_MODULE = {"bicubic_3dgs", "lanczos_3dgs", "direct_3dgs"}  # as 3dgs, on other images
-METHODS = sorted({path.stem for path in (Path(cli.CONF) / "method").glob("*.yaml")} - FOUND_OUT - SAME_MODULE)
+METHODS = sorted({path.stem for path in (Path(CONF) / "method").glob("*.yaml")} - FOUND_OUT - SAME_MODULE)
 SHORT = (*TINY, "max_steps=4", "density=fixed", "trainer.val_check_interval=4", "trainer.limit_val_batches=1")
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_first_step_in_float64_is_that_in_float32_but_for_rounding(method, tmp_path):
-    plain = cli.resolved(compose_run(tmp_path, *SHORT, f"method={method}"))
-    scene, slopes, losses = cli.build(plain["data"]).scene, {}, {}
+    plain = compose([*SHORT, f"method={method}"])
+    scene, slopes, losses = build(plain["data"]).scene, {}, {}
     for dtype in ("float32", "float64"):
         stepper = Stepper(
-            cli.build(plain["module"] | {"dtype": dtype}), scene, step=0, max_steps=plain["max_steps"], device="cpu"
+            build(plain["module"] | {"dtype": dtype}), scene, step=0, max_steps=plain["max_steps"], device="cpu"
         )
         module = stepper.module
         assert {str(parameter.dtype) for parameter in module.parameters()} == {f"torch.{dtype}"}
@@ -48,10 +48,10 @@ def test_a_run_in_float64_is_evaluated_and_goes_on_in_float64(tmp_path):
 def test_the_reference_renderer_takes_a_run_in_float64_as_it_is(tmp_path):
     kinds = {}
     for backend in ("cpu", "reference"):
-        plain = cli.resolved(compose_run(tmp_path, *SHORT, "data.downscale=4", "method=3dgs", "dtype=float64"))
+        plain = compose([*SHORT, "data.downscale=4", "method=3dgs", "dtype=float64"])
         plain["module"]["renderer"]["backend"] = backend
-        scene = cli.build(plain["data"]).scene
-        module = cli.build(plain["module"])
+        scene = build(plain["data"]).scene
+        module = build(plain["module"])
         module.attach(scene)
         kinds[backend] = module.predict(scene.train.frames[0])
     assert kinds["cpu"].dtype == kinds["reference"].dtype == torch.float64

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from heatsplat import cli
+from heatsplat import composition
 from heatsplat.training import machine, session
 
 SRC = Path(__file__).resolve().parents[2] / "src"
@@ -31,6 +31,7 @@ def test_where_no_process_can_be_bound_to_cores_all_count(monkeypatch):
 
 
 def test_the_command_line_counts_by_the_same_rule_and_loads_nothing_heavy_for_it():
-    assert cli.cores is machine.cores
-    told = "import sys, heatsplat.cli; sys.exit(bool({'torch', 'numba', 'pytorch_lightning'} & set(sys.modules)))"
+    assert composition.cores is machine.cores
+    heavy = "{'torch', 'numba', 'pytorch_lightning'} & set(sys.modules)"
+    told = f"import sys, heatsplat.cli; heatsplat.compose; sys.exit(bool({heavy}))"
     assert subprocess.run([sys.executable, "-c", told], env={**os.environ, "PYTHONPATH": str(SRC)}).returncode == 0

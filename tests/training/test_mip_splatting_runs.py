@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from running import TINY, compose_run, run
+from running import TINY, run
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.smoothing import sampling_intervals
@@ -50,19 +50,19 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(whole, tmp_path):
 
 def test_a_restored_checkpoint_shows_the_same_image(whole, tmp_path):
     module, _, folder = whole
-    plain = cli.resolved(compose_run(tmp_path, *SHORT))
-    fresh = cli.build(plain["module"], output_dir=str(tmp_path))
+    plain = compose([*SHORT])
+    fresh = build(plain["module"], output_dir=str(tmp_path))
     fresh.recipe = plain
-    restore(fresh, cli.build(plain["data"]), load_checkpoint(folder / "checkpoints" / "last.ckpt"))
+    restore(fresh, build(plain["data"]), load_checkpoint(folder / "checkpoints" / "last.ckpt"))
     frame = module.scene.test.frames[0]
     assert torch.equal(fresh.predict(frame), module.predict(frame))
     assert torch.equal(fresh.smoothing.widths, module.smoothing.widths)
 
 
 def test_without_the_filter_there_is_no_tensor_of_it(tmp_path):
-    plain = cli.resolved(compose_run(tmp_path, *TINY, "method=3dgs"))
-    module = cli.build(plain["module"])
-    module.attach(cli.build(plain["data"]).scene)
+    plain = compose([*TINY, "method=3dgs"])
+    module = build(plain["module"])
+    module.attach(build(plain["data"]).scene)
     assert not [name for name in module.state_dict() if "smoothing" in name]
     scales, opacities = module.splats.scales, module.splats.opacities
     same = module.smoothing(scales, opacities)

@@ -5,11 +5,11 @@ from itertools import pairwise
 
 import pytest
 import torch
-from running import TINY, compose_run, run
+from running import TINY, run
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
-from heatsplat.studies.stepping import Stepper
+from heatsplat.runs.stepping import Stepper
 from heatsplat.training.init import ABSENT
 from heatsplat.training.session import load_checkpoint
 from heatsplat.training.stages import Stages
@@ -34,13 +34,13 @@ ROUNDS = (
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    plain = cli.resolved(compose_run(tmp_path_factory.mktemp("scene"), *SHORT, "method=msmg"))
-    return cli.build(plain["data"]).scene
+    plain = compose([*SHORT, "method=msmg"])
+    return build(plain["data"]).scene
 
 
 def stepper(scene, folder, *overrides):
-    plain = cli.resolved(compose_run(folder, *SHORT, *overrides))
-    return Stepper(cli.build(plain["module"]), scene, step=0, max_steps=plain["max_steps"], device="cpu")
+    plain = compose([*SHORT, *overrides])
+    return Stepper(build(plain["module"]), scene, step=0, max_steps=plain["max_steps"], device="cpu")
 
 
 # One cloud ------------------------------------------------------------------------------------------------------------

@@ -4,17 +4,17 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from running import TINY, compose_run
+from running import TINY
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 
 SCENE = (*TINY, "synthetic_preset=haze")
 
 
 def prepared(tmp_path, *overrides):
-    plain = cli.resolved(compose_run(tmp_path, *SCENE, *overrides))
-    module = cli.build(plain["module"])
-    module.attach(cli.build(plain["data"]).scene)
+    plain = compose([*SCENE, *overrides])
+    module = build(plain["module"])
+    module.attach(build(plain["data"]).scene)
     return module
 
 

@@ -9,7 +9,7 @@ from running import compose_run, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from weathered import make_scene
 
-from heatsplat.cli import CONF
+from heatsplat.composition import CONF
 from heatsplat.contracts import SceneError
 from heatsplat.io.ply import write_splats
 from heatsplat.splats import GEOMETRY

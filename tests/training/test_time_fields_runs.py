@@ -2,18 +2,18 @@
 
 import pytest
 import torch
-from running import TINY, compose_run
+from running import TINY
 
-from heatsplat import cli
+from heatsplat.composition import build, compose
 
 ALL_HEADS = "thermal.heads=[means,scales,rotations,opacity,radiance]"
 RECIPES = [("method=thermalgs",), ("method=hexplane_4dgs",), ("method=hexplane_4dgs", ALL_HEADS)]
 
 
 def prepared(tmp_path, *overrides):
-    plain = cli.resolved(compose_run(tmp_path, *TINY, "synthetic_preset=cooling", "max_steps=1000", *overrides))
-    module = cli.build(plain["module"])
-    module.attach(cli.build(plain["data"]).scene)
+    plain = compose([*TINY, "synthetic_preset=cooling", "max_steps=1000", *overrides])
+    module = build(plain["module"])
+    module.attach(build(plain["data"]).scene)
     return module
 
 

@@ -39,7 +39,7 @@ class BudgetClock(pl.Callback):
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its clock.
 
     Args:
-        plan: the plan (``heatsplat.studies.budget.Plan.as_dict``).
+        plan: the plan (``heatsplat.runs.budget.Plan.as_dict``).
         twice: what twice the time would buy, in a sentence.
     """
 
@@ -168,7 +168,7 @@ class BudgetClock(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        # The command line reads the end: a run that is over is not gone on with (``heatsplat.cli.begun``).
+        # What is over is not gone on with (``heatsplat.runs.resume``).
         return {"from": list(self._from), "end": self._end, "held": self._held}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -227,7 +227,7 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
 
 
 def told(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Verdicts as plain containers, with what the effects add where that was measured (``studies.prices``)."""
+    """Verdicts as plain containers, with what the effects add where that was measured (``runs.prices``)."""
     return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
 
 

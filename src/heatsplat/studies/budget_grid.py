@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
-from heatsplat.studies.budget import Curve, Point, curves_of, merged, read_points, write_points
+from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
 from heatsplat.studies.child_runs import trained
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from heatsplat.contracts import SceneData
-from heatsplat.studies.stepping import Stepper
+from heatsplat.runs.stepping import Stepper
 
 WARM_UP = 2  # steps of each model that are not timed: kernels compile and memory is found
 ROUNDS = (3, 15)  # fewest and most

@@ -1,33 +1,34 @@
 """Budget in, best recipe out: steps, Gaussians and learning rates that make the most of so many seconds of training.
 
-Three measurements meet. Curves say how well a method does after so many steps with so many Gaussians; they hold no
-seconds, so they travel between machines. A calibration of a few steps says what a step costs here, on this scene, with few
-and with many Gaussians. The plan is the measured choice that scores best in the time. docs/budget.md tells the rest.
+Three measurements meet. Curves (``heatsplat.runs.curves``) say how well a method does after so many steps with so many
+Gaussians. A calibration of a few steps says what a step costs here, on this scene, with few and with many Gaussians. The plan
+is the measured choice that scores best in the time. docs/budget.md tells the rest.
 """
 
 from __future__ import annotations
 
-import csv
-import io
+import logging
 import math
 import re
 import statistics
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
 
+from heatsplat.composition import build, compose, keys_of
 from heatsplat.contracts import SceneData, SceneError
-from heatsplat.io.results import write_atomically
-from heatsplat.studies.stepping import Stepper
+from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
+from heatsplat.runs.stepping import Stepper, device_of
+from heatsplat.runs.verdicts import filled
 from heatsplat.training.rng import generator_for
 
-CURVES_FILE = Path(__file__).with_name("budget_curves.csv")
+log = logging.getLogger("heatsplat")
+
 UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 MIN_STEPS = 100  # below, the schedule loses its shape: growth, which comes every 50 steps or more, has no time
 CALIBRATION_SHARE = 0.05  # of the budget at most
@@ -37,9 +38,6 @@ CALIBRATION_VIEWS = 20  # that take turns in them
 WARM_UP = 2  # steps before them: kernels compile and memory is found
 HEADROOM = 20  # a run has room for so many times its planned steps: where the pace was misjudged, it may need them
 DENSER = 4  # the second size of the calibration, in Gaussians of the start
-
-
-# Asking -------------------------------------------------------------------------------------------------------------
 
 
 def seconds_of(budget: str | float) -> float:
@@ -54,205 +52,6 @@ def seconds_of(budget: str | float) -> float:
             f"budget={budget} is no time; write seconds, or a number with s, min or h: 120, 120s, 2min, 1h"
         )
     return float(match[1]) * UNITS[match[2]]
-
-
-# Curves: what steps and Gaussians are worth ---------------------------------------------------------------------------
-
-
-class Choice(NamedTuple):
-    """Knobs besides the number of steps: cap on the Gaussians in those of the start, and ``optim.decay``."""
-
-    growth: float
-    decay: float
-
-
-@dataclass(frozen=True)
-class Point:
-    """The end of one measured run, or the mean of several with different seeds.
-
-    Args:
-        method, scene: what was reconstructed and how.
-        steps: length of the run.
-        growth: cap on the Gaussians in Gaussians of the start; infinity where nothing but the scene bounds them.
-        mean_growth: Gaussians in the mean over the run's steps, in Gaussians of the start.
-        psnr: of the test views at full resolution, dB.
-        seeds: runs behind the mean.
-        decay: share of the decay of the learning rates, ``optim.decay``.
-    """
-
-    method: str
-    scene: str
-    steps: int
-    growth: float
-    mean_growth: float
-    psnr: float
-    seeds: int = 1
-    decay: float = 1.0
-
-    @property
-    def choice(self) -> Choice:
-        """What a plan may choose."""
-        return Choice(self.growth, self.decay)
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Scores and Gaussians over the length of a run, for one scene and one cap; points in order of their steps."""
-
-    points: tuple[Point, ...]
-
-    def psnr(self, steps: float) -> float:
-        """Expected PSNR in dB; see ``_at``."""
-        return self._at(steps, "psnr")
-
-    def mean_growth(self, steps: float) -> float:
-        """Expected Gaussians in the mean over the run, in those of the start; never fewer than there or in a measured run."""
-        return max(self._at(steps, "mean_growth"), min(1.0, *(point.mean_growth for point in self.points)))
-
-    def _at(self, steps: float, name: str) -> float:
-        """Straight between measured points over log steps; beyond the last one the slope halves with every doubling."""
-        x = [math.log2(point.steps) for point in self.points]
-        y = [getattr(point, name) for point in self.points]
-        at = math.log2(max(steps, 1.0))
-        if len(x) == 1:
-            return y[0]
-        if at > x[-1]:
-            slope = (y[-1] - y[-2]) / (x[-1] - x[-2])
-            return y[-1] + slope * (1.0 - 2.0 ** (x[-1] - at)) / math.log(2.0)
-        i = next((i for i in range(1, len(x)) if at <= x[i]), len(x) - 1)
-        share = (at - x[i - 1]) / (x[i] - x[i - 1])
-        return y[i - 1] + share * (y[i] - y[i - 1])
-
-    @property
-    def last(self) -> int:
-        """The longest measured run, in steps."""
-        return self.points[-1].steps
-
-
-def read_points(path: Path = CURVES_FILE) -> list[Point]:
-    """The measured points of a curves file.
-
-    Raises:
-        SceneError: the file is not one, or empty.
-    """
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            points = [
-                Point(
-                    row["method"],
-                    row["scene"],
-                    int(row["steps"]),
-                    float(row["growth"]),
-                    float(row["mean_growth"]),
-                    float(row["psnr"]),
-                    int(row["seeds"]),
-                    float(row["decay"]),
-                )
-                for row in csv.DictReader(file)
-            ]
-        if not points:
-            raise ValueError("it has no rows")
-        if not all(min(p.steps, p.growth, p.mean_growth) > 0 and math.isfinite(p.psnr) for p in points):
-            raise ValueError("steps, growth and mean_growth must be above zero, psnr finite")
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        raise SceneError(
-            f"{path} holds no curves: {error!r}. Measure them with python src/study.py study=budget, which writes them to "
-            "study.curves=FILE; runs read them from budget_curves=FILE, and without it those that come with heatsplat"
-        ) from error
-    return points
-
-
-def merged(kept: Iterable[Point], measured: Iterable[Point]) -> list[Point]:
-    """The points of both; where the same run was measured anew, the new one."""
-
-    def key(point: Point) -> tuple[str, ...]:  # numbers as a file holds them
-        return point.method, point.scene, str(point.steps), f"{point.growth:.3g}", f"{point.decay:.3g}"
-
-    return list(({key(point): point for point in kept} | {key(point): point for point in measured}).values())
-
-
-def write_points(points: Iterable[Point], path: Path) -> None:
-    """Writes a curves file, in one order whatever that of ``points``."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(Point.__dataclass_fields__), lineterminator="\n")
-    writer.writeheader()
-    for point in sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps)):
-        writer.writerow(
-            asdict(point)
-            | {"psnr": f"{point.psnr:.3f}"}
-            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay")}
-        )
-    write_atomically(path, text.getvalue())
-
-
-def curves_of(points: Iterable[Point]) -> dict[tuple[str, str], dict[Choice, Curve]]:
-    """(method, scene) -> choice -> curve, in one order whatever that of ``points``."""
-    curves: dict[tuple[str, str], dict[Choice, list[Point]]] = {}
-    for point in sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps)):
-        curves.setdefault((point.method, point.scene), {}).setdefault(point.choice, []).append(point)
-    return {scene: {choice: Curve(tuple(own)) for choice, own in choices.items()} for scene, choices in curves.items()}
-
-
-class Outlook:
-    """What choices promise after so many steps, where not every scene measured every choice.
-
-    Scenes are compared with themselves only, or a choice would win for having been measured where all goes well. Each says
-    what a choice gains over the *usual* one there after as many steps; a scene that did not measure the choice is taken to
-    gain what the others gained in the mean. So every choice that was measured anywhere beside the usual one takes part, and
-    where all scenes measured all choices, what comes out is their mean. Gains are differences for PSNR and ratios for
-    Gaussians, of which there are never more than the cap.
-
-    The usual choice is the one that most scenes measured; of several, that with the most Gaussians, then with the whole decay.
-    What was measured at one length only says nothing of others, and counts where there is nothing better.
-
-    Args:
-        points: measured points, at least one.
-    """
-
-    def __init__(self, points: Iterable[Point]) -> None:
-        curves = curves_of(points)
-        least = min(2, max(len(curve.points) for choices in curves.values() for curve in choices.values()))
-        able = {
-            scene: {choice: curve for choice, curve in choices.items() if len(curve.points) >= least}
-            for scene, choices in curves.items()
-        }
-        counts = Counter(choice for choices in able.values() for choice in choices)
-        self.usual = max(counts, key=lambda choice: (counts[choice], *choice))
-        self._scenes = {scene: choices for scene, choices in able.items() if self.usual in choices}
-        self.choices = sorted({choice for choices in self._scenes.values() for choice in choices})
-
-    def psnr(self, choice: Choice, steps: float) -> float:
-        """Expected PSNR in dB, in the mean over the scenes."""
-        usual = statistics.fmean(choices[self.usual].psnr(steps) for choices in self._scenes.values())
-        if choice == self.usual:
-            return usual
-        return usual + statistics.fmean(
-            own.psnr(steps) - choices[self.usual].psnr(steps) for own, choices in self._measured(choice)
-        )
-
-    def mean_growth(self, choice: Choice, steps: float) -> float:
-        """Expected Gaussians in the mean over the run, in those of the start, in the mean over the scenes."""
-        ratio = statistics.fmean(
-            own.mean_growth(steps) / choices[self.usual].mean_growth(steps) for own, choices in self._measured(choice)
-        )
-        least = min(choice.growth, 1.0)  # a run starts with them
-        return statistics.fmean(
-            choices[choice].mean_growth(steps)
-            if choice in choices
-            else min(max(ratio * choices[self.usual].mean_growth(steps), least), choice.growth)
-            for choices in self._scenes.values()
-        )
-
-    def last(self, choice: Choice) -> int:
-        """The longest run that was measured with the choice, in steps."""
-        return max(own.last for own, _ in self._measured(choice))
-
-    def missing(self, choice: Choice) -> list[str]:
-        """The "method/scene" that did not measure the choice."""
-        return [f"{method}/{scene}" for (method, scene), choices in self._scenes.items() if choice not in choices]
-
-    def _measured(self, choice: Choice) -> list[tuple[Curve, dict[Choice, Curve]]]:
-        return [(choices[choice], choices) for choices in self._scenes.values() if choice in choices]
 
 
 # Calibration: what a step costs here ----------------------------------------------------------------------------------
@@ -492,3 +291,62 @@ def plan(
         step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),
     )
+
+
+# The run ------------------------------------------------------------------------------------------------------------
+
+
+def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
+    """The configuration of a run that makes the most of ``budget`` seconds; the same without a budget.
+
+    "budget" then holds the plan, made from the curves in the file ``budget_curves`` (None: those of the package); where it
+    holds one already, of an earlier run, that is kept. The trainer has room for more steps than planned, which
+    ``BudgetClock`` may use.
+    """
+    asked = config["budget"]
+    if asked is None:
+        return config
+    made = Plan.from_dict(asked) if isinstance(asked, Mapping) else _measured(config, scene)
+    decay = [] if made.decay is None else [f"optim.decay={made.decay}"]
+    caps = [f"{group}.cap_max={made.cap}" for group in _growing(config, "cap_max")]
+    resets = [
+        f"{group}.reset_every=null" for group in _growing(config, "reset_every")
+    ]  # as in the runs behind the curves
+    resets = [text for text in resets if text.partition("=")[0] not in keys_of(config["overrides"])]
+    planned = [f"max_steps={made.steps}", f"trainer.max_steps={HEADROOM * made.steps}", *caps, *decay, *resets]
+    overrides = config["overrides"]
+    config = _followed(config, compose(overrides), compose([*overrides, *planned]))
+    clock = {"_target_": "heatsplat.callbacks.budget.BudgetClock", "plan": made.as_dict(), "twice": made.twice()}
+    return config | {
+        "overrides": overrides,
+        "budget": made.as_dict(),
+        "callbacks": config["callbacks"] | {"budget": clock},
+    }
+
+
+def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
+    points = read_points(Path(config["budget_curves"] or CURVES_FILE))
+    log.info("measuring what a step costs here")
+    module, seconds = filled(config)["module"], config["budget"]
+    device = device_of(config["trainer"]["accelerator"])
+    pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
+    density = config["density"]
+    cap_max = density.get("cap_max", density.get("recipe", {}).get("cap_max"))
+    made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(config["overrides"]))
+    for line in made.lines():
+        log.info("%s", line)
+    return made
+
+
+def _growing(config: Mapping[str, Any], setting: str) -> list[str]:
+    """Where density control has a setting that is not null: "density", "density.recipe" or both."""
+    groups = {"density": config["density"], "density.recipe": config["density"].get("recipe", {})}
+    return [name for name, settings in groups.items() if settings.get(setting) is not None]
+
+
+def _followed(config: Any, before: Any, after: Any) -> Any:
+    """A configuration with the changes that lead from ``before`` to ``after``, and all else as it is."""
+    if not isinstance(config, Mapping) or not isinstance(after, Mapping):
+        return after
+    changed = {key for key in after if before.get(key) != after[key]}
+    return {**config, **{key: _followed(config.get(key), before.get(key), after[key]) for key in changed}}

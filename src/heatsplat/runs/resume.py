@@ -1,0 +1,110 @@
+"""Where a run goes on: from a checkpoint that it was given, or from where one with the same settings stopped in its folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from heatsplat.contracts import SceneError
+from heatsplat.effects import assembly
+from heatsplat.training.module import CHECKPOINT_KEY
+from heatsplat.training.session import load_checkpoint
+
+log = logging.getLogger("heatsplat")
+
+# What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
+NOT_LEARNED = {"threads", "ckpt", "row", "table", "test", "trainer", "callbacks", "logger"}
+
+
+def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
+    """The configuration with what an earlier run measured for it, and with ``ckpt``, where there is one to go on from.
+
+    "verdicts" are those on its scene; "budget" is its plan. A checkpoint of the last step of a run is not gone on from, for
+    there would be no step left in which the cost could be measured.
+
+    Args:
+        config: as composed and checked.
+        output_dir: folder of the run.
+
+    Raises:
+        SceneError: the checkpoint that was given is none, or of a run with another budget or other effects.
+    """
+    if config["ckpt"] is not None:
+        return _continued(config, _recipe(load_checkpoint(config["ckpt"])))
+    for path, checkpoint in checkpoints_in(output_dir):
+        stored = _recipe(checkpoint)
+        changed = differences(config, stored)
+        if changed:
+            log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
+            break
+        config = config | {key: stored[key] for key in ("verdicts", "budget") if key in stored}
+        if checkpoint["global_step"] < planned_end(checkpoint):
+            log.info("going on from step %d of %s", checkpoint["global_step"], path)
+            return config | {"ckpt": str(path)}
+    return config
+
+
+def checkpoints_in(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Checkpoints in a run's folder with their paths, newest first; those that cannot be read are passed over, with a word."""
+    paths = (output_dir / "checkpoints").glob("*.ckpt")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
+        try:
+            yield path, load_checkpoint(path)
+        except SceneError as error:  # a disk that was full
+            log.warning("%s", error)
+
+
+def planned_end(checkpoint: Mapping[str, Any]) -> int:
+    """The last step that the run of a checkpoint was heading for."""
+    clock = checkpoint.get("callbacks", {}).get("BudgetClock")  # it moves the end
+    return round(clock["end"]) if clock else _recipe(checkpoint)["trainer"]["max_steps"]
+
+
+def differences(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
+    """Dotted keys of what is learned and how in which a composed configuration differs from that of a finished one.
+
+    What came of it later (steps of a budget, parts that verdicts chose) does not count: ``completed`` says what was composed.
+    """
+    before = {**stored, **stored.get("composed", {})}
+    learned = sorted(config.keys() - NOT_LEARNED - {"overrides"})
+    keys = [key for name in learned for key in _differing(name, config[name], before.get(name))]
+    return [key for key in keys if key.removeprefix("module.") == key or key.removeprefix("module.") not in keys]
+
+
+def completed(config: dict[str, Any], composed: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with what it was ``composed`` as, under that key, where it has become something else."""
+    return config | {"composed": {key: value for key, value in composed.items() if config[key] != value}}
+
+
+def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for name in sorted(one.keys() | other.keys()):
+            yield from _differing(f"{key}.{name}", one.get(name), other.get(name))
+    elif one != other:
+        yield key
+
+
+def _recipe(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    return checkpoint.get(CHECKPOINT_KEY, {}).get("recipe", {})
+
+
+def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration with what was measured for the run of the checkpoint that it was given."""
+    ckpt, asked, plan = config["ckpt"], config["budget"], stored.get("budget")
+    if asked is not None:
+        if plan is None:
+            raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
+        if plan["asked_s"] != asked:
+            raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
+        config = config | {"budget": plan}
+    if "verdicts" in stored and assembly.chooses(config):
+        changed = assembly.changed(config, stored)
+        if changed:
+            raise SceneError(
+                f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "
+                "without ckpt"
+            )
+        config = config | {"verdicts": stored["verdicts"]}
+    return config

@@ -1,0 +1,184 @@
+"""One run: its configuration made ready step by step, its parts built from it, training, and what is made of a checkpoint.
+
+A configuration is a dict of plain containers, and every step of ``begin`` returns another one.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from heatsplat.composition import build, scene_name
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.runs.budget import budgeted
+from heatsplat.runs.checks import checked
+from heatsplat.runs.resume import completed, resumed
+from heatsplat.runs.verdicts import decided, filled
+from heatsplat.shots import at_time, first_free_id
+from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
+from heatsplat.training.session import fit, load_checkpoint, prepare_machine, restore
+
+log = logging.getLogger("heatsplat")
+
+
+@dataclass(frozen=True)
+class Run:
+    """The parts of a run, built.
+
+    Args:
+        config: what they were built from; its ``ckpt`` is where training goes on.
+        module, data, trainer: Lightning's.
+    """
+
+    config: dict[str, Any]
+    module: SplatTraining
+    data: Any
+    trainer: Any
+
+
+def train(config: dict[str, Any], output_dir: Path | str | None = None) -> RunResults:
+    """Trains a method on a scene, tests it and writes the report; what was measured.
+
+    A run that was stopped in this folder goes on from its last checkpoint; one that is finished is not trained again.
+
+    Args:
+        config: of ``heatsplat.compose``.
+        output_dir: folder of the run; None for outputs/<method>_<scene>/<time> in the working directory.
+
+    Raises:
+        SceneError: the configuration or the scene cannot be trained, with the remedy.
+    """
+    if output_dir is None:
+        data = config["data"]
+        scene = scene_name("data", data.get("root"), data.get("scene"))
+        output_dir = Path("outputs") / f"{config['name']}_{scene}" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
+    output_dir = Path(output_dir)
+    if (output_dir / METRICS_FILE).exists():
+        log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
+        return RunResults.read(output_dir / METRICS_FILE)
+    run = begin(config, output_dir)
+    return fit(run.module, run.data, run.trainer, ckpt=run.config["ckpt"], test=run.config["test"])
+
+
+def begin(config: dict[str, Any], output_dir: Path) -> Run:
+    """A run that is ready to train."""
+    prepare_machine(config["threads"])
+    config = composed = checked(config)
+    config = resumed(config, output_dir)
+    data = build(config["data"])
+    config = decided(config, data.scene)
+    config = budgeted(config, data.scene)
+    config = filled(config)
+    config = completed(config, composed)
+    module = build_module(config, output_dir)
+    return Run(config, module, data, build_trainer(config["trainer"], config, output_dir))
+
+
+def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
+    """The training module that a configuration describes, which takes it into its checkpoints."""
+    module = build(config["module"], output_dir=str(output_dir))
+    module.recipe = config  # set, not passed: Hydra would build every part in it once more
+    return module
+
+
+def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
+    """The trainer of a configuration, with the callbacks and the logger of ``watching``, which write into the run's folder."""
+    logger = watching["logger"] and build({**watching["logger"], "save_dir": str(output_dir)})
+    callbacks = build_callbacks(watching["callbacks"], output_dir)
+    return build(dict(trainer), callbacks=callbacks, logger=logger, default_root_dir=str(output_dir))
+
+
+def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]:
+    """The callbacks that are on; ``callbacks.<name>=null`` leaves one out. Where one writes lies in the run's folder."""
+    on = {name: dict(settings) for name, settings in callbacks.items() if settings is not None}
+    for settings in on.values():
+        if "dirpath" in settings:
+            settings["dirpath"] = str(output_dir / settings["dirpath"])
+    return list(build(on).values())
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained scene, to look at from anywhere and at any time.
+
+    Args:
+        config: of the run, with the data that were asked for in place of its own.
+        module: with the weights of the checkpoint.
+        data: its data module.
+        checkpoint: all of it.
+    """
+
+    config: dict[str, Any]
+    module: SplatTraining
+    data: Any
+    checkpoint: dict[str, Any]
+
+    @property
+    def scene(self) -> SceneData:
+        """Its training, validation and test views, thermal range and metadata."""
+        return self.data.scene
+
+    def render(self, camera: Camera | Frame, time_s: float | None = None) -> Tensor:
+        """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
+
+        Args:
+            camera: where from; a frame of the scene (``scene.test.frames[0]``) has a camera and a time of its own.
+            time_s: seconds since the first training frame; None for the frame's own.
+
+        Raises:
+            SceneError: the scene's weather is not known at that time.
+        """
+        frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
+        frame = frame if time_s is None else at_time(self.scene, frame, time_s)
+        image = self.module.predict(frame)[..., 0].cpu()
+        return image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
+
+
+def load(
+    checkpoint: Path | str | None,
+    data: Mapping[str, Any] | None = None,
+    weather: Path | str | None = None,
+    weather_zone: str | None = None,
+    output_dir: Path | str = ".",
+) -> Trained:
+    """The trained scene of a checkpoint.
+
+    Args:
+        checkpoint: such as outputs/<run>/checkpoints/last.ckpt.
+        data: settings of the data that differ from training, such as {"root": "/elsewhere"}; None values keep theirs.
+        weather: table of another weather for the scene's place and times.
+        weather_zone: zone of its times where they have no offset.
+        output_dir: folder for what is measured of it.
+
+    Raises:
+        SceneError: there is no checkpoint of a run, or its method or data set has no weather to change.
+    """
+    if checkpoint is None:
+        raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
+    loaded = load_checkpoint(checkpoint)
+    if CHECKPOINT_KEY not in loaded:
+        raise SceneError(f"{checkpoint} was not written by heatsplat")
+    config = loaded[CHECKPOINT_KEY]["recipe"]
+    changed = {key: value for key, value in (data or {}).items() if value is not None}
+    if "root" in changed:
+        changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    if "weather" in changed and "weather" not in config["data"]:
+        raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
+    module = build_module(config, Path(output_dir))
+    if weather is not None and "weather" not in module.thermal.needs:
+        raise SceneError(
+            f"weather={weather} changes nothing: {type(module.thermal).__name__} does not use weather. Train a method that "
+            "does, or leave weather out."
+        )
+    scene_data = build(config["data"] | changed)
+    if weather is not None:
+        scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
+    restore(module, scene_data, loaded)
+    return Trained(config, module, scene_data, loaded)

@@ -1,0 +1,64 @@
+"""Which effects a run simulates, where its configuration leaves that to the scene."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any
+
+from heatsplat.composition import build
+from heatsplat.contracts import SceneData
+from heatsplat.effects import assembly
+from heatsplat.effects.base import Verdict
+from heatsplat.runs.prices import prices
+from heatsplat.runs.stepping import device_of
+
+log = logging.getLogger("heatsplat")
+
+
+def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
+    """The configuration with "verdicts": on every effect, why, and what each that is on costs (unless effects.price=false).
+
+    The same configuration where nothing is left to be chosen, or an earlier run has chosen.
+    """
+    if "verdicts" in config or not assembly.chooses(config):
+        return config
+    verdicts, costs = decide_effects(config["effects"], scene), {}
+    if config["effects"]["price"]:
+
+        def maker(chosen: Mapping[str, Verdict]) -> Callable[[], Any]:
+            return lambda: build(filled(config | {"verdicts": assembly.told(chosen, {})})["module"])
+
+        on = [name for name, verdict in verdicts.items() if verdict.on]
+        leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
+        log.info("measuring what each of %d effects costs", len(on))
+        costs = prices(
+            maker(verdicts), leaving, scene, config["max_steps"], device_of(config["trainer"]["accelerator"])
+        )
+    found = assembly.told(verdicts, costs)
+    for line in assembly.lines(found):
+        log.info("%s", line)
+    return config | {"verdicts": found}
+
+
+def decide_effects(effects: Mapping[str, Any], scene: SceneData) -> dict[str, Verdict]:
+    """Verdicts on all effects in a scene that can be simulated together, as the group "effects" of a configuration wishes."""
+    from heatsplat.effects.catalogue import (
+        decide,  # here, because it is many modules and most runs leave nothing to choose
+    )
+
+    log.info("looking at scene %s for the effects that it calls for", scene.name)
+    seen = decide(scene, assembly.wishes(effects))
+    return assembly.reconciled(assembly.possible(seen, scene), assembly.explicit(effects))
+
+
+def filled(config: dict[str, Any]) -> dict[str, Any]:
+    """The configuration with thermal model, sensor and loss as its verdicts choose them; the same without verdicts."""
+    if "verdicts" not in config:
+        return config
+    names = [field.name for field in fields(Verdict)]
+    verdicts = {
+        name: Verdict(**{key: said[key] for key in names if key in said}) for name, said in config["verdicts"].items()
+    }
+    return assembly.filled(config, assembly.recipe(verdicts, config["effects"]), config["verdicts"])
