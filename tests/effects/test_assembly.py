@@ -17,6 +17,16 @@ from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.runs.prices import Price
 
 
+EFFECTS = {effect.name: effect for effect in CATALOGUE}
+
+
+def simulated_by(slot):
+    return [effect.name for effect in CATALOGUE if effect.part.slot == slot]
+
+
+ON_THE_WAY, SENSOR = simulated_by("path"), simulated_by("camera")
+
+
 @cache
 def config(*overrides):
     return OmegaConf.to_container(compose_run(Path("unused"), "data.size=tiny", *overrides), resolve=True)
@@ -66,15 +76,15 @@ def test_conduction_wraps_the_state():
     assert found["state"] == recipe("relaxation")["thermal"]["state"]
 
 
-@pytest.mark.parametrize("name", assembly.ON_THE_WAY)
+@pytest.mark.parametrize("name", ON_THE_WAY)
 def test_a_part_stands_in_the_recipe_exactly_when_its_effect_is_on(name):
     everything = recipe(*assembly.NAMES)["thermal"]["parts"]
-    assert list(everything) == list(assembly.ON_THE_WAY)
+    assert list(everything) == ["view_dependence", "reflection", "attenuation"]
     assert list(recipe(name)["thermal"]["parts"]) == [name]
 
 
 def test_light_meets_the_camera_in_order_and_pattern_and_falloff_are_two_effects_of_one_part():
-    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == list(assembly.CAMERA)
+    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == ["point_spread", "calibration", "frame_offset", "agc", "tone"]
     pattern, falloff = (recipe(name)["sensor"]["parts"]["calibration"] for name in ("fixed_pattern", "vignetting"))
     assert pattern["vignetting_max"] == 0 < pattern["gain_max"] and pattern["bias_max"] > 0
     assert falloff["vignetting_max"] > 0 == falloff["gain_max"] == falloff["bias_max"]
@@ -139,17 +149,17 @@ def test_the_selection_of_supirgs_has_its_camera():
 
 def test_every_selection_of_one_effect_can_be_built():
     for name in assembly.NAMES:
-        found = recipe(*{name, assembly.STANDS_ON.get(name, name)})
+        found = recipe(*{name, EFFECTS[name].stands_on or name})
         thermal, sensor = build(found["thermal"]), build(found["sensor"])
-        assert thermal.modality == "thermal" and len(sensor.parts) == (name in assembly.SENSOR)
+        assert thermal.modality == "thermal" and len(sensor.parts) == (name in SENSOR)
         simulated = set(sensor.effects())
-        assert simulated == ({name} if name in assembly.SENSOR else set())
+        assert simulated == ({name} if name in SENSOR else set())
 
 
 def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
-    thermal = build(recipe(*set(assembly.NAMES) - set(assembly.WEATHER_DRIVEN))["thermal"])
+    thermal = build(recipe(*set(assembly.NAMES) - {"solar", "radiation", "convection"})["thermal"])
     assert set(thermal.effects()) <= set(assembly.NAMES)
-    assert {"relaxation", "conduction", *assembly.ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
+    assert {"relaxation", "conduction", *ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
 
 
 # Verdicts that fit together -------------------------------------------------------------------------------

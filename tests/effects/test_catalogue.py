@@ -11,7 +11,7 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 
 NAMES = (
     "relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction", "view_dependence", "reflection",
-    "attenuation", "thermal_opacity", "frame_offset", "agc", "fixed_pattern", "vignetting", "tone", "point_spread",
+    "attenuation", "thermal_opacity", "point_spread", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
 )  # fmt: skip
 
 

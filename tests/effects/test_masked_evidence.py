@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
-from heatsplat.effects.evidence.blur import point_spread
-from heatsplat.effects.evidence.conduction import _kept
-from heatsplat.effects.evidence.see_through import _nearer
+from heatsplat.effects.look import Look
 from heatsplat.effects.noise import noise_of, noise_of_repeats
 from heatsplat.effects.observations import observe
+from heatsplat.effects.physical.conduction import _kept
+from heatsplat.effects.physical.point_spread import evidence as point_spread
+from heatsplat.effects.physical.thermal_opacity import _nearer
 
 HEIGHT, WIDTH, NOISE = 48, 64, 0.01
 
@@ -59,9 +60,9 @@ def test_observations_leave_out_what_does_not_count():
 
 def test_the_border_of_a_mask_is_no_edge_of_the_scene():
     images, masks = filled(6)
-    evidence = point_spread(observe(scene([torch.eye(4)] * 6, images, masks)))
+    evidence = point_spread(Look(scene([torch.eye(4)] * 6, images, masks)))
     assert evidence.statistic is None and evidence.reason.startswith("only 0 edges")
-    assert "only 0 edges" not in point_spread(observe(scene([torch.eye(4)] * 6, images))).reason
+    assert "only 0 edges" not in point_spread(Look(scene([torch.eye(4)] * 6, images))).reason
 
 
 def test_a_tripod_that_a_reconstruction_shakes_a_little_stands_still():

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
-from heatsplat.effects.base import WISHES, Verdict
+from heatsplat.effects.base import SLOTS, WISHES, Effect, Verdict
+from heatsplat.effects.catalogue import CATALOGUE
 
-STATE = ("relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction")
-ON_THE_WAY = ("view_dependence", "reflection", "attenuation")  # in the order in which heat meets them
-SENSOR = ("frame_offset", "agc", "fixed_pattern", "vignetting", "tone", "point_spread")
-NAMES = (*STATE, *ON_THE_WAY, "thermal_opacity", *SENSOR)
-WEATHER_DRIVEN = ("solar", "radiation", "convection")
-# An effect that acts on a changing temperature, and what makes it change.
-STANDS_ON = dict.fromkeys(("harmonic_source", "conduction", *WEATHER_DRIVEN), "relaxation")
-# Parts of the camera in the order in which light meets them, each with the effects that it simulates.
-CAMERA = {
-    "point_spread": ("point_spread",),
-    "calibration": ("fixed_pattern", "vignetting"),
-    "frame_offset": ("frame_offset",),
-    "agc": ("agc",),
-    "tone": ("tone",),
-}
+NAMES = tuple(effect.name for effect in CATALOGUE)
 SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each wishes of an effect of which nothing is said
 PAPERS = "etgs, ravigs, ti3dgs, thermogs, supirgs"  # selections of the group "effects" that are a paper's
 SCENE_SAYS = "scene"  # value of a setting that the evidence chooses; without evidence it is the class's own default
@@ -88,22 +75,20 @@ def chooses(config: Mapping[str, Any]) -> bool:
 
 
 def possible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
-    """The verdicts, without an opacity for each image where a view has only one image."""
+    """The verdicts, with those effects off for which the scene lacks more than metadata."""
     found = dict(verdicts)
-    if found["thermal_opacity"].on:
-        views = (view for part in (scene.train, scene.val, scene.test) for view in part)
-        bare = next((view.frame.name for view in views if view.rgb is None), None)
-        if bare is not None:
-            reason = f"view {bare} has no visible image, which every view needs"
-            found["thermal_opacity"] = replace(found["thermal_opacity"], on=False, reason=reason)
+    for name in _on(verdicts):
+        reason = _effect(name).missing(scene)
+        if reason is not None:
+            found[name] = replace(found[name], on=False, reason=reason)
     return found
 
 
 def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None = None) -> dict[str, Verdict]:
     """Verdicts that can be simulated together, in the order of NAMES; what was changed says so in its reason.
 
-    The heat source of harmonics stands for drivers that nobody recorded: where recorded weather drives the scene it goes,
-    unless it was asked for and the weather was not. What acts on a changing temperature needs relaxation.
+    Of effects that exclude each other the one goes that the others displace, unless it was asked for and they were not.
+    Then each effect brings what it stands on, or goes with it where that was refused.
 
     Args:
         verdicts: one for every name.
@@ -126,13 +111,16 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
     for name, wish in given.items():
         if wish == "on" and not found[name].on:
             raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}; add that, or leave it out")
-    driven = [name for name in WEATHER_DRIVEN if found[name].on]
-    if driven and found["harmonic_source"].on:
-        wanted = given.get("harmonic_source") == "on" and not any(given.get(name) == "on" for name in driven)
-        for name in driven if wanted else ["harmonic_source"]:
-            turn(name, False, "a harmonic source was asked for" if wanted else "the recorded weather drives the scene")
-    for name, ground in STANDS_ON.items():
-        if found[name].on and not found[ground].on:
+    for name in _on(found):
+        others = [other for other in _on(found) if name in _effect(other).displaces]
+        if others and given.get(name) == "on" and not any(given.get(other) == "on" for other in others):
+            for other in others:
+                turn(other, False, f"{name} was asked for, and the two exclude each other")
+        elif others:
+            turn(name, False, _effect(others[0]).displaces[name])
+    for name in _on(found):
+        ground = _effect(name).stands_on
+        if ground is not None and not found[ground].on:
             if given.get(ground) == "off" and given.get(name) != "on":
                 turn(name, False, f"it stands on {ground}, which is off")
             else:
@@ -142,7 +130,7 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
 
 def falls_with(name: str) -> frozenset[str]:
     """The effect and those that stand on it."""
-    return frozenset({name, *(other for other, ground in STANDS_ON.items() if ground == name)})
+    return frozenset({name, *(effect.name for effect in CATALOGUE if effect.stands_on == name)})
 
 
 def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
@@ -163,18 +151,58 @@ def recipe(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dic
         SceneError: a verdict says something of a part that is none of its settings.
     """
     templates = deepcopy(dict(templates))
-    on = [name for name in NAMES if verdicts[name].on]
-    on_the_way = {name: _set(templates["parts"][name], verdicts, [name]) for name in ON_THE_WAY if name in on}
+    parts = {slot: _parts(slot, verdicts, templates) for slot in SLOTS}
+    state = [templates["states"]["static"], *parts["state"].values()][-1]
+    if parts["path"]:  # parts follow that clip
+        state |= {"floor": False} if "floor" in state else {"clip": "none"}
+    for around in parts["around_state"].values():
+        state = around | {"state": state}
+    companion = parts["companion"].get("companion")
     thermal = {
         "_target_": "heatsplat.thermal.composed.Composed",
-        "state": _state(verdicts, templates, open_ended=bool(on_the_way)),
-        "parts": on_the_way,
-        "companion": templates["companion"] if "thermal_opacity" in on else None,
+        "state": state,
+        "parts": parts["path"],
+        "companion": companion,
         "clip": templates["clip"],
     }
-    sensor = {"_target_": templates["sensor"]["_target_"], "parts": _camera(verdicts, templates["sensor"]["parts"])}
-    loss = templates["companion_loss"] if "thermal_opacity" in on else {}
-    return {"thermal": thermal, "sensor": sensor, "loss": loss}
+    sensor = {"_target_": templates["sensor"]["_target_"], "parts": parts["camera"]}
+    return {"thermal": thermal, "sensor": sensor, "loss": templates["companion_loss"] if companion else {}}
+
+
+def _effect(name: str) -> Effect:
+    return next(effect for effect in CATALOGUE if effect.name == name)
+
+
+def _on(verdicts: Mapping[str, Verdict]) -> list[str]:
+    return [name for name in NAMES if verdicts[name].on]
+
+
+def _parts(slot: str, verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Settings of the parts of a slot that simulate effects that are on, by name, in the order of the catalogue."""
+    for key in SLOTS[slot]:
+        templates = templates[key]
+    users = [effect for effect in CATALOGUE if effect.part.slot == slot]
+    parts = {}
+    for name in dict.fromkeys(effect.part.name for effect in users if verdicts[effect.name].on):
+        mine = [effect for effect in users if effect.part.name == name]
+        parts[name] = _set(templates[name], [verdicts[effect.name] for effect in mine if verdicts[effect.name].on])
+        for effect in mine:
+            parts[name] |= {} if verdicts[effect.name].on else effect.part.off
+    return parts
+
+
+def _set(template: Mapping[str, Any], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """A part's settings, with what verdicts say of it where they leave that to the scene."""
+    settings = dict(template)
+    for verdict in verdicts:
+        for key, value in verdict.settings.items():
+            if key not in settings:
+                raise SceneError(
+                    f"the evidence on {verdict.name} sets '{key}', which {settings['_target_']} does not have"
+                )
+            if settings[key] == SCENE_SAYS:
+                settings[key] = value
+    return {key: value for key, value in settings.items() if value != SCENE_SAYS}
 
 
 def asked(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,51 +278,3 @@ def lines(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _plain_price(price: Any) -> dict[str, Any]:
     return {} if price is None else asdict(price)
-
-
-def _state(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any], open_ended: bool) -> dict[str, Any]:
-    """The state model; with ``open_ended`` it does not clip, because parts follow that do."""
-    on = [name for name in STATE if verdicts[name].on]
-    driven = [name for name in WEATHER_DRIVEN if name in on]
-    if driven:
-        state = _set(templates["states"]["energy_balance"], verdicts, driven)
-        state |= {} if "solar" in on else {"sun": False}
-        state |= {} if "radiation" in on else {"sky": None}
-        state |= {} if "convection" in on else {"wind": False}
-    elif "relaxation" in on:
-        heated = [name for name in ("relaxation", "harmonic_source") if name in on]
-        state = _set(templates["states"]["newton_harmonic"], verdicts, heated)
-        state |= {} if "harmonic_source" in on else {"frequencies": 0}
-    else:
-        state = dict(templates["states"]["static"])
-    if open_ended:
-        state |= {"floor": False} if "floor" in state else {"clip": "none"}
-    if "conduction" in on:
-        state = _set(templates["states"]["conducting"], verdicts, ["conduction"]) | {"state": state}
-    return state
-
-
-def _camera(verdicts: Mapping[str, Verdict], parts: Mapping[str, Any]) -> dict[str, Any]:
-    """The parts of the sensor chain that are on, in the order in which light meets them."""
-    chain = {}
-    for part, effects in CAMERA.items():
-        on = [name for name in effects if verdicts[name].on]
-        if on:
-            chain[part] = _set(parts[part], verdicts, on)
-    if "calibration" in chain:
-        pattern = {} if verdicts["fixed_pattern"].on else {"gain_max": 0.0, "bias_max": 0.0}
-        falloff = {} if verdicts["vignetting"].on else {"vignetting_max": 0.0}
-        chain["calibration"] |= pattern | falloff
-    return chain
-
-
-def _set(template: Mapping[str, Any], verdicts: Mapping[str, Verdict], names: Collection[str]) -> dict[str, Any]:
-    """A part's settings, with what the verdicts of ``names`` say of it where they leave that to the scene."""
-    settings = dict(template)
-    for name in names:
-        for key, value in verdicts[name].settings.items():
-            if key not in settings:
-                raise SceneError(f"the evidence on {name} sets '{key}', which {settings['_target_']} does not have")
-            if settings[key] == SCENE_SAYS:
-                settings[key] = value
-    return {key: value for key, value in settings.items() if value != SCENE_SAYS}

@@ -1,17 +1,32 @@
-"""Physical effects: what each is, what speaks for it in a scene, and the verdict on it.
+"""Physical effects: what each is, what speaks for it in a scene, what simulates it, and the verdict on it.
 
-The catalogue (``heatsplat.effects.catalogue``) has one entry per effect. ``decide`` there looks at a scene and returns a
-verdict on each; ``heatsplat.effects.assembly`` turns verdicts into a recipe that simulates exactly what is on.
+Each effect is one file in ``heatsplat.effects.physical``; ``heatsplat.effects.catalogue`` lists them. ``decide`` there looks
+at a scene and returns a verdict on each; ``heatsplat.effects.assembly`` turns verdicts into a recipe that simulates exactly
+what is on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-STAGES = ("state", "emission", "path", "visibility", "sensor")
+from heatsplat.contracts import SceneData
+
+if TYPE_CHECKING:
+    from heatsplat.effects.joint.terms import Term
+    from heatsplat.effects.look import Look
+
+STAGES = ("state", "emission", "path", "visibility", "sensor")  # in the order in which heat meets them
 WISHES = ("on", "off", "auto")
+# Where a part stands in a recipe -> where its settings stand in the group "effects" of a configuration.
+SLOTS = {
+    "state": ("states",),  # the last one that is called for
+    "around_state": ("states",),  # takes the state as its own "state"
+    "path": ("parts",),  # after the state, one after the other
+    "companion": (),
+    "camera": ("sensor", "parts"),  # one after the other
+}
 
 
 @dataclass(frozen=True)
@@ -32,30 +47,58 @@ class Evidence:
 
 
 @dataclass(frozen=True)
+class Part:
+    """What simulates an effect.
+
+    Args:
+        slot: where it stands in a recipe, one of SLOTS.
+        name: of its settings in conf/effects/shared/parts.yaml. Effects may share a part.
+        off: settings that leave this effect out where another one calls for the part.
+    """
+
+    slot: str
+    name: str
+    off: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Effect:
-    """One entry of the catalogue.
+    """A physical effect.
 
     Args:
         name: in config, metrics.json and docs.
         stage: where on the way from heat to pixel it acts, one of STAGES.
+        place: its order within the stage: heat meets the lower ones first.
         summary: what it is, in a sentence.
         source: paper and equation.
         needs: metadata without which it cannot be simulated (SceneData.metadata's vocabulary); it is off without them.
         null: the null hypothesis that its evidence tests.
-        threshold: it is on where the statistic exceeds this.
+        threshold: it is on where the statistic exceeds this. In each file stands what the statistic is on synthetic recordings
+            (18 scenes: five recordings of size tiny of each, and six scenes of size demo) without the effect and with it.
         adds: what it adds to a recipe: parameters and operations, in a sentence.
-        evidence: function (Observations) -> Evidence, cheap, on training data alone.
+        evidence: what the training data of a scene say about it.
+        part: what simulates it.
+        term: what it is in the joint fit, None where it has no part in that.
+        stands_on: name of the effect that it cannot do without.
+        displaces: effects that cannot be had beside it, with the reason.
+        missing: what a scene lacks, beyond metadata, to simulate it; None where it lacks nothing.
     """
 
     name: str
     stage: str
+    place: int
     summary: str
     source: str
-    needs: frozenset[str]
+    needs: frozenset[str] = frozenset()
     null: str
     threshold: float
     adds: str
-    evidence: Callable[[Any], Evidence]
+    evidence: Callable[[Look], Evidence]
+    part: Part
+    term: Term | None = None
+    stands_on: str | None = None
+    displaces: Mapping[str, str] = field(default_factory=dict)
+    missing: Callable[[SceneData], str | None] = lambda scene: None
 
 
 @dataclass(frozen=True)

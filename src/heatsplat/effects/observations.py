@@ -17,13 +17,13 @@ from heatsplat.contracts import SceneData, View
 from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
 from heatsplat.geometry.projection import to_camera, to_pixels
 
-MOST_FRAMES = 64
-# Points whose tracks are fitted, and their observations, by which time goes; all points, up to MOST_IN_FRONT, hide each other.
-MOST_POINTS, MOST_OBSERVATIONS = 500, 24_000
-MOST_CANDIDATES = 1500
-MOST_IN_FRONT = 20000
-LEAST_PX = 8  # along the shorter side of an image
-LEAST_FRAMES = 4  # a track of fewer observations says nothing about time
+MAX_FRAMES = 64
+# Points whose tracks are fitted, and their observations, by which time goes; all points, up to MAX_IN_FRONT, hide each other.
+MAX_POINTS, MAX_OBSERVATIONS = 500, 24_000
+MAX_CANDIDATES = 1500
+MAX_IN_FRONT = 20000
+MIN_PX = 8  # along the shorter side of an image
+MIN_FRAMES = 4  # a track of fewer observations says nothing about time
 # A point is hidden where another one is nearer to the camera by this share within a cell of about two points.
 NEARER = 0.08
 STILL_PX = 0.25  # in the median over points; less is no parallax to learn from
@@ -36,7 +36,7 @@ class Tracks:
     Args:
         points: [P, 3] in the world.
         values: [P, F] image values, bilinear between pixels.
-        slopes: [P, F] steepest change of the image about there, per pixel: what a point that lies astray brings in.
+        slopes: [P, F] steepest change of the image about there, per pixel: what a misplaced point brings in.
         weights: [P, F] 0 or 1.
         distances: [P, F] from the camera, in the world's units.
         directions: [P, F, 3] unit vectors from the point to the camera.
@@ -66,7 +66,7 @@ class Observations:
 
     Args:
         scene: where it comes from.
-        images: [F, H, W] thermal training images (mean over channels), at most MOST_FRAMES evenly spread.
+        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES evenly spread.
         masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
         noise: standard deviation of the noise of a pixel, in image units.
@@ -106,7 +106,7 @@ class Observations:
 def observe(scene: SceneData) -> Observations:
     """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
     frames = scene.train.frames
-    chosen = spread(len(frames), MOST_FRAMES)
+    chosen = spread(len(frames), MAX_FRAMES)
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
@@ -126,9 +126,9 @@ def observe(scene: SceneData) -> Observations:
     if still:
         noise = max(noise_of_repeats(images, masks), step / math.sqrt(12.0), 1e-6)
     tracks, why = None, ""
-    if len(views) < LEAST_FRAMES:
+    if len(views) < MIN_FRAMES:
         why = f"{len(views)} training view(s) are too few to follow anything over"
-    elif min(shape) < LEAST_PX:
+    elif min(shape) < MIN_PX:
         why = f"images of {shape[1]} x {shape[0]} pixels are too small to follow a point through"
     elif still:
         tracks = _pixels(views, images, masks)
@@ -137,7 +137,7 @@ def observe(scene: SceneData) -> Observations:
     else:
         tracks = _tracks(scene.points.double(), views, images, noise)
         if tracks is None:
-            why = f"no scene point is seen in {LEAST_FRAMES} or more training views"
+            why = f"no scene point is seen in {MIN_FRAMES} or more training views"
     return Observations(scene, images, masks, times_s, noise, still, tracks, why)
 
 
@@ -152,7 +152,7 @@ def _stands_still(views: list[View], points: Tensor) -> bool:
     A reconstruction gives a tripod a little motion. Where no point is in front of all cameras, their matrices are equal.
     """
     cameras = [view.camera for view in views]
-    points = points[torch.tensor(spread(len(points), MOST_CANDIDATES), dtype=torch.long)]
+    points = points[torch.tensor(spread(len(points), MAX_CANDIDATES), dtype=torch.long)]
     seen = torch.stack([to_camera(points, camera.viewmat)[:, 2] > 1e-9 for camera in cameras]).all(0)
     if not seen.any():
         viewmats = torch.stack([camera.viewmat for camera in cameras])
@@ -164,7 +164,7 @@ def _stands_still(views: list[View], points: Tensor) -> bool:
 def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
     """Tracks of a grid of pixels of a camera that stands still, one unit away."""
     count, height, width = images.shape
-    every = max(1, math.ceil(math.sqrt(height * width / MOST_POINTS)))
+    every = max(1, math.ceil(math.sqrt(height * width / MAX_POINTS)))
     y, x = torch.meshgrid(
         torch.arange(every // 2, height, every), torch.arange(every // 2, width, every), indexing="ij"
     )
@@ -190,9 +190,9 @@ def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
 
 def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
     """Tracks of scene points; None where too few are seen often enough."""
-    points = points[torch.tensor(spread(len(points), MOST_IN_FRONT))]
+    points = points[torch.tensor(spread(len(points), MAX_IN_FRONT))]
     count, height, width = images.shape
-    followed = torch.tensor(spread(len(points), MOST_CANDIDATES))
+    followed = torch.tensor(spread(len(points), MAX_CANDIDATES))
     cell = max(2.0, math.sqrt(2.0 * width * height / len(points)))
     slopes = _steepest(images, noise)
     has_rgb = all(view.rgb is not None and view.rgb.shape[:2] == (height, width) for view in views)
@@ -225,11 +225,11 @@ def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> 
         points[followed], **{name: torch.stack(values, 1) if values else None for name, values in columns.items()}
     )
     seen = tracks.weights.sum(1)
-    often = seen >= max(LEAST_FRAMES, min(0.4 * count, 0.6 * float(seen.quantile(0.9))))
+    often = seen >= max(MIN_FRAMES, min(0.4 * count, 0.6 * float(seen.quantile(0.9))))
     if not often.any():
         return None
     tracks = tracks.of(often.nonzero()[:, 0])
-    most = min(MOST_POINTS, MOST_OBSERVATIONS // count)
+    most = min(MAX_POINTS, MAX_OBSERVATIONS // count)
     if len(tracks.points) <= most:
         return tracks
     # The points of even surroundings: a point at an edge shows how well it is placed and little else.

@@ -1,4 +1,4 @@
-"""Evidence for a point spread beyond the pixel: how wide the sharpest edges are."""
+"""Blur of lens and detector."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import math
 import torch
 from torch import Tensor
 
-from heatsplat.effects.base import Evidence
-from heatsplat.effects.observations import Observations
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.look import Look
 
 REACH = 4  # pixels on either side of an edge within which it has to be over
 SHARPEST = 0.1  # of the strong edges, the share that is judged: others are gradients of the scene and not its edges
 CLEAR = 20.0  # an edge is strong when it is this many times the noise high
-FEWEST = 30
+MIN_EDGES = 30
 # The width of a step that is no wider than the pixel that collects it, and one of which the reconstruction should know.
 PIXEL_PX, WIDE_PX = 0.45, 0.75
 
 
-def point_spread(obs: Observations) -> Evidence:
+def evidence(look: Look) -> Evidence:
     """Whether edges are wider than pixels. A step's steepest pixel takes a share of it that tells its width."""
+    obs = look.obs
     if obs.images.numel() == 0 or min(obs.images.shape[1:]) < 2 * REACH + 2:
         return Evidence(None, obs.why or "the images are too small to have edges")
     widths = []
@@ -27,8 +28,8 @@ def point_spread(obs: Observations) -> Evidence:
         image = image if obs.masks is None else torch.where(obs.masks[f], image, torch.nan)
         widths += [_widths(image, obs.noise), _widths(image.mT, obs.noise)]
     widths = torch.cat(widths)
-    if len(widths) < FEWEST:
-        return Evidence(None, f"only {len(widths)} edges stand out of the noise, {FEWEST} are needed")
+    if len(widths) < MIN_EDGES:
+        return Evidence(None, f"only {len(widths)} edges stand out of the noise, {MIN_EDGES} are needed")
     sigma = float(widths.quantile(0.5 * SHARPEST))
     spread = math.sqrt(max(sigma**2 - PIXEL_PX**2, 0.0))
     return Evidence(
@@ -52,3 +53,18 @@ def _widths(image: Tensor, noise: float) -> Tensor:
     at = torch.arange(-REACH, REACH + 1, dtype=image.dtype)
     mean = (share * at).sum(1, keepdim=True)
     return (share * (at - mean) ** 2).sum(1).clamp_min(0.0).sqrt()
+
+
+EFFECT = Effect(
+    name="point_spread",
+    stage="sensor",
+    place=0,
+    summary="blur of lens and detector",
+    source="SupIR-GS, degradation model",
+    null="edges are as wide as a pixel",
+    # WIDE_PX; up to 0.98 without it, from 1.17 with it.
+    threshold=1.0,
+    adds="a Gaussian blur of the rendered image",
+    evidence=evidence,
+    part=Part("camera", "point_spread"),
+)

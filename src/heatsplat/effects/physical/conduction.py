@@ -1,47 +1,48 @@
-"""Evidence for heat that flows between neighbouring parts of a surface."""
+"""Heat that flows between neighbouring parts of a surface."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from heatsplat.effects.base import Evidence
-from heatsplat.effects.evidence.joint_fit import joint
-from heatsplat.effects.observations import Observations
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.least_squares import own_part
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.look import Look
 
-HURDLE = 1.0
 NEIGHBOURS = 6
-FEWEST, FEWEST_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
+MIN_POINTS, MIN_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
 # How much faster than levels contrasts must fade: bodies of one level but two rates look a little like it.
 FASTER = 1.35
 LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 
 
-def conduction(obs: Observations) -> Evidence:
+def evidence(look: Look) -> Evidence:
     """Whether contrasts between neighbours fade faster than the levels that they share.
 
     Where every point relaxes by itself, an excess and a difference of two excesses fade alike.
     """
-    found = joint(obs)
-    if found is None or obs.times_s is None:
+    obs = look.obs
+    if look.joint is None or obs.times_s is None:
         return Evidence(None, obs.why or "no point can be followed over time")
-    fit, model = found
-    if fit.drivers is not None:
+    fit, model = look.joint
+    if fit.data.drivers is not None:
         return Evidence(0.0, "levels follow the weather, so that nobody knows how fast they would fade by themselves")
-    if "relaxation" not in model.own or "harmonic_source" in model.own:
-        why = "a source hides how contrasts fade" if "harmonic_source" in model.own else "nothing changes over time"
+    if "relaxation" not in model.names or "harmonic_source" in model.names:
+        why = "a source hides how contrasts fade" if "harmonic_source" in model.names else "nothing changes over time"
         return Evidence(0.0, f"{why}, so that no flow between neighbours shows")
-    early, late, used = fit.early_and_late(model)
+    early, late, used = early_and_late(fit, model)
     points = obs.tracks.points[used]
-    if len(points) < FEWEST:
-        return Evidence(None, f"{len(points)} points are too few to have neighbours, {FEWEST} are needed")
+    if len(points) < MIN_POINTS:
+        return Evidence(None, f"{len(points)} points are too few to have neighbours, {MIN_POINTS} are needed")
     near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
     first, last = early[used], late[used]
     before, after = first[near].mean(1), last[near].mean(1)
-    kept = _kept_apart(before, after) if "frame_offset" in model.shared else _kept(before, after, obs.ambient)
+    kept = _kept_apart(before, after) if "frame_offset" in model.names else _kept(before, after, obs.ambient)
     contrast, remains = first - before, last - after
     strong = contrast.abs() > 5.0 * obs.noise
-    if int(strong.sum()) < FEWEST_STRONG or kept < LEFT:
+    if int(strong.sum()) < MIN_STRONG or kept < LEFT:
         return Evidence(0.0, "neighbours are too much alike, or all is cold in the end, to tell how contrasts fade")
     still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
     rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
@@ -49,6 +50,18 @@ def conduction(obs: Observations) -> Evidence:
         (rate - 1.0) / (FASTER - 1.0),
         f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}",
     )
+
+
+def early_and_late(fit: Fit, model: Model) -> tuple[Tensor, Tensor, Tensor]:
+    """What the points' own parts say of the first and the last fifth of the record [P] each, and which points [P]
+    were seen in both."""
+    values, basis = fit.own(model)
+    own = own_part(basis, values - sum(fit.contributions(model).values()), fit.weights)
+    own = own + (fit.data.ambient if model.kind("attenuation") else 0.0)
+    first, last = fit.data.passed <= 0.2, fit.data.passed >= 0.8
+    used = fit.weights > 0
+    both = used[:, first].any(1) & used[:, last].any(1)
+    return own[:, first].mean(1), own[:, last].mean(1), both
 
 
 def _kept(before: Tensor, after: Tensor, ambient: float | None) -> Tensor:
@@ -69,3 +82,20 @@ def _kept_apart(before: Tensor, after: Tensor) -> Tensor:
     far, rest = before - before.median(), after - after.median()
     clear = far.abs() >= far.abs().median().clamp_min(1e-9)
     return (rest[clear] / far[clear]).median() if clear.any() else torch.zeros(())
+
+
+EFFECT = Effect(
+    name="conduction",
+    stage="state",
+    place=5,
+    summary="heat that flows between neighbouring parts of a surface",
+    source="Fourier's law on the graph of nearest Gaussians",
+    needs=frozenset({"time"}),
+    null="contrasts between neighbours fade as fast as levels do",
+    # Contrasts fade FASTER; up to 0.2 without it, from 2.9 with it.
+    threshold=1.0,
+    adds="a diffusivity and a linear solve over neighbours",
+    evidence=evidence,
+    part=Part("around_state", "conducting"),
+    stands_on="relaxation",
+)

@@ -8,6 +8,8 @@ from torch import Tensor
 from heatsplat.contracts import Weather
 from heatsplat.effects.observations import Observations
 
+# What recorded weather takes the place of, and why: a heat source stands for drivers that nobody recorded.
+INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}
 QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
 
 

@@ -1,0 +1,53 @@
+"""Evidence that comes out of the joint fit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from heatsplat.effects.base import Evidence
+from heatsplat.effects.joint.selection import candidates, earns, worthwhile
+from heatsplat.effects.look import Look
+
+WELL_OUTDONE = 1.0  # share of others' size below which an effect makes up for what they lack
+
+
+def gained(look: Look, name: str, sentence: str) -> Evidence:
+    """What an effect gains in the presence of those that were selected."""
+    if look.joint is None:
+        return Evidence(None, look.obs.why or "no point can be followed through the images")
+    fit, model = look.joint
+    if name in model.names:
+        less = fit.without(model, name)
+        gain, size = fit.gain(model, less), fit.effect_size(model, less)
+        return Evidence(gain, f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost")
+    tried = [one for other, one in candidates(fit, model) if other == name]
+    if not tried:
+        why = fit.data.effects[name].term.unseen(fit.data)
+        return Evidence(None, f"the training views do not allow to look for it: {why}")
+    best = max(tried, key=lambda one: fit.gain(one, model))
+    gain, size = fit.gain(best, model), fit.effect_size(best, model)
+    if gain > 1.0 and not worthwhile(fit, best, model, name):
+        return Evidence(0.0, f"{sentence} {beside(size)}, too little beside the noise or the changes of the scene")
+    if earns(fit, best, model, name):
+        return Evidence(0.0, f"{sentence} {beside(size)}, which the effects that are on explain as well")
+    return Evidence(gain, f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost")
+
+
+def selected_kind(look: Look, name: str) -> object | None:
+    """In which kind the joint fit selected an effect; None where it did not, or there is none."""
+    return None if look.joint is None else look.joint[1].kind(name)
+
+
+def outdone(look: Look, name: str, others: Collection[str]) -> bool:
+    """Whether an effect was only taken in beside others that explain the same kind of change, and more of it."""
+    if look.joint is None or not {name, *others} <= look.joint[1].names:
+        return False
+    fit, model = look.joint
+    less = fit.without(model, name)
+    size = fit.effect_size(model, less)
+    return all(size < WELL_OUTDONE * fit.effect_size(less, fit.without(less, other)) for other in others)
+
+
+def beside(size: float) -> str:
+    """The size of an effect in words."""
+    return f"{size:.2g} times the error expected of an observation"

@@ -1,0 +1,45 @@
+"""A look at a scene: what its training views show, and what all effects together make of it, each worked out once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from heatsplat.contracts import SceneData
+from heatsplat.effects import weather_record
+from heatsplat.effects.base import Effect
+from heatsplat.effects.joint.data import Data
+from heatsplat.effects.joint.fit import Fit, fit_of
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.joint.selection import selected
+from heatsplat.effects.observations import Observations, observe
+from heatsplat.effects.surface import normals
+
+
+class Look:
+    """A scene, for the evidence of effects.
+
+    Args:
+        scene: seen through its training views only.
+        effects: those that the joint fit may take in.
+    """
+
+    def __init__(self, scene: SceneData, effects: Sequence[Effect] = ()) -> None:
+        self.scene = scene
+        self.effects = effects
+
+    @cached_property
+    def obs(self) -> Observations:
+        """What the training views show."""
+        return observe(self.scene)
+
+    @cached_property
+    def joint(self) -> tuple[Fit, Model] | None:
+        """The joint fit and the model that it selects; None where there are no tracks."""
+        obs = self.obs
+        if obs.tracks is None:
+            return None
+        terms = {effect.name: effect for effect in self.effects if effect.term is not None}
+        drivers = weather_record.drivers(obs)
+        fit = fit_of(Data(terms, obs.tracks, obs.times_s, obs.ambient, obs.noise, normals(obs), drivers))
+        return selected(fit) if fit.observations > 0 else None

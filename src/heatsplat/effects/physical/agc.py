@@ -1,0 +1,53 @@
+"""Contrast that the camera stretches from image to image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.data import Data
+from heatsplat.effects.joint.evidence import gained, outdone
+from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
+from heatsplat.effects.look import Look
+from heatsplat.effects.physical.frame_offset import in_common
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent."""
+    if outdone(look, "agc", {"frame_offset", "tone"}):
+        return Evidence(0.0, "what looks like gains of single images is a bent curve along which they shift")
+    return gained(look, "agc", "gains of single images change values by")
+
+
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+    """A gain for each frame."""
+    return image[..., None] * torch.eye(image.shape[1], dtype=image.dtype)
+
+
+EFFECT = Effect(
+    name="agc",
+    stage="sensor",
+    place=4,
+    summary="contrast that the camera stretches from image to image",
+    source="SupIR-GS, Eq. 5",
+    null="the images have one gain",
+    # Up to 0.7 without it, from 1.6 with it.
+    threshold=SHARED_HURDLE,
+    adds="a stretch and a shift for each training image, a logit and a sigmoid",
+    evidence=evidence,
+    part=Part("camera", "agc"),
+    term=Shared(
+        columns=columns,
+        order=3,
+        settled=centred,
+        gain=True,
+        kinds=lambda fit: (1,),
+        numbers=lambda data, kind: data.frames - 1,
+        rich=lambda data: 1,
+        beside_changes=0.1,
+        rules=(in_common,),
+    ),
+)

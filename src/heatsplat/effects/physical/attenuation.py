@@ -1,0 +1,88 @@
+"""Air that swallows heat over distance and sends its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.data import Data
+from heatsplat.effects.joint.evidence import gained, selected_kind
+from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
+from heatsplat.effects.look import Look
+
+MAX_DEPTH = 3.0  # optical depth at the typical distance
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether points lose contrast to the surroundings with distance."""
+    if look.obs.ambient is None:
+        return Evidence(None, "without the temperature of the surroundings nobody knows what haze fades to")
+    found = gained(look, "attenuation", "the path changes values by")
+    kind = selected_kind(look, "attenuation")
+    if kind is None:
+        return found
+    fit, model = look.joint
+    seen = passing(fit, kind, fit.own_basis(model), fit.weights)[fit.weights > 0]
+    count = numbers(fit.data, kind)
+    return replace(
+        found,
+        settings={
+            "depth": round(max(-float(torch.log(seen).median()), 0.02), 3),
+            "moments": 0 if count == 1 else max(2, min(count // 2, 16)),
+        },
+    )
+
+
+def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
+    """Share of the excess over the surroundings that arrives [P, F].
+
+    log(value - ambient) is linear in the extinction (Beer-Lambert), so it comes from one linear fit there.
+    """
+    tracks = fit.data.tracks
+    excess = tracks.values - fit.data.ambient
+    sign = torch.sign((excess * tracks.weights).sum(1, keepdim=True))
+    clear = (excess.abs() > 8.0 * fit.errors) & (excess * sign > 0)
+    logs = torch.where(clear, excess.abs(), torch.ones_like(excess)).log()
+    typical = float((tracks.distances * tracks.weights).sum() / tracks.weights.sum())
+    columns = (tracks.distances / typical)[..., None]
+    if kind == "varying":
+        columns = columns * torch.eye(fit.data.frames, dtype=excess.dtype)
+    products = fit.gram(basis, torch.cat([logs[..., None], columns], 2), weights * excess**2 * clear)
+    ridge = 1e-8 * products.diagonal()[1:].mean().clamp_min(1e-300) * torch.eye(columns.shape[2], dtype=products.dtype)
+    depths = -torch.linalg.solve(products[1:, 1:] + ridge, products[1:, 0])
+    return torch.exp(-(columns @ depths.clamp(0.0, MAX_DEPTH)))  # air only takes away
+
+
+def numbers(data: Data, kind: object) -> int:
+    return data.frames if kind == "varying" else 1
+
+
+def kinds(fit: Fit) -> Sequence[object]:
+    """One extinction, or one that varies over time."""
+    return ("constant", "varying") if fit.data.ambient is not None and fit.data.moves else ()
+
+
+EFFECT = Effect(
+    name="attenuation",
+    stage="path",
+    place=0,
+    summary="air that swallows heat over distance and sends its own",
+    source="TI-3DGS, Eq. 6; Beer and Lambert",
+    null="a point looks the same from near and far",
+    # Up to 0.9 without it; from 30 with it, and 0 once, where haze passes for heat.
+    threshold=SHARED_HURDLE,
+    adds="one extinction, or a curve of it over time",
+    evidence=evidence,
+    part=Part("path", "attenuation"),
+    term=Path(
+        passing=passing,
+        kinds=kinds,
+        numbers=numbers,
+        smallest=0.2,  # misplaced points go with distance a little
+    ),
+)

@@ -1,0 +1,130 @@
+"""Heat that is switched on and off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.data import MIN_FREE, Data
+from heatsplat.effects.joint.evidence import gained, selected_kind
+from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.least_squares import RIDGE, own_part, own_weights
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own
+from heatsplat.effects.look import Look
+from heatsplat.effects.physical import relaxation
+from heatsplat.physics.frequencies import default_tau_min, frequency_grid
+
+# Courses over time that points share: one source and bodies that follow it more or less slowly need a few.
+COURSES = (1, 2, 3)
+SWEEPS = 4  # of alternating least squares for them
+HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether something drives the scene, and how many harmonics say how."""
+    beside = "any relaxation" if look.scene.weather is None else "what the weather does"
+    found = gained(look, "harmonic_source", f"points depart from {beside} by")
+    count = selected_kind(look, "harmonic_source")
+    return found if count is None else replace(found, settings={"frequencies": harmonics(look, count)})
+
+
+def kinds(fit: Fit) -> Sequence[int]:
+    """Numbers of common courses that the record has frames for."""
+    return allowed(fit.data)
+
+
+def allowed(data: Data) -> list[int]:
+    if data.span_s <= 0:
+        return []
+    return [count for count in COURSES if count <= data.usual_length - 1 - relaxation.count(data) - MIN_FREE]
+
+
+def rich(data: Data) -> int | None:
+    return COURSES[0] if relaxation.rich(data) and COURSES[0] in allowed(data) else None
+
+
+def courses(fit: Fit, count: int) -> Tensor:
+    """Courses over time [F, count] by which points depart from relaxation, each in its own measure.
+
+    Whatever drives the scene: the leading directions of what relaxation leaves, by alternating least squares.
+    """
+    values = fit.data.tracks.values - sum(fit.known.values())
+    decaying = fit.own_basis(Model.of(relaxation=1))
+    left = (values - own_part(decaying, values, fit.weights)) * (fit.weights > 0)
+    weights = fit.weights / fit.trust[:, None]
+    scale = weights.sum(1).clamp_min(1e-300)[:, None]
+    _, found = torch.linalg.eigh((left * weights / scale).T @ left)
+    found = found[:, -count:]
+    for _ in range(SWEEPS):
+        basis = torch.cat([decaying, found.expand(len(values), -1, -1)], 2)
+        own = own_weights(basis, values, fit.weights)
+        amplitudes, rest = own[:, -count:], values - (decaying @ own[:, :-count, None])[..., 0]
+        inner = torch.einsum("pf,pi,pj->fij", weights, amplitudes, amplitudes)
+        inner = inner + RIDGE * inner.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-300) * torch.eye(count)
+        found = torch.linalg.solve(inner, torch.einsum("pf,pi,pf->fi", weights, amplitudes, rest))
+        found = torch.linalg.qr(found).Q
+    return found
+
+
+def harmonics(look: Look, count: int) -> int:
+    """K for which the criterion is least when the courses that points share are written as K harmonics and a decay.
+
+    The grid of frequencies is that of the thermal model, whose response to a harmonic after its start is that harmonic
+    and a decay.
+    """
+    fit, _ = look.joint
+    recorded = torch.tensor([t for t in look.scene.train.times_s if t is not None], dtype=torch.float64)
+    shared = fit.basis("harmonic_source", count)
+    frames = len(shared)
+    passed = look.obs.times_s - look.obs.times_s.min()
+    decays = torch.exp(
+        -passed[:, None] / float(passed.max()) * torch.tensor(relaxation.DECAYS_FEW, dtype=torch.float64)
+    )
+    used = (fit.weights > 0).sum(0).double()
+    # A course is known as well as the mean over the points that show it; the noise of one point is the criterion's own.
+    best, least = 1, math.inf
+    for number in HARMONICS:
+        omega = frequency_grid(recorded, number, default_tau_min(recorded), math.sqrt(0.5))
+        phases = passed[:, None] * omega
+        basis = torch.cat([torch.ones(frames, 1, dtype=torch.float64), decays, phases.cos(), phases.sin()], 1)
+        if basis.shape[1] > frames - 2:
+            break
+        left = shared - basis @ torch.linalg.lstsq(basis, shared).solution
+        variance = max(float((left**2).sum()) / (count * (frames - basis.shape[1])), 1e-12)
+        criterion = frames * count * math.log(variance) + 2 * len(omega) * count * math.log(float(used.mean()))
+        if criterion < least:
+            best, least = number, criterion
+    return best
+
+
+EFFECT = Effect(
+    name="harmonic_source",
+    stage="state",
+    place=1,
+    summary="heat that is switched on and off, as a sum of K harmonics",
+    source="ETGS, Eq. 4, 7, 8",
+    needs=frozenset({"time"}),
+    null="what changes is a mixture of relaxations",
+    # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it.
+    threshold=OWN_HURDLE,
+    adds="2 K amplitudes for each Gaussian, 11 K operations",
+    evidence=evidence,
+    part=Part("state", "newton_harmonic", off={"frequencies": 0}),
+    term=Own(
+        basis=courses,
+        in_time=True,
+        kinds=kinds,
+        numbers=lambda data, count: count * data.frames,
+        rich=rich,
+        unseen=relaxation.unseen,
+        beside_changes=0.15,
+        rules=(relaxation.beyond_drift,),
+    ),
+    stands_on="relaxation",
+)

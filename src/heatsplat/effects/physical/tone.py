@@ -1,0 +1,58 @@
+"""A bent curve from heat to grey."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.data import Data
+from heatsplat.effects.joint.evidence import gained
+from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
+from heatsplat.effects.look import Look
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether what moves a whole image moves its dark and bright parts by amounts that a bent curve explains.
+
+    A curve that never changes over a scene that never changes only renames its levels: nothing shows it, and nothing is
+    lost without it. It shows where an offset moves all levels along it.
+    """
+    return gained(look, "tone", "offsets act on dark and bright parts differently by")
+
+
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+    """A curve T turns an offset o of the level x into T'(x) o: what it bends goes with o times x and x²."""
+    offset = known.get("frame_offset", torch.zeros_like(image))[..., None]
+    return torch.cat([offset * image[..., None], offset * image[..., None] ** 2], 2)
+
+
+def kinds(fit: Fit) -> Sequence[object]:
+    return (1,) if "frame_offset" in fit.known else ()
+
+
+EFFECT = Effect(
+    name="tone",
+    stage="sensor",
+    place=5,
+    summary="a bent curve from heat to grey",
+    source="SupIR-GS, Eq. 7, 8",
+    null="what a common change of an image does to its greys is a straight line of them",
+    # Up to 0.4 without it, from 190 with it.
+    threshold=SHARED_HURDLE,
+    adds="a small network of one number, kept as 256 levels",
+    evidence=evidence,
+    part=Part("camera", "tone"),
+    term=Shared(
+        columns=columns,
+        order=5,
+        kinds=kinds,
+        numbers=lambda data, kind: 2,
+        unseen=lambda data: "no offset moves the levels along a curve",
+        sensor_first=True,
+        beside_changes=0.01,
+    ),
+)

@@ -1,0 +1,34 @@
+"""Emission that depends on the direction of view."""
+
+from __future__ import annotations
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.evidence import gained, outdone
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own, where_moving
+from heatsplat.effects.look import Look
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether points look different from different sides.
+
+    Beside mirrors it only makes up for their normals, which are known roughly.
+    """
+    if outdone(look, "view_dependence", {"reflection"}):
+        return Evidence(0.0, "what depends on direction is mirrors, as far as their normals are known")
+    return gained(look, "view_dependence", "points change with the direction of view by")
+
+
+EFFECT = Effect(
+    name="view_dependence",
+    stage="emission",
+    place=0,
+    summary="emission that depends on the direction of view",
+    source="3DGS, spherical harmonics",
+    null="a point looks the same from every side",
+    # Up to 1.7 without it, from 4.7 with it.
+    threshold=OWN_HURDLE,
+    adds="harmonics for each Gaussian",
+    evidence=evidence,
+    part=Part("path", "view_dependence"),
+    term=Own(basis=lambda fit, kind: fit.data.tracks.directions, kinds=where_moving),
+)

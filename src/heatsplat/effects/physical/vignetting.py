@@ -1,0 +1,107 @@
+"""Falloff of the lens towards the corners."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.data import Data
+from heatsplat.effects.joint.evidence import beside
+from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.image_grid import STILL, grid_columns
+from heatsplat.effects.joint.least_squares import scaled
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.joint.selection import worthwhile
+from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, where_moving
+from heatsplat.effects.look import Look
+
+MIN_FALLOFF = -0.04  # in the corners; blur at the border of an image passes for half of that
+FINE_NODES = 9  # where the pattern is a random field, which more nodes than it needs do no harm
+STRENGTHS = 12  # iterations for the strength of that field
+
+
+def evidence(look: Look) -> Evidence:
+    """Whether the image fades towards its corners."""
+    if look.joint is None:
+        return Evidence(None, look.obs.why)
+    fit, model = look.joint
+    if not fit.data.moves:
+        return Evidence(None, STILL)
+    none = model.minus({"fixed_pattern", "vignetting"})
+    radial = none.plus("vignetting")
+    share, gain = falloff(fit, none)
+    size = fit.effect_size(radial, none)
+    why = (
+        f"distance from the middle of the image changes values by {beside(size)} ({100 * share:+.0f} % in the corners)"
+    )
+    if share >= MIN_FALLOFF:
+        return Evidence(0.0, f"{why}, which is no falloff")
+    return Evidence(gain if worthwhile(fit, radial, none, "vignetting") else 0.0, why)
+
+
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+    """A gain that goes with the second and the fourth power of the distance from the middle of the image."""
+    r2 = data.tracks.radii
+    return torch.stack([r2, r2**2], 2) * image[..., None]
+
+
+def falloff(fit: Fit, none: Model) -> tuple[float, float]:
+    """By what share the image is brighter in its corners than in its middle (negative where it fades), and what such
+    a falloff gains when the rest of the pattern is a random field as strong as it turns out to be.
+
+    A random field has a radial part, too; a falloff is there when that part stands out of what its other parts lead
+    one to expect. The strength of the field is found by expectation and maximisation, and the falloff has to earn its
+    two numbers against the field's nodes, of which each is about one observation of it.
+
+    Args:
+        fit: joint fit.
+        none: its model without falloff and pattern.
+    """
+    image, shared = fit.image(none), fit.shared_columns(none)
+    values, basis = fit.own(none)
+    radial, field = columns(fit.data, image, fit.known), grid_columns(fit.data.tracks, image, FINE_NODES)
+    products = fit.gram(basis, torch.cat([values[..., None], field, radial, *shared.values()], dim=2))
+    inner, right, scale = scaled(products)
+    inner = inner + 1e-8 * torch.eye(len(inner), dtype=inner.dtype)
+    n, half = field.shape[2], field.shape[2] // 2
+    loose = torch.zeros(len(inner), dtype=inner.dtype)  # inverse variances of the field's nodes in scaled units
+    loose[:n] = 1e-2 / scale[:n] ** 2
+    for _ in range(STRENGTHS):
+        inverse = torch.linalg.inv(inner + loose.diag())
+        found = ((inverse @ right) ** 2 + inverse.diagonal()) * scale**2
+        for part in (slice(0, half), slice(half, n)):
+            loose[part] = 1.0 / (found[part].mean().clamp_min(1e-12) * scale[part] ** -2)
+    inverse = torch.linalg.inv(inner + loose.diag())
+    two = slice(n, n + radial.shape[2])
+    numbers = (inverse @ right)[two]
+    stands_out = float(numbers @ torch.linalg.solve(inverse[two, two], numbers))
+    return float((numbers * scale[two]).sum()), stands_out / (radial.shape[2] * math.log(n))
+
+
+EFFECT = Effect(
+    name="vignetting",
+    stage="sensor",
+    place=2,
+    summary="falloff of the lens towards the corners",
+    source="SupIR-GS, Eq. 6",
+    null="residuals do not depend on the distance from the middle of the image",
+    # Up to 0.3 without it, from 0.4 with it: beside a heat source it is missed.
+    threshold=SHARED_HURDLE,
+    adds="two numbers",
+    evidence=evidence,
+    part=Part("camera", "calibration", off={"vignetting_max": 0.0}),
+    term=Shared(
+        columns=columns,
+        order=2,
+        kinds=where_moving,
+        numbers=lambda data, kind: 2,
+        sensor_first=True,
+        # Where neighbours exchange heat, what the courses of points miss looks like a pattern of 0.004 of the changes; true ones
+        # have 0.017 and more.
+        beside_changes=0.008,
+    ),
+)
