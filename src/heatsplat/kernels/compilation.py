@@ -14,6 +14,11 @@ from typing import Any
 import numba
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.typed_passes import NativeLowering
+from numba.np.ufunc.parallel import _launch_threads
 
 log = logging.getLogger(__name__)
 
@@ -42,32 +47,61 @@ class _Cache(FunctionCache):
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def _callable(function: Callable, **options: bool) -> Callable:
-    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, **options)(function)
+def kernel(function: Callable) -> Callable:
+    """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
+    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True)(function)
     compiled._cache = _Cache(function)
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
         with _ONE_AT_A_TIME:
+            _launch_threads()  # before code that calls them is loaded; does nothing the second time
             return compiled(*arguments)
 
     call.compiled = compiled
     return call
 
 
-def kernel(function: Callable) -> Callable:
-    """``function`` compiled for Python callers: parallel over ``prange``, without the GIL, cached on disk."""
-    return _callable(function, parallel=True)
+class _CodeToLink(JITCodeLibrary):
+    """Code that is linked into kernels, where it is optimised and turned into instructions, and not before."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
 
 
-def serial_kernel(function: Callable) -> Callable:
-    """``function`` compiled for Python callers, to run in one thread."""
-    return _callable(function)
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerToLink(NativeLowering):
+    """Numba's lowering of a function that nobody calls from Python: no wrappers, no instructions."""
+
+    _name = "lowering_to_link"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _CodeToLink(state.targetctx.codegen(), state.func_id.func_qualname)
+        for flag in ("no_compile", "no_cpython_wrapper", "no_cfunc_wrapper"):
+            setattr(state.flags, flag, True)
+        super().run_pass(state)
+        handle = [].copy  # callers know a function by something of its own that is built in, and never call that
+        state.targetctx.insert_user_function(handle, state.cr.fndesc, [state.library])
+        state.cr = state.cr._replace(cfunc=handle)
+        return True
+
+
+class _CompilerToLink(CompilerBase):
+    def define_pipelines(self) -> list:
+        manager = PassManager("to link")
+        for step, description in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            manager.add_pass(_LowerToLink if step is NativeLowering else step, description)
+        manager.finalize()
+        return [manager]
 
 
 def inline(function: Callable) -> Callable:
     """``function`` compiled into the kernels that call it."""
-    return numba.njit(fastmath=FASTMATH, error_model="numpy", forceinline=True)(function)
+    options = {"fastmath": FASTMATH, "error_model": "numpy", "forceinline": True}
+    return numba.njit(pipeline_class=_CompilerToLink, **options)(function)
 
 
 def part(function: Callable) -> Callable:

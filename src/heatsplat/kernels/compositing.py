@@ -22,7 +22,6 @@ to the same number.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from heatsplat.kernels.binning import feature_row
 from heatsplat.kernels.buffers import aligned
@@ -32,6 +31,7 @@ from heatsplat.kernels.constants import (
     ALPHA_MIN,
     BLOCK,
     BLOCKS,
+    CHUNK,
     DEPTH_GRADIENT,
     ELLIPSE,
     FIRST,
@@ -58,7 +58,7 @@ from heatsplat.kernels.layout import (
     modality_of,
     slot_columns,
 )
-from heatsplat.kernels.scheduling import take
+from heatsplat.kernels.scheduling import parallel_for, take
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -215,6 +215,23 @@ def _write_tile(layout, tile, tiles_x, transmittances, image, background, featur
                 depth[top + y, left + x] = image[block, colours, lane]
 
 
+@inline
+def _composite_tiles(
+    _worker, layout, records, instances, tile_starts, centres, background, ticket,
+    tile_ends, transmittances, image, features, alpha, depth,
+):  # fmt: skip
+    """``composite`` in tiles, as long as there are any."""
+    tiles_x = (features.shape[1] + TILE - 1) // TILE
+    tile = take(ticket, 1)
+    while tile < tile_ends.shape[0]:
+        tile_ends[tile] = _composite_tile(
+            layout, tile, tiles_x, records, instances, tile_starts[tile], tile_starts[tile + 1], centres,
+            transmittances, image,
+        )  # fmt: skip
+        _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth)
+        tile = take(ticket, 1)
+
+
 @kernel
 def composite(
     layout, workers, records, instances, tile_starts, centres, background, ticket,
@@ -231,16 +248,11 @@ def composite(
         transmittances, image: out [tiles * BLOCKS, modalities or channels, LANES], the final state of the pixels.
         features, alpha, depth: out [H, W, C], [M, H, W], and [H, W] where the layout has depth.
     """
-    tiles_x = (features.shape[1] + TILE - 1) // TILE
-    for _worker in prange(workers):
-        tile = take(ticket, 1)
-        while tile < tile_ends.shape[0]:
-            tile_ends[tile] = _composite_tile(
-                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_starts[tile + 1], centres,
-                transmittances, image,
-            )  # fmt: skip
-            _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth)
-            tile = take(ticket, 1)
+    parallel_for(
+        _composite_tiles, workers,
+        (layout, records, instances, tile_starts, centres, background, ticket,
+         tile_ends, transmittances, image, features, alpha, depth),
+    )  # fmt: skip
 
 
 @part
@@ -364,6 +376,28 @@ def _composite_tile_backward(
         _write_slot(layout, slots, slot, sums)
 
 
+@inline
+def _composite_tiles_backward(
+    worker, layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
+    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+):  # fmt: skip
+    """``composite_backward`` in tiles, as long as there are any."""
+    tiles_x = (v_features.shape[1] + TILE - 1) // TILE
+    tile = take(ticket, 1)
+    while tile < tile_ends.shape[0]:
+        for channel in range(v_features.shape[2]):
+            v_background[tile, channel] = 0.0
+        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
+        _start(layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background)
+        _composite_tile_backward(
+            layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
+            worker, state, slots,
+        )  # fmt: skip
+        for instance in range(tile_ends[tile], tile_starts[tile + 1]):
+            _clear_slot(slots, instances[instance, 0] >> 32)
+        tile = take(ticket, 1)
+
+
 @kernel
 def composite_backward(
     layout, workers, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
@@ -378,45 +412,22 @@ def composite_backward(
         slots: out [instances, slot_size], columns as in ``constants``.
         v_background: out [tiles, C], the gradient of the background tile by tile.
     """
-    tiles_x = (v_features.shape[1] + TILE - 1) // TILE
-    for worker in prange(workers):
-        tile = take(ticket, 1)
-        while tile < tile_ends.shape[0]:
-            for channel in range(v_features.shape[2]):
-                v_background[tile, channel] = 0.0
-            _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
-            _start(
-                layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background
-            )  # fmt: skip
-            _composite_tile_backward(
-                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
-                worker, state, slots,
-            )  # fmt: skip
-            for instance in range(tile_ends[tile], tile_starts[tile + 1]):
-                _clear_slot(slots, instances[instance, 0] >> 32)
-            tile = take(ticket, 1)
+    parallel_for(
+        _composite_tiles_backward, workers,
+        (layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
+         v_features, v_alpha, v_depth, v_pixels, state, slots, v_background),
+    )  # fmt: skip
 
 
-@kernel
-def sum_slots(
-    ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+@inline
+def _sum_chunk(
+    chunk, ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
     sums, v_opacities, v_features, absgrad,
 ):  # fmt: skip
-    """Adds up the slots of each visible Gaussian and finishes the gradients that need no projection.
-
-    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the
-    image: not on threads, not on the run.
-
-    Args:
-        ids, slot_starts, screen, rows_are_ranks, first_ranks: see ``binning``.
-        slots: [slots, slot_size], the first slot of each Gaussian is overwritten with the sum.
-        sums: out [N, SUMS], for ``projection.project_backward``; rows of visible Gaussians only, as below.
-        v_opacities, v_features: out [M, N], and [N, C] or [n, C].
-        absgrad: out [N, 2], or [0, 0] where it is not wanted.
-    """
+    """``sum_slots`` of CHUNK visible Gaussians."""
     modalities, colours = opacities.shape[0], v_features.shape[1]
     size = slots.shape[1]
-    for rank in prange(ids.shape[0]):
+    for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, ids.shape[0])):
         ahead = np.int64(ids[min(rank + RANKS_AHEAD, ids.shape[0] - 1)])
         prefetch(sums, ahead * SUMS)
         prefetch(opacities, ahead)
@@ -447,3 +458,27 @@ def sum_slots(
             v_features[row, channel] = slots[slot, column + channel]
         for axis in range(absgrad.shape[1]):
             absgrad[gaussian, axis] = slots[slot, column + colours + axis] * TWO_LN_2
+
+
+@kernel
+def sum_slots(
+    ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+    sums, v_opacities, v_features, absgrad,
+):  # fmt: skip
+    """Adds up the slots of each visible Gaussian and finishes the gradients that need no projection.
+
+    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the
+    image: not on threads, not on the run.
+
+    Args:
+        ids, slot_starts, screen, rows_are_ranks, first_ranks: see ``binning``.
+        slots: [slots, slot_size], the first slot of each Gaussian is overwritten with the sum.
+        sums: out [N, SUMS], for ``projection.project_backward``; rows of visible Gaussians only, as below.
+        v_opacities, v_features: out [M, N], and [N, C] or [n, C].
+        absgrad: out [N, 2], or [0, 0] where it is not wanted.
+    """
+    parallel_for(
+        _sum_chunk, (ids.shape[0] + CHUNK - 1) // CHUNK,
+        (ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+         sums, v_opacities, v_features, absgrad),
+    )  # fmt: skip

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from numba import prange
-
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.compile_time import compile_time, constant
+from heatsplat.kernels.scheduling import parallel_for
 
 BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
@@ -84,6 +83,48 @@ def weights(y):
     return decay, first, second, (0.5 - second) / y
 
 
+@inline
+def _recent_sunlight_block(block, normals, log_rates, steps, beams, last, responses, slopes, vectors):
+    """``recent_sunlight`` of BLOCK Gaussians."""
+    count, intervals = log_rates.shape[0], steps.shape[0]
+    for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+        nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        rate = math.exp(float(log_rates[i]))
+        y, response, slope, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        bx, by, bz = beams[0, 0], beams[0, 1], beams[0, 2]
+        u = nx * bx + ny * by + nz * bz
+        if u <= 0.0:
+            u, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+        seconds, decay, before, after, phi = -1.0, 1.0, 0.0, 0.0, 1.0
+        for k in range(intervals):
+            cx, cy, cz = beams[k + 1, 0], beams[k + 1, 1], beams[k + 1, 2]
+            v = nx * cx + ny * cy + nz * cz
+            if v <= 0.0:
+                v, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
+            step = steps[k]
+            if k == intervals - 1:
+                step *= last
+                v, cx, cy, cz = (
+                    u + last * (v - u),
+                    bx + last * (cx - bx),
+                    by + last * (cy - by),
+                    bz + last * (cz - bz),
+                )
+            if step != seconds:
+                seconds, y = step, rate * step
+                decay, phi, second, _ = weights(y)
+                after = y * second
+                before = phi - decay
+            slope = decay * (slope - y * response) + (y * decay - before) * u + before * v
+            response = decay * response + before * u + after * v
+            vx = decay * vx + before * bx + after * cx
+            vy = decay * vy + before * by + after * cy
+            vz = decay * vz + before * bz + after * cz
+            u, bx, by, bz = v, cx, cy, cz
+        responses[i], slopes[i] = response, slope
+        vectors[i, 0], vectors[i, 1], vectors[i, 2] = vx, vy, vz
+
+
 @kernel
 def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, vectors):
     """Settled responses to max(n · beam, 0), which is linear between samples, from rest at the first sample.
@@ -98,44 +139,11 @@ def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, v
         slopes: [n] filled with dY / d log a.
         vectors: [n, 3] filled with dY / dn.
     """
-    count, intervals = log_rates.shape[0], steps.shape[0]
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
-            rate = math.exp(float(log_rates[i]))
-            y, response, slope, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            bx, by, bz = beams[0, 0], beams[0, 1], beams[0, 2]
-            u = nx * bx + ny * by + nz * bz
-            if u <= 0.0:
-                u, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-            seconds, decay, before, after, phi = -1.0, 1.0, 0.0, 0.0, 1.0
-            for k in range(intervals):
-                cx, cy, cz = beams[k + 1, 0], beams[k + 1, 1], beams[k + 1, 2]
-                v = nx * cx + ny * cy + nz * cz
-                if v <= 0.0:
-                    v, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
-                step = steps[k]
-                if k == intervals - 1:
-                    step *= last
-                    v, cx, cy, cz = (
-                        u + last * (v - u),
-                        bx + last * (cx - bx),
-                        by + last * (cy - by),
-                        bz + last * (cz - bz),
-                    )
-                if step != seconds:
-                    seconds, y = step, rate * step
-                    decay, phi, second, _ = weights(y)
-                    after = y * second
-                    before = phi - decay
-                slope = decay * (slope - y * response) + (y * decay - before) * u + before * v
-                response = decay * response + before * u + after * v
-                vx = decay * vx + before * bx + after * cx
-                vy = decay * vy + before * by + after * cy
-                vz = decay * vz + before * bz + after * cz
-                u, bx, by, bz = v, cx, cy, cz
-            responses[i], slopes[i] = response, slope
-            vectors[i, 0], vectors[i, 1], vectors[i, 2] = vx, vy, vz
+    parallel_for(
+        _recent_sunlight_block,
+        (log_rates.shape[0] + BLOCK - 1) // BLOCK,
+        (normals, log_rates, steps, beams, last, responses, slopes, vectors),
+    )
 
 
 @inline
@@ -323,6 +331,14 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
         sensitivities[i, column + 2] = dz
 
 
+@inline
+def _march_block(block, balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
+    """``march`` of BLOCK Gaussians; ``final`` is the sample before ``time``."""
+    count = parameters.shape[0]
+    for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+        march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
+
+
 @kernel
 def march(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
     """Temperatures at a time under the full balance: T⁴ as it is, wind as it blows.
@@ -344,10 +360,11 @@ def march(balance, parameters, times, drivers, up, reference, time, temperatures
         temperatures: [n] filled with x.
         sensitivities: [n, P] filled with the derivatives of x by the parameters.
     """
-    count = parameters.shape[0]
     final = times.shape[0] - 2
     while final > 0 and times[final] >= time:
         final -= 1
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
+    parallel_for(
+        _march_block,
+        (parameters.shape[0] + BLOCK - 1) // BLOCK,
+        (balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities),
+    )

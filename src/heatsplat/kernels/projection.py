@@ -23,7 +23,6 @@ inverse.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel, part
 from heatsplat.kernels.constants import (
@@ -43,6 +42,7 @@ from heatsplat.kernels.constants import (
     TWO_LN_2,
     WHITENING,
 )
+from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -305,6 +305,26 @@ def _project_block(
     return _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scratch)
 
 
+@inline
+def _project_chunk(
+    chunk, means, quats, scales, opacities, camera, width, height, antialiased,
+    screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
+):  # fmt: skip
+    """Projects the Gaussians of a chunk; leaves how many are visible, and how many tiles they may touch."""
+    begin = chunk * CHUNK
+    place = begin
+    blur = camera[BLUR], camera[BLUR_SQUARED]
+    for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
+        place = _project_block(
+            block, means, quats, scales, opacities, camera, blur, width, height, antialiased,
+            screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
+        )  # fmt: skip
+    first_ranks[chunk] = place - begin
+    bounds[chunk] = 0
+    for k in range(begin, place):
+        bounds[chunk] += box_tiles(ids[k], screen)
+
+
 @kernel
 def project(
     means, quats, scales, opacities, camera, width, height, antialiased,
@@ -324,19 +344,11 @@ def project(
         bounds, scratch: scratch [chunks] int64 and [chunks, RANK, LANES].
     """
     chunks = first_ranks.shape[0]
-    for chunk in prange(chunks):
-        begin = chunk * CHUNK
-        place = begin
-        blur = camera[BLUR], camera[BLUR_SQUARED]
-        for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
-            place = _project_block(
-                block, means, quats, scales, opacities, camera, blur, width, height, antialiased,
-                screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
-            )  # fmt: skip
-        first_ranks[chunk] = place - begin
-        bounds[chunk] = 0
-        for k in range(begin, place):
-            bounds[chunk] += box_tiles(ids[k], screen)
+    parallel_for(
+        _project_chunk, chunks,
+        (means, quats, scales, opacities, camera, width, height, antialiased,
+         screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch),
+    )  # fmt: skip
     visible, tiles = np.int64(0), np.int64(0)
     for chunk in range(chunks):
         here = first_ranks[chunk]
@@ -466,6 +478,19 @@ def _project_block_backward(
         _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y)
 
 
+@inline
+def _project_chunk_backward(
+    chunk, means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
+):  # fmt: skip
+    """``project_backward`` of the Gaussians of a chunk."""
+    blur = camera[BLUR], camera[BLUR_SQUARED]
+    for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
+        _project_block_backward(
+            block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, blur, antialiased,
+            v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
+        )  # fmt: skip
+
+
 @kernel
 def project_backward(
     means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
@@ -478,10 +503,7 @@ def project_backward(
         v_means, v_quats, v_scales, v_means2d: out, all rows are written.
         v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
-    for chunk in prange(v_cameras.shape[0]):
-        blur = camera[BLUR], camera[BLUR_SQUARED]
-        for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
-            _project_block_backward(
-                block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, blur, antialiased,
-                v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
-            )  # fmt: skip
+    parallel_for(
+        _project_chunk_backward, v_cameras.shape[0],
+        (means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras),
+    )  # fmt: skip
