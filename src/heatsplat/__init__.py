@@ -1,5 +1,6 @@
 """heatsplat: thermal-infrared scenes as 3D Gaussians whose appearance is a physical model of heat."""
 
+import os
 from pathlib import Path
 
 __version__ = "0.1.0"
@@ -9,3 +10,8 @@ __version__ = "0.1.0"
 CHECKOUT = next((root for root in [Path(__file__).resolve().parents[2]] if (root / "datamodules").is_dir()), None)
 if CHECKOUT is not None:
     __path__.append(str(CHECKOUT))
+
+# Threads of OpenMP wait for each other at the end of every parallel loop, some thirty times in a training step. Left to
+# themselves they spin meanwhile, in two pools, PyTorch's and Numba's: two runs on two cores then take ten times as long as
+# one. The libraries read this when they are loaded, and children inherit it.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from heatsplat.kernels.compilation import inline, kernel, part
+from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.constants import (
     BLOCK,
     CHUNK,
@@ -96,7 +96,7 @@ def feature_row(gaussian, screen, rows_are_ranks, first_ranks):
     return first_ranks[gaussian // CHUNK] + np.int64(screen[gaussian, RANK]) if rows_are_ranks else gaussian
 
 
-@part
+@inline
 def _pack(rank, gaussian, screen, features, row, opacities, with_depth, records):
     """Writes the record of a Gaussian, what compositing reads of it: see ``layout.Layout``."""
     store_first(records, rank * records.shape[1], load(screen, gaussian * SCREEN), ELLIPSE)
@@ -140,7 +140,7 @@ def _spans(gaussian, screen, first_row):
     return begin, select(crossed, maximum(end, begin), begin)
 
 
-@part
+@inline
 def _find(gaussian, screen, tiles_x, found, place, counts, slab):
     """Writes tile and mask of the instances of a Gaussian from ``place`` of ``found`` on; returns the place after."""
     left, right, top, bottom = box(gaussian, screen)

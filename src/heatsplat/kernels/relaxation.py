@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numba import njit
 
-from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.compilation import exact_kernel, inline, kernel
 from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
     LANES,
@@ -64,7 +64,7 @@ def threads_for(count: int) -> Iterator[None]:
         numba.set_num_threads(before)
 
 
-@njit(cache=True)
+@njit
 def _series(square, first):
     result, term = 0.0, 1.0
     for j in range(1, first + 1):
@@ -75,7 +75,7 @@ def _series(square, first):
     return result
 
 
-@njit(cache=True)  # without contraction, which would spoil the exact product
+@exact_kernel  # contraction would spoil the exact product
 def fill_table(omega, time, table):
     """Fills ``table`` [TABLE_ROWS, padded K] with functions of ω [K] at a time, computed in float64.
 
