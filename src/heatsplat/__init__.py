@@ -5,6 +5,7 @@ In Python: ``config = heatsplat.compose(["method=etgs", "data.scene=heated"])``,
 """
 
 from importlib import import_module
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,10 @@ CHECKOUT = next((root for root in [Path(__file__).resolve().parents[2]] if (root
 if CHECKOUT is not None:
     __path__.append(str(CHECKOUT))
 
+# Threads of OpenMP wait for each other at the end of every parallel loop, some thirty times in a training step. Left to
+# themselves they spin meanwhile, in two pools, PyTorch's and Numba's: two runs on two cores then take ten times as long as
+# one. The libraries read this when they are loaded, and children inherit it.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:

@@ -99,9 +99,9 @@ def test_the_march_without_an_effect_is_that_with_its_parameter_at_zero_and_has_
         climate = Climate(replace(drivers(), beams=None))
     else:
         climate = Climate(drivers())
-    columns, march = [], energy_balance.kernels.march
+    columns, integrate = [], energy_balance.kernels.integrate
     monkeypatch.setattr(
-        energy_balance.kernels, "march", lambda *given: (columns.append(given[1].shape[1]), march(*given))
+        energy_balance.kernels, "integrate", lambda *given: (columns.append(given[1].shape[1]), integrate(*given))
     )
     whole = bodies(wind=True)
     zeros = {key: torch.zeros_like(getattr(whole, key)) + tensor(*([x] if x == 0 else x)) for key, x in zeroed.items()}

@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import RenderOutput
 from heatsplat.geometry.projection import look_at
 from heatsplat.renderers import rasterization
-from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, BLUR, FOV_MARGIN, TRANSMITTANCE_MIN
+from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, EPS2D, FOV_MARGIN, TRANSMITTANCE_MIN
 from heatsplat.training.rng import generator_for
 
 GRADIENTS = ("means", "quats", "scales", "opacities", "features", "background", "viewmat")
@@ -213,7 +213,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Features, alpha and depth by a loop over pixels and Gaussians with explicit inverses, and the relative distance
     of the nearest value from a threshold, which finite differences must not cross."""
     channels, antialiased = scene.options["modality_channels"], scene.options.get("antialiased", False)
-    blur = scene.options.get("blur", BLUR)
+    eps2d = scene.options.get("eps2d", EPS2D)
     viewmat, K = scene.viewmat.numpy(), scene.K.numpy()
     focal, principal = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
     size = np.array([scene.width, scene.height])
@@ -233,7 +233,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
             [[focal[0], 0, -focal[0] * slope[0]], [0, focal[1], -focal[1] * slope[1]]]
         ) / point[2] @ viewmat[:3, :3]  # fmt: skip
         flat = jacobian @ covariance @ jacobian.T
-        blurred = flat + blur * np.eye(2)
+        blurred = flat + eps2d * np.eye(2)
         factor = math.sqrt(np.linalg.det(flat) / np.linalg.det(blurred)) if antialiased else 1.0
         splats.append((point[2], i, focal * point[:2] / point[2] + principal, np.linalg.inv(blurred), factor))
     splats.sort(key=lambda splat: splat[:2])
@@ -266,7 +266,7 @@ def loop(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 SMALL = [
     plain_scene(30, (3,), seed=3, width=16, height=12),
     plain_scene(30, (2, 1), seed=10, width=16, height=12, antialiased=True),
-    plain_scene(30, (1,), seed=27, width=16, height=12, antialiased=True, blur=0.1),
+    plain_scene(30, (1,), seed=27, width=16, height=12, antialiased=True, eps2d=0.1),
 ]
 
 
@@ -341,8 +341,8 @@ def test_reference_runs_on_cuda():
 PLAIN = {
     "one channel": plain_scene(channels=(1,)),
     "one channel, antialiased": plain_scene(channels=(1,), antialiased=True),
-    "one channel, antialiased, less blur": plain_scene(channels=(1,), antialiased=True, blur=0.1),
-    "one channel, more blur": plain_scene(channels=(1,), blur=0.7),
+    "one channel, antialiased, less blur": plain_scene(channels=(1,), antialiased=True, eps2d=0.1),
+    "one channel, more blur": plain_scene(channels=(1,), eps2d=0.7),
     "rgb": plain_scene(channels=(3,)),
     "rgb, antialiased": plain_scene(channels=(3,), antialiased=True),
     "four channels": plain_scene(channels=(4,), absgrad=True),
@@ -684,14 +684,14 @@ def test_extents_reach_to_the_opacity_cut(backend):
     opacities = torch.tensor([0.9, 0.3, 0.05, 0.006, 0.004], dtype=torch.float64)
     scene = facing([[0.0, 0.0, 2.0]] * 5, [0.4] * 3, opacities)
     for axis, focal in enumerate((20.0, 22.0)):
-        deviation = math.sqrt((0.4 * focal / 2) ** 2 + BLUR)
+        deviation = math.sqrt((0.4 * focal / 2) ** 2 + EPS2D)
         expected = (deviation * (2 * (255 * opacities).log()).sqrt()).ceil()
         assert run(backend, scene).output.meta["radii"][:, axis].tolist() == expected.tolist()
 
 
 def test_a_gaussian_beyond_the_border_is_seen_by_its_tail(backend):
     # Its centre lies so far left of the image that only the first column has an alpha above the cut.
-    deviation = math.sqrt((0.05 * 20 / 2) ** 2 + BLUR)
+    deviation = math.sqrt((0.05 * 20 / 2) ** 2 + EPS2D)
     reach = deviation * math.sqrt(2 * math.log(255 * 0.9))
     x = 0.5 + 0.02 - reach
     scene = facing([[2 * (x - 0.46 * 24) / 20, 2 * (10.5 - 11.0) / 22, 2.0]], 0.0, 0.9)

@@ -1,4 +1,4 @@
-"""Mip-Splatting's two filters at work: an image from farther away is the average of the one nearby; bad blur is refused."""
+"""Mip-Splatting's two filters at work: an image from farther away is the average of the one nearby; bad eps2d is refused."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def seen(camera: Camera, mip: bool) -> torch.Tensor:
     if mip:
         widths = 0.2**0.5 * sampling_intervals(means, [near()])
         scales, opacities = smoothed(scales, opacities, widths)
-    renderer = Renderer("cpu", antialiased=True, blur=0.1) if mip else Renderer("cpu")
+    renderer = Renderer("cpu", antialiased=True, eps2d=0.1) if mip else Renderer("cpu")
     return renderer(means, quats, scales, opacities, torch.ones(len(means), 1), camera, None, (1,)).features[..., 0]
 
 
@@ -50,12 +50,12 @@ def test_a_finer_image_does_not_lose_what_the_fine_one_shows():
     assert kept[False] < 0.6 and 0.95 < kept[True] < 1.05
 
 
-@pytest.mark.parametrize("blur", [0.0, -0.1, float("nan")])
-def test_a_blur_that_is_none_is_refused(blur):
-    with pytest.raises(ValueError, match=r"renderer.blur must be above 0 pixels² \(3DGS: 0.3, Mip-Splatting: 0.1\)"):
-        Renderer(blur=blur)
+@pytest.mark.parametrize("eps2d", [0.0, -0.1, float("nan")])
+def test_a_blur_that_is_none_is_refused(eps2d):
+    with pytest.raises(ValueError, match=r"renderer.eps2d must be above 0 pixels² \(3DGS: 0.3, Mip-Splatting: 0.1\)"):
+        Renderer(eps2d=eps2d)
     means, quats, scales, opacities = sparks(3)
-    with pytest.raises(ValueError, match="blur must be above 0 pixels²"):
+    with pytest.raises(ValueError, match="eps2d must be above 0 pixels²"):
         rasterization(
             means,
             quats,
@@ -67,5 +67,5 @@ def test_a_blur_that_is_none_is_refused(blur):
             8,
             8,
             backend="cpu",
-            blur=blur,
+            eps2d=eps2d,
         )

@@ -18,7 +18,7 @@ from heatsplat.physics.ellipsoids import (
     radiating_area_ratio,
 )
 from heatsplat.physics.grey_body import radiance, temperature_of
-from heatsplat.renderers.base import BLUR, FOV_MARGIN
+from heatsplat.renderers.base import EPS2D, FOV_MARGIN
 from heatsplat.thermal.atmospheric_field import octaves
 
 axes = logarithmic(1e-8, 1e3)
@@ -77,7 +77,7 @@ def screen(dtype, quats, scales, slope, depth):
     K = torch.tensor([[500.0, 0, 200], [0, 520, 200], [0, 0, 1]], dtype=dtype)
     scales = scales.to(dtype).requires_grad_()
     eye = torch.eye(4, dtype=dtype)
-    return scales, project_gaussians(means.to(dtype), quats.to(dtype), scales, eye, K, 400, 400, BLUR, FOV_MARGIN)
+    return scales, project_gaussians(means.to(dtype), quats.to(dtype), scales, eye, K, 400, 400, EPS2D, FOV_MARGIN)
 
 
 @settings(max_examples=200)

@@ -11,9 +11,8 @@ result is the one order there is, whatever the slabs.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from heatsplat.kernels.compilation import inline, kernel, part, serial_kernel
+from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.constants import (
     BLOCK,
     CHUNK,
@@ -32,7 +31,7 @@ from heatsplat.kernels.constants import (
     TILE_BLOCKS,
 )
 from heatsplat.kernels.projection import box, box_tiles
-from heatsplat.kernels.scheduling import take
+from heatsplat.kernels.scheduling import parallel_for, take
 from heatsplat.kernels.simd import (
     bytes_of,
     ceil,
@@ -57,7 +56,7 @@ AHEAD = 16  # Gaussians ahead of their use that rows are fetched
 MARGIN = 0.02  # pixels, more than the rounding of an interval's ends: a mask may hold too much, never too little
 
 
-@serial_kernel
+@kernel
 def sort_by_depth(visible, depths, ids, keys, other_ids, other_keys, histogram):
     """Writes the ids ``visible`` [n] into ``ids`` in order of depth, equal depths in order of index.
 
@@ -97,7 +96,7 @@ def feature_row(gaussian, screen, rows_are_ranks, first_ranks):
     return first_ranks[gaussian // CHUNK] + np.int64(screen[gaussian, RANK]) if rows_are_ranks else gaussian
 
 
-@part
+@inline
 def _pack(rank, gaussian, screen, features, row, opacities, with_depth, records):
     """Writes the record of a Gaussian, what compositing reads of it: see ``layout.Layout``."""
     store_first(records, rank * records.shape[1], load(screen, gaussian * SCREEN), ELLIPSE)
@@ -141,7 +140,7 @@ def _spans(gaussian, screen, first_row):
     return begin, select(crossed, maximum(end, begin), begin)
 
 
-@part
+@inline
 def _find(gaussian, screen, tiles_x, found, place, counts, slab):
     """Writes tile and mask of the instances of a Gaussian from ``place`` of ``found`` on; returns the place after."""
     left, right, top, bottom = box(gaussian, screen)
@@ -164,6 +163,38 @@ def _find(gaussian, screen, tiles_x, found, place, counts, slab):
     return place
 
 
+@inline
+def _find_slabs(
+    _worker, ids, screen, width, features, rows_are_ranks, first_ranks, opacities, with_depth, tickets,
+    records, found, found_starts, found_counts, counts,
+):  # fmt: skip
+    """``find_instances`` in slabs, as long as there are any."""
+    slabs = counts.shape[0]
+    tiles_x = (width + TILE - 1) // TILE
+    count = ids.shape[0]
+    share = (count + slabs - 1) // slabs
+    slab = take(tickets[0], 1)
+    while slab < slabs:
+        for tile in range(counts.shape[1]):
+            counts[slab, tile] = 0
+        room = np.int64(1)
+        for rank in range(slab * share, min(count, (slab + 1) * share)):
+            prefetch(screen, np.int64(ids[min(rank + AHEAD, count - 1)]) * SCREEN)
+            gaussian = np.int64(ids[rank])
+            prefetch(features, feature_row(gaussian, screen, rows_are_ranks, first_ranks) * features.shape[1])
+            room += box_tiles(gaussian, screen)
+        place = take(tickets[1], room)
+        found_starts[slab] = place
+        for rank in range(slab * share, min(count, (slab + 1) * share)):
+            gaussian = np.int64(ids[rank])
+            row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
+            _pack(rank, gaussian, screen, features, row, opacities, with_depth, records)
+            before = place
+            place = _find(gaussian, screen, tiles_x, found, place, counts, slab)
+            found_counts[rank] = place - before
+        slab = take(tickets[0], 1)
+
+
 @kernel
 def find_instances(
     workers, ids, screen, width, features, rows_are_ranks, first_ranks, opacities, with_depth, tickets,
@@ -183,31 +214,33 @@ def find_instances(
         found_counts: out [n], how many instances a Gaussian has.
         counts: out [slabs, tiles and a row of tiles to spare], how many instances of a slab a tile has.
     """
-    slabs = counts.shape[0]
-    tiles_x = (width + TILE - 1) // TILE
-    count = ids.shape[0]
-    share = (count + slabs - 1) // slabs
-    for _worker in prange(workers):
-        slab = take(tickets[0], 1)
-        while slab < slabs:
-            for tile in range(counts.shape[1]):
-                counts[slab, tile] = 0
-            room = np.int64(1)
-            for rank in range(slab * share, min(count, (slab + 1) * share)):
-                prefetch(screen, np.int64(ids[min(rank + AHEAD, count - 1)]) * SCREEN)
-                gaussian = np.int64(ids[rank])
-                prefetch(features, feature_row(gaussian, screen, rows_are_ranks, first_ranks) * features.shape[1])
-                room += box_tiles(gaussian, screen)
-            place = take(tickets[1], room)
-            found_starts[slab] = place
-            for rank in range(slab * share, min(count, (slab + 1) * share)):
-                gaussian = np.int64(ids[rank])
-                row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
-                _pack(rank, gaussian, screen, features, row, opacities, with_depth, records)
-                before = place
-                place = _find(gaussian, screen, tiles_x, found, place, counts, slab)
-                found_counts[rank] = place - before
-            slab = take(tickets[0], 1)
+    parallel_for(
+        _find_slabs, workers,
+        (ids, screen, width, features, rows_are_ranks, first_ranks, opacities, with_depth, tickets,
+         records, found, found_starts, found_counts, counts),
+    )  # fmt: skip
+
+
+@inline
+def _deal_slabs(
+    _worker, share, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, instances
+):  # fmt: skip
+    """``deal_to_tiles`` in slabs, as long as there are any."""
+    slabs, count = counts.shape[0], found_counts.shape[0]
+    slab = take(ticket, 1)
+    while slab < slabs:
+        slot, source = slab_starts[slab], found_starts[slab]
+        for rank in range(slab * share, min(count, (slab + 1) * share)):
+            slot_starts[rank] = slot
+            for _instance in range(found_counts[rank]):
+                tile = found[source, 0]
+                place = counts[slab, tile]
+                counts[slab, tile] = place + 1
+                instances[place, 0] = rank | slot << 32
+                instances[place, 1] = found[source, 1]
+                slot += 1
+                source += 1
+        slab = take(ticket, 1)
 
 
 @kernel
@@ -242,18 +275,7 @@ def deal_to_tiles(
     for slab in range(slabs):
         running += slab_starts[slab]
         slab_starts[slab] = running - slab_starts[slab]
-    for _worker in prange(workers):
-        slab = take(ticket, 1)
-        while slab < slabs:
-            slot, source = slab_starts[slab], found_starts[slab]
-            for rank in range(slab * share, min(count, (slab + 1) * share)):
-                slot_starts[rank] = slot
-                for _instance in range(found_counts[rank]):
-                    tile = found[source, 0]
-                    place = counts[slab, tile]
-                    counts[slab, tile] = place + 1
-                    instances[place, 0] = rank | slot << 32
-                    instances[place, 1] = found[source, 1]
-                    slot += 1
-                    source += 1
-            slab = take(ticket, 1)
+    parallel_for(
+        _deal_slabs, workers,
+        (share, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, instances),
+    )  # fmt: skip

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import functools
+import glob
 import hashlib
 import logging
+import pickle
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.serialize import dumps
+from numba.core.typed_passes import NativeLowering
+from numba.np.ufunc.parallel import _launch_threads
 
 log = logging.getLogger(__name__)
 
@@ -28,13 +36,62 @@ _FINGERPRINT = hashlib.sha256(
 ).hexdigest()[:12]
 
 
+@functools.cache  # of many kernels in one folder, the first says it for all
+def _warn_once(message: str) -> None:
+    log.warning(message)
+
+
 class _CacheFiles(CompileResultCacheImpl):
+    """What lies in a file of the cache: a hash and what it is of, for damaged instructions would crash the process."""
+
     def get_filename_base(self, fullname: str, abiflags: str) -> str:
         return f"{super().get_filename_base(fullname, abiflags)}-{_FINGERPRINT}"
 
+    def reduce(self, result: Any) -> tuple[bytes, bytes]:
+        code = dumps(super().reduce(result))
+        return hashlib.sha256(code).digest(), code
+
+    def rebuild(self, context: Any, payload: tuple[bytes, bytes]) -> Any:
+        digest, code = payload
+        if hashlib.sha256(code).digest() != digest:
+            raise ValueError("damaged")
+        return super().rebuild(context, pickle.loads(code))
+
 
 class _Cache(FunctionCache):
+    """Numba's cache of a function in a folder; whatever is wrong with the folder costs time, not the run."""
+
     _impl_class = _CacheFiles
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        try:
+            return super().load_overload(signature, context)
+        except Exception:  # reading what was cut off raises anything
+            _warn_once(f"the kernels' cache in {self.cache_path} is damaged: what cannot be read is compiled anew")
+            with suppress(OSError):
+                for path in Path(self.cache_path).glob(f"{glob.escape(self._impl.filename_base)}.*"):
+                    path.unlink(missing_ok=True)
+        return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        try:
+            super().save_overload(signature, result)
+        except Exception as error:
+            _warn_once(
+                f"the kernels' cache in {self.cache_path} cannot be written ({getattr(error, 'strerror', None) or error}): "
+                "until it can, each run compiles them; make room, or set NUMBA_CACHE_DIR to another folder"
+            )
+
+
+def _cache_on_disk(compiled: Any, function: Callable) -> None:
+    """Beside the source, or in the user's folder of caches where that cannot be written; NUMBA_CACHE_DIR goes first."""
+    try:
+        compiled._cache = _Cache(function)
+    except (RuntimeError, OSError):
+        _warn_once(
+            f"no folder for compiled kernels can be written, neither {Path(__file__).parent / '__pycache__'} nor the "
+            "user's own: each run compiles them; set NUMBA_CACHE_DIR to a folder that can be written"
+        )
 
 
 # Numba's 'workqueue' threads, the fallback where there is no OpenMP, abort the process if two Python threads use them
@@ -42,37 +99,66 @@ class _Cache(FunctionCache):
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def _callable(function: Callable, **options: bool) -> Callable:
-    compiled = numba.njit(fastmath=FASTMATH, error_model="numpy", nogil=True, **options)(function)
-    compiled._cache = _Cache(function)
+def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
+    """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
+    compiled = numba.njit(fastmath=fastmath, error_model="numpy", nogil=True)(function)
+    _cache_on_disk(compiled, function)
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
         with _ONE_AT_A_TIME:
+            _launch_threads()  # before code that calls them is loaded; does nothing the second time
             return compiled(*arguments)
 
     call.compiled = compiled
     return call
 
 
-def kernel(function: Callable) -> Callable:
-    """``function`` compiled for Python callers: parallel over ``prange``, without the GIL, cached on disk."""
-    return _callable(function, parallel=True)
+def exact_kernel(function: Callable) -> Callable:
+    """A ``kernel`` that rounds after every operation, as sums and products that must cancel exactly want it."""
+    return kernel(function, fastmath=set())
 
 
-def serial_kernel(function: Callable) -> Callable:
-    """``function`` compiled for Python callers, to run in one thread."""
-    return _callable(function)
+class _CodeToLink(JITCodeLibrary):
+    """Code that is linked into kernels, where it is optimised and turned into instructions, and not before."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerToLink(NativeLowering):
+    """Numba's lowering of a function that nobody calls from Python: no wrappers, no instructions."""
+
+    _name = "lowering_to_link"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _CodeToLink(state.targetctx.codegen(), state.func_id.func_qualname)
+        for flag in ("no_compile", "no_cpython_wrapper", "no_cfunc_wrapper"):
+            setattr(state.flags, flag, True)
+        super().run_pass(state)
+        handle = [].copy  # callers know a function by something of its own that is built in, and never call that
+        state.targetctx.insert_user_function(handle, state.cr.fndesc, [state.library])
+        state.cr = state.cr._replace(cfunc=handle)
+        return True
+
+
+class _CompilerToLink(CompilerBase):
+    def define_pipelines(self) -> list:
+        manager = PassManager("to link")
+        for step, description in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
+            manager.add_pass(_LowerToLink if step is NativeLowering else step, description)
+        manager.finalize()
+        return [manager]
 
 
 def inline(function: Callable) -> Callable:
     """``function`` compiled into the kernels that call it."""
-    return numba.njit(fastmath=FASTMATH, error_model="numpy", forceinline=True)(function)
-
-
-def part(function: Callable) -> Callable:
-    """``function`` as a piece of the one kernel that calls it, which compiles faster than a function of its own."""
-    return numba.njit(fastmath=FASTMATH, error_model="numpy", inline="always")(function)
+    options = {"fastmath": FASTMATH, "error_model": "numpy", "forceinline": True}
+    return numba.njit(pipeline_class=_CompilerToLink, **options)(function)
 
 
 class _Announcer(event.Listener):

@@ -22,16 +22,16 @@ to the same number.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from heatsplat.kernels.binning import feature_row
 from heatsplat.kernels.buffers import aligned
-from heatsplat.kernels.compilation import inline, kernel, part
+from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     BLOCK,
     BLOCKS,
+    CHUNK,
     DEPTH_GRADIENT,
     ELLIPSE,
     FIRST,
@@ -53,12 +53,11 @@ from heatsplat.kernels.layout import (
     channels,
     feature_column,
     has_absgrad,
-    has_depth,
     modalities,
     modality_of,
     slot_columns,
 )
-from heatsplat.kernels.scheduling import take
+from heatsplat.kernels.scheduling import parallel_for, take
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -147,7 +146,7 @@ def _unfinished(layout, tile, transmittances):
     return mask
 
 
-@part
+@inline
 def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centres, transmittances, image):
     """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
 
@@ -195,7 +194,7 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centr
     return last
 
 
-@part
+@inline
 def _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth):
     """Copies the state of a tile into the images, with the background behind it."""
     height, width, colours = features.shape
@@ -211,8 +210,25 @@ def _write_tile(layout, tile, tiles_x, transmittances, image, background, featur
                 behind = transmittances[block, modality_of(layout, channel), lane]
                 image[block, channel, lane] += behind * background[channel]
                 features[top + y, left + x, channel] = image[block, channel, lane]
-            if has_depth(layout):
+            if depth.shape[0] > 0:
                 depth[top + y, left + x] = image[block, colours, lane]
+
+
+@inline
+def _composite_tiles(
+    _worker, layout, records, instances, tile_starts, centres, background, ticket,
+    tile_ends, transmittances, image, features, alpha, depth,
+):  # fmt: skip
+    """``composite`` in tiles, as long as there are any."""
+    tiles_x = (features.shape[1] + TILE - 1) // TILE
+    tile = take(ticket, 1)
+    while tile < tile_ends.shape[0]:
+        tile_ends[tile] = _composite_tile(
+            layout, tile, tiles_x, records, instances, tile_starts[tile], tile_starts[tile + 1], centres,
+            transmittances, image,
+        )  # fmt: skip
+        _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth)
+        tile = take(ticket, 1)
 
 
 @kernel
@@ -229,21 +245,16 @@ def composite(
         background, ticket: [C] and [1] int64, zero.
         tile_ends: out [tiles], the end of the instances that mattered to a tile.
         transmittances, image: out [tiles * BLOCKS, modalities or channels, LANES], the final state of the pixels.
-        features, alpha, depth: out [H, W, C], [M, H, W], and [H, W] where the layout has depth.
+        features, alpha, depth: out [H, W, C], [M, H, W], and [H, W] where the last channel is depth, else [0, 0].
     """
-    tiles_x = (features.shape[1] + TILE - 1) // TILE
-    for _worker in prange(workers):
-        tile = take(ticket, 1)
-        while tile < tile_ends.shape[0]:
-            tile_ends[tile] = _composite_tile(
-                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_starts[tile + 1], centres,
-                transmittances, image,
-            )  # fmt: skip
-            _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth)
-            tile = take(ticket, 1)
+    parallel_for(
+        _composite_tiles, workers,
+        (layout, records, instances, tile_starts, centres, background, ticket,
+         tile_ends, transmittances, image, features, alpha, depth),
+    )  # fmt: skip
 
 
-@part
+@inline
 def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker):
     """Copies the gradients of a tile's pixels into blocks; those of pixels outside of the image are zero."""
     height, width, colours = v_features.shape
@@ -257,13 +268,13 @@ def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixel
             lane = y % BLOCK * BLOCK + x % BLOCK
             for channel in range(colours):
                 v_pixels[block, channel, lane] = v_features[top + y, left + x, channel]
-            if has_depth(layout):
+            if v_depth.shape[0] > 0:
                 v_pixels[block, colours, lane] = v_depth[top + y, left + x]
             for modality in range(modalities(layout)):
                 v_pixels[block, channels(layout) + modality, lane] = v_alpha[modality, top + y, left + x]
 
 
-@part
+@inline
 def _start(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
     """Sets a worker's pixels to what they are before the first Gaussian; adds to the background's gradient."""
     size = channels(layout) + modalities(layout)
@@ -283,7 +294,7 @@ def _start(layout, tile, colours, transmittances, image, v_pixels, worker, state
             v_background[tile, channel] += total(left * load_vector(v_pixels, here * size + channel))
 
 
-@part
+@inline
 def _write_slot(layout, slots, slot, sums):
     """Writes the sums over lanes of a slot's columns."""
     if slot_columns(layout) <= LANES:
@@ -293,13 +304,13 @@ def _write_slot(layout, slots, slot, sums):
             slots[slot, column] = total(sums[column])
 
 
-@part
+@inline
 def _clear_slot(slots, slot):
     for column in range(0, slots.shape[1], LANES):
         store_first(slots, slot * slots.shape[1] + column, splat(0.0), slots.shape[1] - column)
 
 
-@part
+@inline
 def _composite_tile_backward(
     layout, tile, tiles_x, records, instances, begin, end, centres, v_pixels, worker, state, slots
 ):  # fmt: skip
@@ -357,11 +368,32 @@ def _composite_tile_backward(
             sums[3] = sums[3] + g1 * u2
             sums[4] = sums[4] + g2 * u2
             for channel in range(channels(layout)):
-                is_depth = has_depth(layout) and channel == channels(layout) - 1
-                column = DEPTH_GRADIENT if is_depth else OPACITY_GRADIENTS + modalities(layout) + channel
+                column = OPACITY_GRADIENTS + modalities(layout) + channel
                 v_pixel = load_vector(v_pixels, here * size + channel)
                 sums[column] = sums[column] + weights[modality_of(layout, channel)] * v_pixel
         _write_slot(layout, slots, slot, sums)
+
+
+@inline
+def _composite_tiles_backward(
+    worker, layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
+    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+):  # fmt: skip
+    """``composite_backward`` in tiles, as long as there are any."""
+    tiles_x = (v_features.shape[1] + TILE - 1) // TILE
+    tile = take(ticket, 1)
+    while tile < tile_ends.shape[0]:
+        for channel in range(v_features.shape[2]):
+            v_background[tile, channel] = 0.0
+        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
+        _start(layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background)
+        _composite_tile_backward(
+            layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
+            worker, state, slots,
+        )  # fmt: skip
+        for instance in range(tile_ends[tile], tile_starts[tile + 1]):
+            _clear_slot(slots, instances[instance, 0] >> 32)
+        tile = take(ticket, 1)
 
 
 @kernel
@@ -373,28 +405,58 @@ def composite_backward(
 
     Args:
         records ... image: as ``composite`` left them.
-        v_features, v_alpha, v_depth: [H, W, C], [M, H, W], and [H, W] where the layout has depth.
+        v_features, v_alpha, v_depth: [H, W, C], [M, H, W], and [H, W] where the last channel is depth, else [0, 0].
         v_pixels, state: scratch [workers * BLOCKS, channels + modalities, LANES] and [.., 2 * modalities, LANES].
         slots: out [instances, slot_size], columns as in ``constants``.
         v_background: out [tiles, C], the gradient of the background tile by tile.
     """
-    tiles_x = (v_features.shape[1] + TILE - 1) // TILE
-    for worker in prange(workers):
-        tile = take(ticket, 1)
-        while tile < tile_ends.shape[0]:
-            for channel in range(v_features.shape[2]):
-                v_background[tile, channel] = 0.0
-            _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
-            _start(
-                layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background
-            )  # fmt: skip
-            _composite_tile_backward(
-                layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
-                worker, state, slots,
-            )  # fmt: skip
-            for instance in range(tile_ends[tile], tile_starts[tile + 1]):
-                _clear_slot(slots, instances[instance, 0] >> 32)
-            tile = take(ticket, 1)
+    parallel_for(
+        _composite_tiles_backward, workers,
+        (layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
+         v_features, v_alpha, v_depth, v_pixels, state, slots, v_background),
+    )  # fmt: skip
+
+
+@inline
+def _sum_chunk(
+    chunk, ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+    sums, v_opacities, v_features, absgrad,
+):  # fmt: skip
+    """``sum_slots`` of CHUNK visible Gaussians."""
+    modalities, colours = opacities.shape[0], v_features.shape[1]
+    size = slots.shape[1]
+    for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, ids.shape[0])):
+        ahead = np.int64(ids[min(rank + RANKS_AHEAD, ids.shape[0] - 1)])
+        prefetch(sums, ahead * SUMS)
+        prefetch(opacities, ahead)
+        prefetch(v_opacities, ahead)
+        prefetch(v_features, ahead * colours)
+        gaussian = np.int64(ids[rank])
+        slot, end = slot_starts[rank], slot_starts[rank + 1]
+        if slot == end:
+            store_first(sums, gaussian * SUMS, splat(0.0), SUMS)
+            continue
+        for column in range(0, size, LANES):
+            added = load(slots, slot * size + column)
+            for other in range(slot + 1, end):
+                added = added + load(slots, other * size + column)
+            store_first(slots, slot * size + column, added, size - column)
+        store_first(sums, gaussian * SUMS, load(slots, slot * size), SUMS)
+        sums[gaussian, LOG_OPACITY_GRADIENT] = 0.0
+        for modality in range(modalities):
+            v_log_opacity = slots[slot, OPACITY_GRADIENTS + modality]
+            opacity = opacities[modality, gaussian]
+            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else 0.0
+            sums[gaussian, LOG_OPACITY_GRADIENT] += v_log_opacity
+        column = OPACITY_GRADIENTS + modalities
+        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
+        for channel in range(colours):
+            v_features[row, channel] = slots[slot, column + channel]
+        column += colours
+        sums[gaussian, DEPTH_GRADIENT] = slots[slot, column] if with_depth else np.float32(0.0)
+        column += np.int64(with_depth)
+        for axis in range(absgrad.shape[1]):
+            absgrad[gaussian, axis] = slots[slot, column + axis] * TWO_LN_2
 
 
 @kernel
@@ -414,36 +476,8 @@ def sum_slots(
         v_opacities, v_features: out [M, N], and [N, C] or [n, C].
         absgrad: out [N, 2], or [0, 0] where it is not wanted.
     """
-    modalities, colours = opacities.shape[0], v_features.shape[1]
-    size = slots.shape[1]
-    for rank in prange(ids.shape[0]):
-        ahead = np.int64(ids[min(rank + RANKS_AHEAD, ids.shape[0] - 1)])
-        prefetch(sums, ahead * SUMS)
-        prefetch(opacities, ahead)
-        prefetch(v_opacities, ahead)
-        prefetch(v_features, ahead * colours)
-        gaussian = np.int64(ids[rank])
-        slot, end = slot_starts[rank], slot_starts[rank + 1]
-        if slot == end:
-            store_first(sums, gaussian * SUMS, splat(0.0), SUMS)
-            continue
-        for column in range(0, size, LANES):
-            added = load(slots, slot * size + column)
-            for other in range(slot + 1, end):
-                added = added + load(slots, other * size + column)
-            store_first(slots, slot * size + column, added, size - column)
-        store_first(sums, gaussian * SUMS, load(slots, slot * size), SUMS)
-        if not with_depth:
-            sums[gaussian, DEPTH_GRADIENT] = 0.0
-        sums[gaussian, LOG_OPACITY_GRADIENT] = 0.0
-        for modality in range(modalities):
-            v_log_opacity = slots[slot, OPACITY_GRADIENTS + modality]
-            opacity = opacities[modality, gaussian]
-            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else 0.0
-            sums[gaussian, LOG_OPACITY_GRADIENT] += v_log_opacity
-        column = OPACITY_GRADIENTS + modalities
-        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
-        for channel in range(colours):
-            v_features[row, channel] = slots[slot, column + channel]
-        for axis in range(absgrad.shape[1]):
-            absgrad[gaussian, axis] = slots[slot, column + colours + axis] * TWO_LN_2
+    parallel_for(
+        _sum_chunk, (ids.shape[0] + CHUNK - 1) // CHUNK,
+        (ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
+         sums, v_opacities, v_features, absgrad),
+    )  # fmt: skip

@@ -38,10 +38,10 @@ LIMIT, PEAK, SLOPE, INVERSE_FIRST = range(11, 15)  # see binning
 RANK = 15  # place among the visible Gaussians of its chunk
 SCREEN = 16
 
-# Columns of a gradient slot: moments of the gradient (see compositing), the gradients of depth, of the logarithms of
-# the opacities, of the features, and two absolute ones where they are wanted.
+# Columns of a gradient slot: five moments of the gradient (see compositing), the gradients of the logarithms of the
+# opacities, of the channels, and two absolute ones where they are wanted.
+OPACITY_GRADIENTS = 5
+# Columns of ``sums``, what the projection's backward pass needs of the summed slots: the moments, and
 DEPTH_GRADIENT = 5
-OPACITY_GRADIENTS = 6
-# Columns of ``sums``, what the projection's backward pass needs of the summed slots: the first six, and
 LOG_OPACITY_GRADIENT = 6  # of all opacities together
 SUMS = 8

@@ -1,4 +1,4 @@
-"""Heat balances of surfaces, marched along a record of weather: one Gaussian at a time, in float64, with sensitivities.
+"""Heat balances of surfaces, integrated along a record of weather: one Gaussian at a time, in float64, with sensitivities.
 
 heatsplat.physics.energy_balance and heatsplat.physics.sunlight say what the symbols mean and drive these kernels. A value
 comes with its derivatives by all parameters, which obey linear equations with the same exponentials and cost a few
@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from numba import prange
-
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.compile_time import compile_time, constant
+from heatsplat.kernels.scheduling import parallel_for
 
 BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
@@ -21,15 +20,15 @@ MEMORY = 15.0  # time constants after which a body has forgotten: e^-15 of 50 K 
 SUBSTEPS = 8  # of an interval between samples, at most: of bodies that settle within it
 STEP = 0.35  # of y that one substep covers, if they suffice
 
-# Rows of the drivers of ``march``; those of effects that are off are not read.
-AIR, SKY, AROUND, LIGHT, BREEZE, BEAM_X, BEAM_Y, BEAM_Z = range(8)
+# Rows of the drivers of ``integrate``; those of effects that are off are not read.
+AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z = range(8)
 START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 
 
 @compile_time
 @dataclass(frozen=True)
 class Balance:
-    """Which effects a heat balance has beside the air; ``march`` is compiled for each, without a trace of the others.
+    """Which effects a heat balance has beside the air; ``integrate`` is compiled for each, without a trace of the others.
 
     Args:
         radiates: with the share p of exchange that is radiation.
@@ -84,6 +83,48 @@ def weights(y):
     return decay, first, second, (0.5 - second) / y
 
 
+@inline
+def _recent_sunlight_block(block, normals, log_rates, steps, beams, last, responses, slopes, vectors):
+    """``recent_sunlight`` of BLOCK Gaussians."""
+    count, intervals = log_rates.shape[0], steps.shape[0]
+    for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+        nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        rate = math.exp(float(log_rates[i]))
+        y, response, slope, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        bx, by, bz = beams[0, 0], beams[0, 1], beams[0, 2]
+        u = nx * bx + ny * by + nz * bz
+        if u <= 0.0:
+            u, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+        seconds, decay, before, after, phi = -1.0, 1.0, 0.0, 0.0, 1.0
+        for k in range(intervals):
+            cx, cy, cz = beams[k + 1, 0], beams[k + 1, 1], beams[k + 1, 2]
+            v = nx * cx + ny * cy + nz * cz
+            if v <= 0.0:
+                v, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
+            step = steps[k]
+            if k == intervals - 1:
+                step *= last
+                v, cx, cy, cz = (
+                    u + last * (v - u),
+                    bx + last * (cx - bx),
+                    by + last * (cy - by),
+                    bz + last * (cz - bz),
+                )
+            if step != seconds:
+                seconds, y = step, rate * step
+                decay, phi, second, _ = weights(y)
+                after = y * second
+                before = phi - decay
+            slope = decay * (slope - y * response) + (y * decay - before) * u + before * v
+            response = decay * response + before * u + after * v
+            vx = decay * vx + before * bx + after * cx
+            vy = decay * vy + before * by + after * cy
+            vz = decay * vz + before * bz + after * cz
+            u, bx, by, bz = v, cx, cy, cz
+        responses[i], slopes[i] = response, slope
+        vectors[i, 0], vectors[i, 1], vectors[i, 2] = vx, vy, vz
+
+
 @kernel
 def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, vectors):
     """Settled responses to max(n · beam, 0), which is linear between samples, from rest at the first sample.
@@ -98,44 +139,11 @@ def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, v
         slopes: [n] filled with dY / d log a.
         vectors: [n, 3] filled with dY / dn.
     """
-    count, intervals = log_rates.shape[0], steps.shape[0]
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
-            rate = math.exp(float(log_rates[i]))
-            y, response, slope, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            bx, by, bz = beams[0, 0], beams[0, 1], beams[0, 2]
-            u = nx * bx + ny * by + nz * bz
-            if u <= 0.0:
-                u, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-            seconds, decay, before, after, phi = -1.0, 1.0, 0.0, 0.0, 1.0
-            for k in range(intervals):
-                cx, cy, cz = beams[k + 1, 0], beams[k + 1, 1], beams[k + 1, 2]
-                v = nx * cx + ny * cy + nz * cz
-                if v <= 0.0:
-                    v, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
-                step = steps[k]
-                if k == intervals - 1:
-                    step *= last
-                    v, cx, cy, cz = (
-                        u + last * (v - u),
-                        bx + last * (cx - bx),
-                        by + last * (cy - by),
-                        bz + last * (cz - bz),
-                    )
-                if step != seconds:
-                    seconds, y = step, rate * step
-                    decay, phi, second, _ = weights(y)
-                    after = y * second
-                    before = phi - decay
-                slope = decay * (slope - y * response) + (y * decay - before) * u + before * v
-                response = decay * response + before * u + after * v
-                vx = decay * vx + before * bx + after * cx
-                vy = decay * vy + before * by + after * cy
-                vz = decay * vz + before * bz + after * cz
-                u, bx, by, bz = v, cx, cy, cz
-            responses[i], slopes[i] = response, slope
-            vectors[i, 0], vectors[i, 1], vectors[i, 2] = vx, vy, vz
+    parallel_for(
+        _recent_sunlight_block,
+        (log_rates.shape[0] + BLOCK - 1) // BLOCK,
+        (normals, log_rates, steps, beams, last, responses, slopes, vectors),
+    )
 
 
 @inline
@@ -146,8 +154,8 @@ def power(x, reference):
 
 
 @inline
-def march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
-    """``march`` for the Gaussian ``i``; ``final`` is the sample before ``time``.
+def integrate_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
+    """``integrate`` for the Gaussian ``i``; ``final`` is the sample before ``time``.
 
     On its own, because Numba takes the body of a parallel loop through its passes twice, and this one is long.
     """
@@ -172,17 +180,17 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
         k -= 1
         slowest = 1.0
         if windy(balance):
-            slowest += v * min(drivers[BREEZE, k], drivers[BREEZE, k + 1])
+            slowest += v * min(drivers[WIND_ANOMALY, k], drivers[WIND_ANOMALY, k + 1])
         if radiates(balance):
             slowest = (1.0 - p) * slowest + 0.7 * p
         age += r * slowest * (times[k + 1] - times[k])
     remembers = k == 0 and age < MEMORY
     air = drivers[AIR, k]
     c, tilt, sky, light, sun, w, w_slope = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    breeze, bx, by, bz = 0.0, 0.0, 0.0, 0.0
+    wind_anomaly, bx, by, bz = 0.0, 0.0, 0.0, 0.0
     if windy(balance):
-        breeze = drivers[BREEZE, k]
-        c = 1.0 + v * breeze
+        wind_anomaly = drivers[WIND_ANOMALY, k]
+        c = 1.0 + v * wind_anomaly
     if sunny(balance):
         light = drivers[LIGHT, k]
         sun = f * light
@@ -210,12 +218,12 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
         seconds = interval * ending
         # Differences to the end of the interval, and the fastest that the body can be within it.
         d_air = drivers[AIR, k + 1] - air
-        d_breeze, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
+        d_wind_anomaly, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
         ex, ey, ez = 0.0, 0.0, 0.0
         fastest = 1.0
         if windy(balance):
-            d_breeze = drivers[BREEZE, k + 1] - breeze
-            fastest += v * max(breeze, breeze + d_breeze)
+            d_wind_anomaly = drivers[WIND_ANOMALY, k + 1] - wind_anomaly
+            fastest += v * max(wind_anomaly, wind_anomaly + d_wind_anomaly)
         if radiates(balance):
             fastest = (1.0 - p) * fastest + p * w_slope
             tilt_2 = drivers[SKY, k + 1] - drivers[AROUND, k + 1]
@@ -237,10 +245,10 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
         for _ in range(substeps):
             # Linear part: the slope of w here, and the wind halfway.
             air_2, c_2 = air + share * d_air, c
-            breeze_2, tilt_2, sky_2, light_2, sun_2 = breeze, tilt, sky, light, sun
+            wind_anomaly_2, tilt_2, sky_2, light_2, sun_2 = wind_anomaly, tilt, sky, light, sun
             if windy(balance):
-                breeze_2 = breeze + share * d_breeze
-                c_2 = 1.0 + v * breeze_2
+                wind_anomaly_2 = wind_anomaly + share * d_wind_anomaly
+                c_2 = 1.0 + v * wind_anomaly_2
                 if radiates(balance):
                     c_2 *= 1.0 - p
             slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
@@ -279,13 +287,13 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
             if radiates(balance):
                 calm, calm_2 = air - x, air_2 - new
                 if windy(balance):
-                    calm *= 1.0 + v * breeze
-                    calm_2 *= 1.0 + v * breeze_2
+                    calm *= 1.0 + v * wind_anomaly
+                    calm_2 *= 1.0 + v * wind_anomaly_2
                 d_share = decay * d_share + one * (sky - w - calm) + two * (sky_2 - w_2 - calm_2)
             if sunny(balance):
                 d_sun = decay * d_sun + one * sun + two * sun_2
             if windy(balance):
-                gust = one * breeze * (air - x) + two * breeze_2 * (air_2 - new)
+                gust = one * wind_anomaly * (air - x) + two * wind_anomaly_2 * (air_2 - new)
                 if radiates(balance):
                     gust *= 1.0 - p
                 d_wind = decay * d_wind + gust
@@ -306,7 +314,15 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
                     dz += g * (one * bz + two * cz)
                     bx, by, bz = cx, cy, cz
             x, air, c = new, air_2, c_2
-            w, w_slope, breeze, tilt, sky, light, sun = w_2, slope_2, breeze_2, tilt_2, sky_2, light_2, sun_2
+            w, w_slope, wind_anomaly, tilt, sky, light, sun = (
+                w_2,
+                slope_2,
+                wind_anomaly_2,
+                tilt_2,
+                sky_2,
+                light_2,
+                sun_2,
+            )
         k += 1
     temperatures[i] = x
     sensitivities[i, START] = d_start if remembers else 0.0
@@ -323,11 +339,21 @@ def march_one(balance, i, parameters, times, drivers, up, reference, time, final
         sensitivities[i, column + 2] = dz
 
 
+@inline
+def _integrate_block(
+    block, balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities
+):
+    """``integrate`` of BLOCK Gaussians; ``final`` is the sample before ``time``."""
+    count = parameters.shape[0]
+    for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+        integrate_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
+
+
 @kernel
-def march(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
+def integrate(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
     """Temperatures at a time under the full balance: T⁴ as it is, wind as it blows.
 
-    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v breeze), G = light f +
+    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v wind_anomaly), G = light f +
     max(n · beam, 0), s = f sky + (1 - f) around and f = (1 + n · up) / 2. Exponential Rosenbrock steps of third order
     (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. A
     body starts where it can still be remembered.
@@ -344,10 +370,11 @@ def march(balance, parameters, times, drivers, up, reference, time, temperatures
         temperatures: [n] filled with x.
         sensitivities: [n, P] filled with the derivatives of x by the parameters.
     """
-    count = parameters.shape[0]
     final = times.shape[0] - 2
     while final > 0 and times[final] >= time:
         final -= 1
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            march_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
+    parallel_for(
+        _integrate_block,
+        (parameters.shape[0] + BLOCK - 1) // BLOCK,
+        (balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities),
+    )

@@ -1,4 +1,8 @@
-"""The channels of an image as a compile-time constant: compositing is compiled once per layout."""
+"""The channels of an image as a compile-time constant: compositing is compiled once per layout.
+
+Only what shapes the innermost loops is part of it. Depth is one more channel; whether the last one is depth is known at
+run time.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +24,13 @@ class Layout:
     """Which modality composites which channel.
 
     Args:
-        modality_of: one entry per channel, the modality whose opacity composites it.
+        modality_of: one entry per channel, depth included, the modality whose opacity composites it.
         modalities: how many modalities there are; one without channels still has an alpha.
-        depth: whether the last channel is depth, which has no background.
-        absgrad: whether the backward pass also gathers absolute screen gradients.
+        absgrad: whether the backward pass also gathers absolute screen gradients; false in the forward pass.
     """
 
     modality_of: tuple[int, ...]
     modalities: int = 1
-    depth: bool = False
     absgrad: bool = False
 
     @property
@@ -48,7 +50,7 @@ class Layout:
     @property
     def slot_columns(self) -> int:
         """Numbers per gradient slot (heatsplat.kernels.constants has their order)."""
-        return OPACITY_GRADIENTS + self.modalities + self.channels - self.depth + 2 * self.absgrad
+        return OPACITY_GRADIENTS + self.modalities + self.channels + 2 * self.absgrad
 
     @property
     def slot_size(self) -> int:
@@ -60,7 +62,6 @@ channels = constant("channels")
 modalities = constant("modalities")
 feature_column = constant("feature_column")
 slot_columns = constant("slot_columns")
-has_depth = constant("depth")
 has_absgrad = constant("absgrad")
 
 

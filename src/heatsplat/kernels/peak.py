@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numba
 import numpy as np
 
-from heatsplat.kernels.compilation import kernel
-from heatsplat.kernels.scheduling import use_threads
+from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.scheduling import parallel_for, use_threads
 from heatsplat.kernels.simd import LANES, load, store
 
+SHARE = 2**14  # numbers per parallel task
 _CHAINS = 8  # independent sums, enough to hide the latency of one multiply-add
 
 
@@ -42,22 +42,31 @@ def _quickest(work: Callable[[], None], seconds: float) -> float:
     return best
 
 
+@inline
+def _multiply_add_row(row, values, rounds):
+    """Chains of multiply-adds on a row of numbers."""
+    own = values[row]
+    factor = load(own, 16 * LANES)
+    a, b, c, d = load(own, 0), load(own, LANES), load(own, 2 * LANES), load(own, 3 * LANES)
+    e, f, g, h = load(own, 4 * LANES), load(own, 5 * LANES), load(own, 6 * LANES), load(own, 7 * LANES)
+    for _ in range(rounds):
+        a, b, c, d = a * factor + factor, b * factor + factor, c * factor + factor, d * factor + factor
+        e, f, g, h = e * factor + factor, f * factor + factor, g * factor + factor, h * factor + factor
+    store(own, 8 * LANES, a + b + c + d + e + f + g + h)
+
+
 @kernel
 def _multiply_add(values, rounds):
-    for row in numba.prange(values.shape[0]):
-        own = values[row]
-        factor = load(own, 16 * LANES)
-        a, b, c, d = load(own, 0), load(own, LANES), load(own, 2 * LANES), load(own, 3 * LANES)
-        e, f, g, h = load(own, 4 * LANES), load(own, 5 * LANES), load(own, 6 * LANES), load(own, 7 * LANES)
-        for _ in range(rounds):
-            a, b, c, d = a * factor + factor, b * factor + factor, c * factor + factor, d * factor + factor
-            e, f, g, h = e * factor + factor, f * factor + factor, g * factor + factor, h * factor + factor
-        store(own, 8 * LANES, a + b + c + d + e + f + g + h)
+    parallel_for(_multiply_add_row, values.shape[0], (values, rounds))
+
+
+@inline
+def _double_block(block, numbers):
+    """Doubles SHARE numbers."""
+    for k in range(block * SHARE, (block + 1) * SHARE, LANES):
+        store(numbers, k, load(numbers, k) * np.float32(2.0))
 
 
 @kernel
 def _double(numbers):
-    share = 2**14
-    for block in numba.prange(numbers.shape[0] // share):
-        for k in range(block * share, (block + 1) * share, LANES):
-            store(numbers, k, load(numbers, k) * np.float32(2.0))
+    parallel_for(_double_block, numbers.shape[0] // SHARE, (numbers,))

@@ -4,10 +4,10 @@ Plain twin: heatsplat.geometry.projection, under autograd.
 
 **Convention:** R is the rotation of a Gaussian, s its semi-axes, W the rotation of the camera and J the 2x3 Jacobian
 of the projection, whose x/z and y/z are clamped to the field of view and a margin. The rows of J W R diag(s) are U
-and V, so that the screen covariance with its blur is
+and V, so that the screen covariance with its blur eps2d is
 
-    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + blur I,
-    det = |U x V|^2 + blur (U.U + V.V) + blur^2        (Cauchy-Binet: a sum of squares, which never cancels).
+    [[a, b], [b, c]] = [[U.U, U.V], [U.V, V.V]] + eps2d I,
+    det = |U x V|^2 + eps2d (U.U + V.V) + eps2d^2        (Cauchy-Binet: a sum of squares, which never cancels).
 
 Offsets (dx, dy) from the mean are whitened by the Cholesky factor of the inverse covariance instead of multiplied by
 the inverse itself,
@@ -23,9 +23,8 @@ inverse.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from heatsplat.kernels.compilation import inline, kernel, part
+from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.constants import (
     ALPHA_MIN,
     BLOCK,
@@ -43,6 +42,7 @@ from heatsplat.kernels.constants import (
     TWO_LN_2,
     WHITENING,
 )
+from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -69,7 +69,7 @@ from heatsplat.kernels.simd import (
 FX, FY, CX, CY = range(12, 16)
 LOWEST_X, HIGHEST_X, LOWEST_Y, HIGHEST_Y = range(16, 20)  # limits of x/z and y/z in the Jacobian
 NEAR, FAR = 20, 21
-BLUR, BLUR_SQUARED = 22, 23  # pixels² added to the screen covariance, and their square
+EPS2D, EPS2D_SQUARED = 22, 23  # pixels² added to the screen covariance, and their square
 CAMERA = 24
 
 
@@ -161,12 +161,12 @@ def _times_rotation(a, r):
 
 
 @inline
-def _covariance(blur, u, v):
-    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the blur."""
+def _covariance(eps2d, u, v):
+    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the eps2d."""
     normal = _cross(u, v)
     uu, vv = _dot(u, u), _dot(v, v)
     sharp = _dot(normal, normal)
-    return uu + blur[0], _dot(u, v), vv + blur[0], sharp + blur[0] * (uu + vv) + blur[1], sharp
+    return uu + eps2d[0], _dot(u, v), vv + eps2d[0], sharp + eps2d[0] * (uu + vv) + eps2d[1], sharp
 
 
 @inline
@@ -233,7 +233,7 @@ def _largest_opacity(opacities, first, rows):
     return opacity
 
 
-@part
+@inline
 def _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scratch):
     """Writes the rows of visible Gaussians and their ids from ``place`` on; returns the place after."""
     for column in range(RANK):
@@ -251,9 +251,9 @@ def _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scr
     return place
 
 
-@part
+@inline
 def _project_block(
-    first, means, quats, scales, opacities, camera, blur, width, height, antialiased,
+    first, means, quats, scales, opacities, camera, eps2d, width, height, antialiased,
     screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
 ):  # fmt: skip
     """Projects Gaussians ``first`` to ``first + 15``; writes visible ids from ``place`` on, returns the place after."""
@@ -261,7 +261,7 @@ def _project_block(
     _, (x, y, z), (_, _, inverse_z), (_, length), _, _, turned, axes = _seen_from(
         camera, means, quats, scales, first, rows
     )
-    a, b, c, determinant, sharp = _covariance(blur, _times(turned[0], axes), _times(turned[1], axes))
+    a, b, c, determinant, sharp = _covariance(eps2d, _times(turned[0], axes), _times(turned[1], axes))
     opacity = _largest_opacity(opacities, first, rows)
     if antialiased:
         opacity = opacity * sqrt(sharp / determinant)
@@ -305,6 +305,26 @@ def _project_block(
     return _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scratch)
 
 
+@inline
+def _project_chunk(
+    chunk, means, quats, scales, opacities, camera, width, height, antialiased,
+    screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
+):  # fmt: skip
+    """Projects the Gaussians of a chunk; leaves how many are visible, and how many tiles they may touch."""
+    begin = chunk * CHUNK
+    place = begin
+    eps2d = camera[EPS2D], camera[EPS2D_SQUARED]
+    for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
+        place = _project_block(
+            block, means, quats, scales, opacities, camera, eps2d, width, height, antialiased,
+            screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
+        )  # fmt: skip
+    first_ranks[chunk] = place - begin
+    bounds[chunk] = 0
+    for k in range(begin, place):
+        bounds[chunk] += box_tiles(ids[k], screen)
+
+
 @kernel
 def project(
     means, quats, scales, opacities, camera, width, height, antialiased,
@@ -324,19 +344,11 @@ def project(
         bounds, scratch: scratch [chunks] int64 and [chunks, RANK, LANES].
     """
     chunks = first_ranks.shape[0]
-    for chunk in prange(chunks):
-        begin = chunk * CHUNK
-        place = begin
-        blur = camera[BLUR], camera[BLUR_SQUARED]
-        for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
-            place = _project_block(
-                block, means, quats, scales, opacities, camera, blur, width, height, antialiased,
-                screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
-            )  # fmt: skip
-        first_ranks[chunk] = place - begin
-        bounds[chunk] = 0
-        for k in range(begin, place):
-            bounds[chunk] += box_tiles(ids[k], screen)
+    parallel_for(
+        _project_chunk, chunks,
+        (means, quats, scales, opacities, camera, width, height, antialiased,
+         screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch),
+    )  # fmt: skip
     visible, tiles = np.int64(0), np.int64(0)
     for chunk in range(chunks):
         here = first_ranks[chunk]
@@ -349,7 +361,7 @@ def project(
 
 
 @inline
-def _covariance_backward(blur, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased):
+def _covariance_backward(eps2d, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased):
     """Gradients of U and V, from the moments of g: with the whitening as a matrix L, the gradient of the covariance is
     L (sum of g u u^T) L^T / 2, of which twice the products with U and V follow."""
     one, mixed, two = whitening
@@ -360,7 +372,7 @@ def _covariance_backward(blur, u, v, determinant, sharp, whitening, moments, v_l
     if antialiased:
         # The opacity was multiplied by sqrt(|U x V|^2 / det); |U x V|^2 is far from 0, or nothing would have been seen.
         normal = _cross(u, v)
-        spread, shrink = v_log_opacity / sharp - v_log_opacity / determinant, v_log_opacity * blur[0] / determinant
+        spread, shrink = v_log_opacity / sharp - v_log_opacity / determinant, v_log_opacity * eps2d[0] / determinant
         v_normal = (spread * normal[0], spread * normal[1], spread * normal[2])
         through_u, through_v = _cross(v, v_normal), _cross(v_normal, u)
         v_a, v_c = v_a - shrink, v_c - shrink
@@ -407,7 +419,7 @@ def _only(visible, vectors):
     return select(visible, vectors[0], 0.0), select(visible, vectors[1], 0.0), select(visible, vectors[2], 0.0)
 
 
-@part
+@inline
 def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y):
     """Adds what Gaussians tell about rotation (0-8) and translation (9-11) of the camera."""
     jx, jy = camera[FX] * slopes[2], camera[FY] * slopes[2]
@@ -421,9 +433,9 @@ def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_her
         v_cameras[chunk, 9 + k] += np.float64(total(v_here[k]))
 
 
-@part
+@inline
 def _project_block_backward(
-    first, visible, sums, means, quats, scales, camera, blur, antialiased,
+    first, visible, sums, means, quats, scales, camera, eps2d, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
     """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
@@ -432,7 +444,7 @@ def _project_block_backward(
         camera, means, quats, scales, first, rows
     )
     u, v = _times(turned[0], axes), _times(turned[1], axes)
-    a, b, c, determinant, sharp = _covariance(blur, u, v)
+    a, b, c, determinant, sharp = _covariance(eps2d, u, v)
     whitening = _whitening(b, c, determinant)
 
     m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
@@ -440,7 +452,7 @@ def _project_block_backward(
     moments = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
     v_mean_x, v_mean_y = whitening[0] * m1, whitening[1] * m1 + whitening[2] * m2
     v_u, v_v = _covariance_backward(
-        blur, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased
+        eps2d, u, v, determinant, sharp, whitening, moments, v_log_opacity, antialiased
     )  # fmt: skip
 
     v_axes = _sum(_times(v_u, turned[0]), 1.0, _times(v_v, turned[1]), 1.0, (0.0, 0.0, 0.0))
@@ -466,6 +478,19 @@ def _project_block_backward(
         _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y)
 
 
+@inline
+def _project_chunk_backward(
+    chunk, means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
+):  # fmt: skip
+    """``project_backward`` of the Gaussians of a chunk."""
+    eps2d = camera[EPS2D], camera[EPS2D_SQUARED]
+    for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
+        _project_block_backward(
+            block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, eps2d, antialiased,
+            v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
+        )  # fmt: skip
+
+
 @kernel
 def project_backward(
     means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
@@ -478,10 +503,7 @@ def project_backward(
         v_means, v_quats, v_scales, v_means2d: out, all rows are written.
         v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
-    for chunk in prange(v_cameras.shape[0]):
-        blur = camera[BLUR], camera[BLUR_SQUARED]
-        for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
-            _project_block_backward(
-                block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, blur, antialiased,
-                v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
-            )  # fmt: skip
+    parallel_for(
+        _project_chunk_backward, v_cameras.shape[0],
+        (means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras),
+    )  # fmt: skip

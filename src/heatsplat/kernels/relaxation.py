@@ -14,9 +14,10 @@ from contextlib import contextmanager
 
 import numba
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.compilation import exact_kernel, inline, kernel
+from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
     LANES,
     exp,
@@ -63,7 +64,7 @@ def threads_for(count: int) -> Iterator[None]:
         numba.set_num_threads(before)
 
 
-@njit(cache=True)
+@njit
 def _series(square, first):
     result, term = 0.0, 1.0
     for j in range(1, first + 1):
@@ -74,7 +75,7 @@ def _series(square, first):
     return result
 
 
-@njit(cache=True)  # without contraction, which would spoil the exact product
+@exact_kernel  # contraction would spoil the exact product
 def fill_table(omega, time, table):
     """Fills ``table`` [TABLE_ROWS, padded K] with functions of ω [K] at a time, computed in float64.
 
@@ -165,6 +166,36 @@ def _responses(table, k, width, a, phi, offset, difference_row):
     return sine * inverse, cosine * inverse, inverse
 
 
+@inline
+def _forward_block(block, rate, initial, ambient, gains, places, scale, ids, time, limit, table, values):
+    """``forward`` of BLOCK Gaussians."""
+    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
+    start = block * BLOCK
+    stop = min(start + BLOCK, count)
+    scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
+    _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
+    heated = np.empty(BLOCK, np.int64)
+    for j in range(stop - start):
+        values[start + j] = scratch[RELAXED, j]
+    for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
+        j = heated[i]
+        row = ids[start + j]
+        a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
+        difference_row = NEAR if y < 1 else FAR
+        place = places[row] if places.shape[0] > 0 else row
+        source = filled(scratch, 0.0)
+        first = place * (2 * frequencies)
+        for k in range(0, frequencies, LANES):
+            sine, cosine, _ = _responses(table, k, width, a, phi, offset, difference_row)
+            sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
+            cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
+            source = source + sin_gain * sine + cos_gain * cosine
+        heat = time * sum_of_lanes(source)
+        if scale.shape[0] > 0:
+            heat = heat * scale[row]
+        values[start + j] = scratch[RELAXED, j] + heat
+
+
 @kernel
 def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, table, values):
     """Fills ``values`` [n] with the temperatures of the Gaussians ``ids``.
@@ -183,32 +214,19 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
         table: of ``fill_table``.
         values: [n] output.
     """
-    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        stop = min(start + BLOCK, count)
-        scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
-        _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
-        heated = np.empty(BLOCK, np.int64)
-        for j in range(stop - start):
-            values[start + j] = scratch[RELAXED, j]
-        for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
-            j = heated[i]
-            row = ids[start + j]
-            a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-            difference_row = NEAR if y < 1 else FAR
-            place = places[row] if places.shape[0] > 0 else row
-            source = filled(scratch, 0.0)
-            first = place * (2 * frequencies)
-            for k in range(0, frequencies, LANES):
-                sine, cosine, _ = _responses(table, k, width, a, phi, offset, difference_row)
-                sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
-                cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
-                source = source + sin_gain * sine + cos_gain * cosine
-            heat = time * sum_of_lanes(source)
-            if scale.shape[0] > 0:
-                heat = heat * scale[row]
-            values[start + j] = scratch[RELAXED, j] + heat
+    parallel_for(
+        _forward_block,
+        (ids.shape[0] + BLOCK - 1) // BLOCK,
+        (rate, initial, ambient, gains, places, scale, ids, time, limit, table, values),
+    )
+
+
+@inline
+def _clear_block(block, written, v_gains):
+    """Clears those of BLOCK rows that are not written."""
+    for row in range(block * BLOCK, min((block + 1) * BLOCK, v_gains.shape[0])):
+        if not written[row]:
+            v_gains[row] = 0
 
 
 @kernel
@@ -224,10 +242,85 @@ def clear_others(ids, written, v_gains):
     written[:] = False
     for j in range(ids.shape[0]):
         written[ids[j]] = True
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        for row in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            if not written[row]:
-                v_gains[row] = 0
+    parallel_for(_clear_block, (count + BLOCK - 1) // BLOCK, (written, v_gains))
+
+
+@inline
+def _backward_block(
+    block,
+    rate,
+    initial,
+    ambient,
+    gains,
+    places,
+    scale,
+    ids,
+    time,
+    limit,
+    table,
+    v_values,
+    v_rate,
+    v_initial,
+    v_ambient,
+    v_gains,
+    v_scale,
+):
+    """``backward`` of BLOCK Gaussians."""
+    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
+    start = block * BLOCK
+    stop = min(start + BLOCK, count)
+    scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
+    _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
+    scratch[SOURCE] = 0
+    scratch[SLOPE] = 0
+    heated = np.empty(BLOCK, np.int64)
+    for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
+        j = heated[i]
+        row = ids[start + j]
+        a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
+        fall, small = scratch[FALL, j], scratch[Y, j] < 1
+        difference_row = NEAR if small else FAR
+        v_gain = v_values[start + j] * time
+        if scale.shape[0] > 0:
+            v_gain = v_gain * scale[row]
+        source, slope = filled(scratch, 0.0), filled(scratch, 0.0)
+        place = places[row] if places.shape[0] > 0 else row
+        first = place * (2 * frequencies)
+        for k in range(0, frequencies, LANES):
+            sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
+            sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
+            cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
+            store_columns(v_gains, first + k, (sine * v_gain,), frequencies - k)
+            store_columns(v_gains, first + frequencies + k, (cosine * v_gain,), frequencies - k)
+            source = source + sin_gain * sine + cos_gain * cosine
+            if small:
+                q, o = a * a * inverse, load(table, OMEGA_SQUARED * width + k) * inverse
+                sinc2 = load(table, SINC2 * width + k)
+                theta, theta2 = scratch[THETA, j], scratch[THETA2, j]
+                inner = (q - o) * (q * theta2 + o * sinc2) - q * scratch[CHI2, j]
+                inner = inner + o * o * (load(table, COSC3 * width + k) * (2.0 * y))
+                sine_slope = load(table, X * width + k) * inner
+                cosine_slope = (q - o) * load(table, COSC1 * width + k) + 2.0 * (o * sinc2 * y - q * theta)
+                cosine_slope = cosine_slope * o - q * scratch[CHI, j]
+                slope = slope + (sin_gain * sine_slope + cos_gain * cosine_slope) * time
+            else:
+                omega, rest = load(table, OMEGA * width + k), fall - cosine
+                slope = slope + (cos_gain * (a * rest - omega * sine) - sin_gain * (a * sine + omega * rest)) * inverse
+        scratch[SOURCE, j] = sum_of_lanes(source)
+        scratch[SLOPE, j] = v_gain * sum_of_lanes(slope)
+    ambient_sum = _f(0.0)  # becomes a double among doubles
+    for j in range(stop - start):
+        row, v, fall = ids[start + j], v_values[start + j], scratch[FALL, j]
+        above = scratch[INITIAL, j] - ambient
+        v_initial[row] = v * fall
+        ambient_sum += v * (scratch[Y, j] * scratch[PHI, j])
+        if scale.shape[0] > 0:
+            v_scale[row] = v * time * scratch[SOURCE, j]
+        if rate[row] <= limit:
+            v_rate[row] = scratch[SLOPE, j] - v * above * time * fall
+        else:
+            v_rate[row] = 0
+    v_ambient[block] = ambient_sum
 
 
 @kernel
@@ -257,61 +350,25 @@ def backward(
         v_rate, v_initial, v_gains, v_scale: outputs, shaped as what they are gradients of.
         v_ambient: [blocks] output, a sum for each block of Gaussians.
     """
-    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        stop = min(start + BLOCK, count)
-        scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
-        _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
-        scratch[SOURCE] = 0
-        scratch[SLOPE] = 0
-        heated = np.empty(BLOCK, np.int64)
-        for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
-            j = heated[i]
-            row = ids[start + j]
-            a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-            fall, small = scratch[FALL, j], scratch[Y, j] < 1
-            difference_row = NEAR if small else FAR
-            v_gain = v_values[start + j] * time
-            if scale.shape[0] > 0:
-                v_gain = v_gain * scale[row]
-            source, slope = filled(scratch, 0.0), filled(scratch, 0.0)
-            place = places[row] if places.shape[0] > 0 else row
-            first = place * (2 * frequencies)
-            for k in range(0, frequencies, LANES):
-                sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
-                sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
-                cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
-                store_columns(v_gains, first + k, (sine * v_gain,), frequencies - k)
-                store_columns(v_gains, first + frequencies + k, (cosine * v_gain,), frequencies - k)
-                source = source + sin_gain * sine + cos_gain * cosine
-                if small:
-                    q, o = a * a * inverse, load(table, OMEGA_SQUARED * width + k) * inverse
-                    sinc2 = load(table, SINC2 * width + k)
-                    theta, theta2 = scratch[THETA, j], scratch[THETA2, j]
-                    inner = (q - o) * (q * theta2 + o * sinc2) - q * scratch[CHI2, j]
-                    inner = inner + o * o * (load(table, COSC3 * width + k) * (2.0 * y))
-                    sine_slope = load(table, X * width + k) * inner
-                    cosine_slope = (q - o) * load(table, COSC1 * width + k) + 2.0 * (o * sinc2 * y - q * theta)
-                    cosine_slope = cosine_slope * o - q * scratch[CHI, j]
-                    slope = slope + (sin_gain * sine_slope + cos_gain * cosine_slope) * time
-                else:
-                    omega, rest = load(table, OMEGA * width + k), fall - cosine
-                    slope = (
-                        slope + (cos_gain * (a * rest - omega * sine) - sin_gain * (a * sine + omega * rest)) * inverse
-                    )
-            scratch[SOURCE, j] = sum_of_lanes(source)
-            scratch[SLOPE, j] = v_gain * sum_of_lanes(slope)
-        ambient_sum = _f(0.0)  # becomes a double among doubles
-        for j in range(stop - start):
-            row, v, fall = ids[start + j], v_values[start + j], scratch[FALL, j]
-            above = scratch[INITIAL, j] - ambient
-            v_initial[row] = v * fall
-            ambient_sum += v * (scratch[Y, j] * scratch[PHI, j])
-            if scale.shape[0] > 0:
-                v_scale[row] = v * time * scratch[SOURCE, j]
-            if rate[row] <= limit:
-                v_rate[row] = scratch[SLOPE, j] - v * above * time * fall
-            else:
-                v_rate[row] = 0
-        v_ambient[block] = ambient_sum
+    parallel_for(
+        _backward_block,
+        (ids.shape[0] + BLOCK - 1) // BLOCK,
+        (
+            rate,
+            initial,
+            ambient,
+            gains,
+            places,
+            scale,
+            ids,
+            time,
+            limit,
+            table,
+            v_values,
+            v_rate,
+            v_initial,
+            v_ambient,
+            v_gains,
+            v_scale,
+        ),
+    )

@@ -9,9 +9,9 @@ changes no bit.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import LANES, absolute, load, maximum, select, splat, sqrt, store
 
 BLOCK = 512  # Gaussians per parallel task: enough to hide its start, few enough to share 10 k of them
@@ -93,6 +93,26 @@ def _slope(x, y, z, degree, weights):
     return slope_x, slope_y, slope_z
 
 
+@inline
+def _forward_block(block, constant, rest, means, center, ids, degree, values):
+    """``forward`` of BLOCK Gaussians."""
+    count, channels = values.shape
+    bands = (degree + 1) ** 2 - 1
+    places = np.zeros(3 * LANES, np.float32)
+    basis = np.empty((15, LANES), np.float32)
+    for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
+        stop = min(start + LANES, count)
+        x, y, z, _ = _directions(means, ids, start, stop, center, places)
+        _fill_basis(x, y, z, degree, basis)
+        for lane in range(stop - start):
+            row = ids[start + lane]
+            for c in range(channels):
+                value = _A0 * constant[row, 0, c]
+                for b in range(bands):
+                    value += basis[b, lane] * rest[row, b, c]
+                values[start + lane, c] = value
+
+
 @kernel
 def forward(constant, rest, means, center, ids, degree, values):
     """Fills ``values`` [n, C] with the sums of harmonics.
@@ -106,22 +126,45 @@ def forward(constant, rest, means, center, ids, degree, values):
         degree: 1 to 3.
         values: [n, C] output.
     """
-    count, channels = values.shape
+    parallel_for(
+        _forward_block, (values.shape[0] + BLOCK - 1) // BLOCK, (constant, rest, means, center, ids, degree, values)
+    )
+
+
+@inline
+def _backward_block(block, rest, means, center, ids, degree, v_values, v_constant, v_rest, v_means):
+    """``backward`` of BLOCK Gaussians."""
+    count, channels = v_values.shape
     bands = (degree + 1) ** 2 - 1
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        places = np.zeros(3 * LANES, np.float32)
-        basis = np.empty((15, LANES), np.float32)
-        for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
-            stop = min(start + LANES, count)
-            x, y, z, _ = _directions(means, ids, start, stop, center, places)
-            _fill_basis(x, y, z, degree, basis)
-            for lane in range(stop - start):
-                row = ids[start + lane]
+    places = np.zeros(3 * LANES, np.float32)
+    basis = np.empty((15, LANES), np.float32)
+    weights = np.zeros((15, LANES), np.float32)  # gradient of each harmonic's value
+    slopes = np.empty((3, LANES), np.float32)
+    for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
+        stop = min(start + LANES, count)
+        x, y, z, inverse = _directions(means, ids, start, stop, center, places)
+        _fill_basis(x, y, z, degree, basis)
+        for lane in range(stop - start):
+            row = ids[start + lane]
+            for c in range(channels):
+                v_constant[row, 0, c] = _A0 * v_values[start + lane, c]
+            for b in range(bands):
+                weight = _ZERO
                 for c in range(channels):
-                    value = _A0 * constant[row, 0, c]
-                    for b in range(bands):
-                        value += basis[b, lane] * rest[row, b, c]
-                    values[start + lane, c] = value
+                    v_rest[row, b, c] = basis[b, lane] * v_values[start + lane, c]
+                    weight += rest[row, b, c] * v_values[start + lane, c]
+                weights[b, lane] = weight
+            for b in range(bands, v_rest.shape[1]):
+                for c in range(channels):
+                    v_rest[row, b, c] = _ZERO
+        slope_x, slope_y, slope_z = _slope(x, y, z, degree, weights)
+        along = x * slope_x + y * slope_y + z * slope_z  # the length of a direction does not matter
+        store(slopes, 0, (slope_x - along * x) * inverse)
+        store(slopes, LANES, (slope_y - along * y) * inverse)
+        store(slopes, 2 * LANES, (slope_z - along * z) * inverse)
+        for lane in range(stop - start):
+            for axis in range(3):
+                v_means[ids[start + lane], axis] = slopes[axis, lane]
 
 
 @kernel
@@ -133,35 +176,8 @@ def backward(rest, means, center, ids, degree, v_values, v_constant, v_rest, v_m
         v_values: [n, C] gradient of the values.
         v_constant, v_rest, v_means: [N, 1, C], [N, B - 1, C] and [N, 3] outputs.
     """
-    count, channels = v_values.shape
-    bands = (degree + 1) ** 2 - 1
-    for block in prange((count + BLOCK - 1) // BLOCK):
-        places = np.zeros(3 * LANES, np.float32)
-        basis = np.empty((15, LANES), np.float32)
-        weights = np.zeros((15, LANES), np.float32)  # gradient of each harmonic's value
-        slopes = np.empty((3, LANES), np.float32)
-        for start in range(block * BLOCK, min(count, (block + 1) * BLOCK), LANES):
-            stop = min(start + LANES, count)
-            x, y, z, inverse = _directions(means, ids, start, stop, center, places)
-            _fill_basis(x, y, z, degree, basis)
-            for lane in range(stop - start):
-                row = ids[start + lane]
-                for c in range(channels):
-                    v_constant[row, 0, c] = _A0 * v_values[start + lane, c]
-                for b in range(bands):
-                    weight = _ZERO
-                    for c in range(channels):
-                        v_rest[row, b, c] = basis[b, lane] * v_values[start + lane, c]
-                        weight += rest[row, b, c] * v_values[start + lane, c]
-                    weights[b, lane] = weight
-                for b in range(bands, v_rest.shape[1]):
-                    for c in range(channels):
-                        v_rest[row, b, c] = _ZERO
-            slope_x, slope_y, slope_z = _slope(x, y, z, degree, weights)
-            along = x * slope_x + y * slope_y + z * slope_z  # the length of a direction does not matter
-            store(slopes, 0, (slope_x - along * x) * inverse)
-            store(slopes, LANES, (slope_y - along * y) * inverse)
-            store(slopes, 2 * LANES, (slope_z - along * z) * inverse)
-            for lane in range(stop - start):
-                for axis in range(3):
-                    v_means[ids[start + lane], axis] = slopes[axis, lane]
+    parallel_for(
+        _backward_block,
+        (v_values.shape[0] + BLOCK - 1) // BLOCK,
+        (rest, means, center, ids, degree, v_values, v_constant, v_rest, v_means),
+    )

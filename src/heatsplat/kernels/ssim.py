@@ -16,9 +16,9 @@ images of memory for every view.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from heatsplat.kernels.compilation import inline, kernel
+from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
     LANES,
     absolute,
@@ -54,6 +54,27 @@ def _blur(plane, offset, step, taps):
     return blurred
 
 
+@inline
+def _missing_row(row, valid, length, step, missing):
+    """What does not count in a row of the plane ``missing``."""
+    for column in range(0, length, LANES):
+        (counts,) = load_columns(valid, row * length + column, 1, length - column)
+        store(missing, (row + RADIUS) * step + column, _ONE - counts)
+
+
+@inline
+def _coverage_block(block, missing, height, length, step, channels, taps, outside):
+    """``coverage`` of BLOCK rows."""
+    margin = RADIUS * channels
+    buffer = np.ones(step + 2 * margin, np.float32)
+    for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
+        for column in range(0, length, LANES):
+            store(buffer, margin + column, _blur(missing, row * step + column, step, taps))
+        for column in range(0, length, LANES):
+            share = _blur(buffer, column, channels, taps)
+            store_columns(outside, row * length + column, (share,), length - column)
+
+
 @kernel
 def coverage(valid, height, length, channels, taps, outside):
     """Fills ``outside`` [H·L] with the share of each pixel's window that does not count: beyond the border or masked.
@@ -66,20 +87,92 @@ def coverage(valid, height, length, channels, taps, outside):
         outside: [H·L] output; exactly 0 where the whole window counts.
     """
     step = (length + LANES - 1) // LANES * LANES
-    margin = RADIUS * channels
     missing = np.ones((height + 2 * RADIUS) * step, np.float32)
-    for row in prange(height):
+    parallel_for(_missing_row, height, (valid, length, step, missing))
+    parallel_for(
+        _coverage_block, (height + BLOCK - 1) // BLOCK, (missing, height, length, step, channels, taps, outside)
+    )
+
+
+@inline
+def _level_of_row(row, target, valid, length, sums):
+    """Sum of the target over what counts of a row, and how much counts."""
+    level, count = splat(_ZERO), splat(_ZERO)
+    for column in range(0, length, LANES):
+        (counts,) = load_columns(valid, row * length + column, 1, length - column)
+        (there,) = load_columns(target, row * length + column, 1, length - column)
+        level = level + select(counts > _ZERO, there, _ZERO)
+        count = count + counts
+    sums[row, 0], sums[row, 1] = total(level), total(count)
+
+
+@inline
+def _shift_row(row, prediction, target, valid, length, step, shift, x, y, sums):
+    """Writes a row of the planes; the sum of |x - y| over what counts."""
+    difference = splat(_ZERO)
+    for column in range(0, length, LANES):
+        at, rest = row * length + column, length - column
+        (counts,) = load_columns(valid, at, 1, rest)
+        (here,) = load_columns(prediction, at, 1, rest)
+        (there,) = load_columns(target, at, 1, rest)
+        difference = difference + select(counts > _ZERO, absolute(here - there), _ZERO)
+        inner = (row + RADIUS) * step + column
+        store(x, inner, select(counts > _ZERO, here - shift, _ZERO))
+        store(y, inner, select(counts > _ZERO, there - shift, _ZERO))
+    sums[row, 0] = total(difference)
+
+
+@inline
+def _forward_block(block, valid, outside, height, length, step, channels, taps, shift, x, y, slopes, sums):
+    """The sums of 1 - SSIM and the slopes of BLOCK rows."""
+    plane = (height + 2 * RADIUS) * step
+    margin = RADIUS * channels
+    span = step + 2 * margin
+    buffer = np.zeros(4 * span, np.float32)
+    for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
+        for column in range(0, length, LANES):
+            blur_x, blur_y, blur_squares, blur_xy = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+            for k in range(TAPS):
+                at, tap = (row + k) * step + column, load_scalar(taps, k)
+                here, there = load(x, at), load(y, at)
+                weighted_here, weighted_there = tap * here, tap * there
+                blur_x = blur_x + weighted_here
+                blur_y = blur_y + weighted_there
+                blur_squares = blur_squares + weighted_here * here + weighted_there * there
+                blur_xy = blur_xy + weighted_here * there
+            store(buffer, margin + column, blur_x)
+            store(buffer, span + margin + column, blur_y)
+            store(buffer, 2 * span + margin + column, blur_squares)
+            store(buffer, 3 * span + margin + column, blur_xy)
+
+        dissimilarity = splat(_ZERO)
         for column in range(0, length, LANES):
             (counts,) = load_columns(valid, row * length + column, 1, length - column)
-            store(missing, (row + RADIUS) * step + column, _ONE - counts)
-    for block in prange((height + BLOCK - 1) // BLOCK):
-        buffer = np.ones(step + 2 * margin, np.float32)
-        for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
-            for column in range(0, length, LANES):
-                store(buffer, margin + column, _blur(missing, row * step + column, step, taps))
-            for column in range(0, length, LANES):
-                share = _blur(buffer, column, channels, taps)
-                store_columns(outside, row * length + column, (share,), length - column)
+            (missing,) = load_columns(outside, row * length + column, 1, length - column)
+            away_x = _blur(buffer, column, channels, taps) - shift * missing  # means, minus the shift
+            away_y = _blur(buffer, span + column, channels, taps) - shift * missing
+            squares = _blur(buffer, 2 * span + column, channels, taps)
+            products = _blur(buffer, 3 * span + column, channels, taps)
+            mean_x, mean_y = away_x + shift, away_y + shift
+            beyond = shift * shift * missing  # what lies outside is 0, so minus the shift its square is this
+            variances = squares + _TWO * beyond - away_x * away_x - away_y * away_y
+            covariance = products + beyond - away_x * away_y
+
+            inverse_levels = _ONE / (mean_x * mean_x + mean_y * mean_y + C1)
+            inverse_variances = _ONE / (variances + C2)
+            luminance = (_TWO * mean_x * mean_y + C1) * inverse_levels
+            structure = (_TWO * covariance + C2) * inverse_variances
+            similarity = luminance * structure
+            dissimilarity = dissimilarity + counts * (_ONE - similarity)
+
+            by_squares = -counts * similarity * inverse_variances
+            by_xy = counts * _TWO * luminance * inverse_variances
+            by_mean = counts * _TWO * structure * (mean_y - mean_x * luminance) * inverse_levels
+            inner = (row + RADIUS) * step + column
+            store(slopes, inner, by_mean - _TWO * by_squares * away_x - by_xy * away_y)
+            store(slopes, plane + inner, by_squares)
+            store(slopes, 2 * plane + inner, by_xy)
+        sums[row, 1] = total(dissimilarity)
 
 
 @kernel
@@ -97,19 +190,10 @@ def forward(prediction, target, valid, outside, height, length, channels, taps, 
     """
     step = (length + LANES - 1) // LANES * LANES
     plane = (height + 2 * RADIUS) * step
-    margin = RADIUS * channels
-    span = step + 2 * margin
     sums = np.empty((height, 2))
 
     # The shift: the mean of the target, where it counts
-    for row in prange(height):
-        level, count = splat(_ZERO), splat(_ZERO)
-        for column in range(0, length, LANES):
-            (counts,) = load_columns(valid, row * length + column, 1, length - column)
-            (there,) = load_columns(target, row * length + column, 1, length - column)
-            level = level + select(counts > _ZERO, there, _ZERO)
-            count = count + counts
-        sums[row, 0], sums[row, 1] = total(level), total(count)
+    parallel_for(_level_of_row, height, (target, valid, length, sums))
     level, count = 0.0, 0.0
     for row in range(height):
         level += sums[row, 0]
@@ -117,18 +201,7 @@ def forward(prediction, target, valid, outside, height, length, channels, taps, 
     shift = np.float32(level / max(count, 1.0))
 
     zeros = splat(_ZERO)
-    for row in prange(height):
-        difference = splat(_ZERO)
-        for column in range(0, length, LANES):
-            at, rest = row * length + column, length - column
-            (counts,) = load_columns(valid, at, 1, rest)
-            (here,) = load_columns(prediction, at, 1, rest)
-            (there,) = load_columns(target, at, 1, rest)
-            difference = difference + select(counts > _ZERO, absolute(here - there), _ZERO)
-            inner = (row + RADIUS) * step + column
-            store(x, inner, select(counts > _ZERO, here - shift, _ZERO))
-            store(y, inner, select(counts > _ZERO, there - shift, _ZERO))
-        sums[row, 0] = total(difference)
+    parallel_for(_shift_row, height, (prediction, target, valid, length, step, shift, x, y, sums))
     for border in range(0, RADIUS * step, LANES):
         for at in (border, plane - LANES - border):
             store(x, at, zeros)
@@ -136,57 +209,44 @@ def forward(prediction, target, valid, outside, height, length, channels, taps, 
             for k in range(3):
                 store(slopes, k * plane + at, zeros)
 
-    for block in prange((height + BLOCK - 1) // BLOCK):
-        buffer = np.zeros(4 * span, np.float32)
-        for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
-            for column in range(0, length, LANES):
-                blur_x, blur_y, blur_squares, blur_xy = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
-                for k in range(TAPS):
-                    at, tap = (row + k) * step + column, load_scalar(taps, k)
-                    here, there = load(x, at), load(y, at)
-                    weighted_here, weighted_there = tap * here, tap * there
-                    blur_x = blur_x + weighted_here
-                    blur_y = blur_y + weighted_there
-                    blur_squares = blur_squares + weighted_here * here + weighted_there * there
-                    blur_xy = blur_xy + weighted_here * there
-                store(buffer, margin + column, blur_x)
-                store(buffer, span + margin + column, blur_y)
-                store(buffer, 2 * span + margin + column, blur_squares)
-                store(buffer, 3 * span + margin + column, blur_xy)
-
-            dissimilarity = splat(_ZERO)
-            for column in range(0, length, LANES):
-                (counts,) = load_columns(valid, row * length + column, 1, length - column)
-                (missing,) = load_columns(outside, row * length + column, 1, length - column)
-                away_x = _blur(buffer, column, channels, taps) - shift * missing  # means, minus the shift
-                away_y = _blur(buffer, span + column, channels, taps) - shift * missing
-                squares = _blur(buffer, 2 * span + column, channels, taps)
-                products = _blur(buffer, 3 * span + column, channels, taps)
-                mean_x, mean_y = away_x + shift, away_y + shift
-                beyond = shift * shift * missing  # what lies outside is 0, so minus the shift its square is this
-                variances = squares + _TWO * beyond - away_x * away_x - away_y * away_y
-                covariance = products + beyond - away_x * away_y
-
-                inverse_levels = _ONE / (mean_x * mean_x + mean_y * mean_y + C1)
-                inverse_variances = _ONE / (variances + C2)
-                luminance = (_TWO * mean_x * mean_y + C1) * inverse_levels
-                structure = (_TWO * covariance + C2) * inverse_variances
-                similarity = luminance * structure
-                dissimilarity = dissimilarity + counts * (_ONE - similarity)
-
-                by_squares = -counts * similarity * inverse_variances
-                by_xy = counts * _TWO * luminance * inverse_variances
-                by_mean = counts * _TWO * structure * (mean_y - mean_x * luminance) * inverse_levels
-                inner = (row + RADIUS) * step + column
-                store(slopes, inner, by_mean - _TWO * by_squares * away_x - by_xy * away_y)
-                store(slopes, plane + inner, by_squares)
-                store(slopes, 2 * plane + inner, by_xy)
-            sums[row, 1] = total(dissimilarity)
+    parallel_for(
+        _forward_block,
+        (height + BLOCK - 1) // BLOCK,
+        (valid, outside, height, length, step, channels, taps, shift, x, y, slopes, sums),
+    )
     difference, dissimilarity = 0.0, 0.0
     for row in range(height):
         difference += sums[row, 0]
         dissimilarity += sums[row, 1]
     return difference, dissimilarity
+
+
+@inline
+def _backward_block(
+    block, prediction, target, valid, height, length, channels, taps, x, y, slopes, v_l1, v_dssim, v_prediction
+):
+    """``backward`` of BLOCK rows."""
+    step = (length + LANES - 1) // LANES * LANES
+    plane = (height + 2 * RADIUS) * step
+    margin = RADIUS * channels
+    span = step + 2 * margin
+    weight_l1 = splat(v_l1)
+    buffer = np.zeros(3 * span, np.float32)
+    for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
+        for column in range(0, length, LANES):
+            for k in range(3):
+                blurred = _blur(slopes, k * plane + row * step + column, step, taps)
+                store(buffer, k * span + margin + column, blurred)
+        for column in range(0, length, LANES):
+            at, rest, inner = row * length + column, length - column, (row + RADIUS) * step + column
+            slope = _blur(buffer, column, channels, taps)
+            slope = slope + _TWO * load(x, inner) * _blur(buffer, span + column, channels, taps)
+            slope = slope + load(y, inner) * _blur(buffer, 2 * span + column, channels, taps)
+            (counts,) = load_columns(valid, at, 1, rest)
+            (here,) = load_columns(prediction, at, 1, rest)
+            (there,) = load_columns(target, at, 1, rest)
+            sign = select(here > there, weight_l1, _ZERO) - select(here < there, weight_l1, _ZERO)
+            store_columns(v_prediction, at, (select(counts > _ZERO, sign - v_dssim * slope, _ZERO),), rest)
 
 
 @kernel
@@ -195,25 +255,8 @@ def backward(prediction, target, valid, height, length, channels, taps, x, y, sl
 
     Args: as in ``forward``, whose x, y and slopes it reads.
     """
-    step = (length + LANES - 1) // LANES * LANES
-    plane = (height + 2 * RADIUS) * step
-    margin = RADIUS * channels
-    span = step + 2 * margin
-    weight_l1 = splat(v_l1)
-    for block in prange((height + BLOCK - 1) // BLOCK):
-        buffer = np.zeros(3 * span, np.float32)
-        for row in range(block * BLOCK, min(height, (block + 1) * BLOCK)):
-            for column in range(0, length, LANES):
-                for k in range(3):
-                    blurred = _blur(slopes, k * plane + row * step + column, step, taps)
-                    store(buffer, k * span + margin + column, blurred)
-            for column in range(0, length, LANES):
-                at, rest, inner = row * length + column, length - column, (row + RADIUS) * step + column
-                slope = _blur(buffer, column, channels, taps)
-                slope = slope + _TWO * load(x, inner) * _blur(buffer, span + column, channels, taps)
-                slope = slope + load(y, inner) * _blur(buffer, 2 * span + column, channels, taps)
-                (counts,) = load_columns(valid, at, 1, rest)
-                (here,) = load_columns(prediction, at, 1, rest)
-                (there,) = load_columns(target, at, 1, rest)
-                sign = select(here > there, weight_l1, _ZERO) - select(here < there, weight_l1, _ZERO)
-                store_columns(v_prediction, at, (select(counts > _ZERO, sign - v_dssim * slope, _ZERO),), rest)
+    parallel_for(
+        _backward_block,
+        (height + BLOCK - 1) // BLOCK,
+        (prediction, target, valid, height, length, channels, taps, x, y, slopes, v_l1, v_dssim, v_prediction),
+    )

@@ -214,7 +214,7 @@ class _March(torch.autograd.Function):
         values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
         up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
         with announced(COMPILING):
-            kernels.march(
+            kernels.integrate(
                 balance,
                 rows.numpy(),
                 drivers.times_s.numpy(),

@@ -12,7 +12,7 @@ from torch import Tensor
 from heatsplat.contracts import RenderOutput
 
 # Constants that all backends share, so that they can be compared pixel by pixel (values of gsplat 1.5).
-BLUR = 0.3  # pixels² added to the diagonal of the projected covariance, unless the caller gives others
+EPS2D = 0.3  # pixels² added to the diagonal of the projected covariance, unless the caller gives others
 ALPHA_MIN = 1.0 / 255.0  # a contribution below this is skipped
 ALPHA_MAX = 0.999  # alpha is clamped here; its gradient is zero where it is
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance would fall to this
@@ -41,7 +41,7 @@ class RenderInputs:
     modality_channels: tuple[int, ...] | None
     absgrad: bool
     depth: bool
-    blur: float = BLUR
+    eps2d: float = EPS2D
 
 
 def rasterization(
@@ -62,7 +62,7 @@ def rasterization(
     backend: str = "auto",
     absgrad: bool = False,
     depth: bool = True,
-    blur: float = BLUR,
+    eps2d: float = EPS2D,
 ) -> RenderOutput:
     """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
 
@@ -86,13 +86,13 @@ def rasterization(
         backend: "reference" (float64-able oracle), "cpu", "gsplat" (CUDA), or "auto" by the device of ``means``.
         absgrad: also gather the sum of absolute values of the screen gradients in ``meta["means2d"].absgrad``.
         depth: composite the depth of the first modality as well.
-        blur: pixels² added to both variances of the projected covariance (3DGS: 0.3; Mip-Splatting: 0.1, antialiased).
+        eps2d: pixels² added to both variances of the projected covariance (3DGS: 0.3; Mip-Splatting: 0.1, antialiased).
 
     Returns:
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
 
     Raises:
-        ValueError: shapes do not fit together, the blur is not positive, or the backend is unknown.
+        ValueError: shapes do not fit together, eps2d is not positive, or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
     n = means.shape[0]
@@ -111,8 +111,8 @@ def rasterization(
         raise ValueError(f"{opacities.shape[0]} opacity sets need modality_channels, such as (3, 1)")
     if modality_channels is not None and len(modality_channels) != opacities.shape[0]:
         raise ValueError(f"modality_channels {tuple(modality_channels)} must name {opacities.shape[0]} counts")
-    if not blur > 0:
-        raise ValueError(f"blur must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {blur}")
+    if not eps2d > 0:
+        raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
     if width < 1 or height < 1:
         raise ValueError(f"image must have pixels, got {width} x {height}")
     if backend == "auto":
@@ -121,6 +121,6 @@ def rasterization(
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
     inputs = RenderInputs(
         means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
-        background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, blur,
+        background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
     )  # fmt: skip
     return import_module(f"heatsplat.renderers.{backend}").render(inputs)

@@ -6,6 +6,8 @@ composite_backward, sum_slots, project_backward. What they pass to each other li
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -127,7 +129,8 @@ class _Frame:
         """Deals out the visible Gaussians, with their features, to the tiles."""
         array, inputs = self.buffers.array, self.inputs
         modality_of = [modality for modality, count in enumerate(channels) for _ in range(count)]
-        self.layout = Layout(tuple(modality_of + [0] * inputs.depth), len(channels), inputs.depth, inputs.absgrad)
+        self.layout = Layout(tuple(modality_of + [0] * inputs.depth), len(channels))
+        self.backward_layout = replace(self.layout, absgrad=inputs.absgrad)
         count, slabs = len(visible), binning.SLABS * self.workers
 
         self.ids = array("ids", np.int32, count)
@@ -157,7 +160,7 @@ class _Frame:
         """The image [H, W, C], alpha [M, H, W] and depth [H, W] or None."""
         array, layout, height, width = self.buffers.array, self.layout, self.inputs.height, self.inputs.width
         image, alpha = torch.empty(height, width, len(background)), torch.empty(layout.modalities, height, width)
-        depth = torch.empty(height, width) if layout.depth else None
+        depth = torch.empty(height, width) if self.inputs.depth else None
         self.tile_ends = array("tile_ends", np.int64, self.tiles_x * self.tiles_y)
         blocks = self.tiles_x * self.tiles_y * BLOCKS
         self.transmittances = array("transmittances", np.float32, blocks, layout.modalities, LANES)
@@ -171,7 +174,7 @@ class _Frame:
 
     def composite_backward(self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None) -> Tensor:
         """The gradient of the background [C]. Leaves what the Gaussians need in their slots."""
-        array, layout, rows = self.buffers.array, self.layout, self.workers * BLOCKS
+        array, layout, rows = self.buffers.array, self.backward_layout, self.workers * BLOCKS
         self.slots = array("slots", np.float32, int(self.slot_starts[-1]), layout.slot_size)
         v_background = array("v_background", np.float32, self.tiles_x * self.tiles_y, v_image.shape[2])
         compositing.composite_backward(
@@ -186,10 +189,10 @@ class _Frame:
     def sum_slots(self, opacities: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Gradients of opacities and features, and absolute screen gradients [N, 2] or None."""
         v_opacities, v_features = torch.zeros(opacities.shape), torch.zeros(features.shape)
-        absgrad = torch.zeros(self.count, 2) if self.layout.absgrad else None
+        absgrad = torch.zeros(self.count, 2) if self.inputs.absgrad else None
         self.sums = self.buffers.array("sums", np.float32, self.count, SUMS)
         compositing.sum_slots(
-            self.ids, self.slot_starts, self.slots, self.screen, _numpy(opacities), self.layout.depth,
+            self.ids, self.slot_starts, self.slots, self.screen, _numpy(opacities), self.inputs.depth,
             callable(self.inputs.features), self.first_ranks, self.sums, v_opacities.numpy(), v_features.numpy(),
             _UNWANTED if absgrad is None else absgrad.numpy(),
         )  # fmt: skip
@@ -225,5 +228,5 @@ def _camera_vector(inputs: RenderInputs) -> np.ndarray:
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     limits = -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
     numbers = (*viewmat[:3, :3].flat, *viewmat[:3, 3], fx, fy, cx, cy, *limits, inputs.near, inputs.far)
-    blur = np.float32(inputs.blur)  # squared here: a square inside the kernel could melt into a fused multiply-add
-    return np.array((*numbers, blur, blur * blur), np.float32)
+    eps2d = np.float32(inputs.eps2d)  # squared here: a square inside the kernel could melt into a fused multiply-add
+    return np.array((*numbers, eps2d, eps2d * eps2d), np.float32)

@@ -34,7 +34,7 @@ class Kernels(NamedTuple):
 def render(inputs: RenderInputs) -> RenderOutput:
     """Composited features, alpha and depth; ``heatsplat.renderers.rasterization`` has the contract.
 
-    **Convention:** the constants of ``renderers.base`` other than the blur are compiled into gsplat's kernels. Rows of
+    **Convention:** the constants of ``renderers.base`` other than eps2d are compiled into gsplat's kernels. Rows of
     ``meta["means2d"]`` that were not seen are undefined. Quaternions whose squared length is 0 in float32 are hidden.
     Absolute screen gradients are summed over modalities and over groups of 32 channels, each of which gsplat composites
     on its own.
@@ -60,7 +60,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
         inputs.K[None],
         width,
         height,
-        eps2d=inputs.blur,
+        eps2d=inputs.eps2d,
         near_plane=inputs.near,
         far_plane=inputs.far,
         calc_compensations=inputs.antialiased,

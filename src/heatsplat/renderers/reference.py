@@ -76,7 +76,7 @@ def channel_counts(inputs: RenderInputs, features: Tensor, count: int) -> tuple[
 def _project(inputs: RenderInputs, ids: Tensor) -> ScreenGaussians:
     means, quats, scales = (rows.index_select(0, ids) for rows in (inputs.means, inputs.quats, inputs.scales))
     return project_gaussians(
-        means, quats, scales, inputs.viewmat, inputs.K, inputs.width, inputs.height, inputs.blur, FOV_MARGIN
+        means, quats, scales, inputs.viewmat, inputs.K, inputs.width, inputs.height, inputs.eps2d, FOV_MARGIN
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData
-from heatsplat.renderers.base import BACKENDS, BLUR, rasterization
+from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
 
 
 class Renderer:
@@ -20,7 +20,7 @@ class Renderer:
     Args:
         backend: "auto", "cpu", "gsplat" or "reference".
         antialiased: compensates opacity for the screen blur (Mip-Splatting's 2D filter).
-        blur: pixels² added to both variances of a Gaussian on the screen.
+        eps2d: pixels² added to both variances of a Gaussian on the screen.
         near, far: visible range of camera z in world units.
         background: what lies behind the splats: "ambient" (the ambient temperature where the scene has one, black where
             not), or an image value in [0, 1].
@@ -33,15 +33,15 @@ class Renderer:
         near: float = 0.01,
         far: float = 1e10,
         background: str | float = "ambient",
-        blur: float = BLUR,
+        eps2d: float = EPS2D,
     ) -> None:
         if backend not in ("auto", *BACKENDS):
             raise ValueError(f"renderer.backend '{backend}' is unknown; choose auto, {', '.join(BACKENDS)}")
         if isinstance(background, str) and background != "ambient":
             raise ValueError(f"renderer.background must be 'ambient' or a number in [0, 1], got '{background}'")
-        if not blur > 0:
-            raise ValueError(f"renderer.blur must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {blur}")
-        self.blur = blur
+        if not eps2d > 0:
+            raise ValueError(f"renderer.eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
+        self.eps2d = eps2d
         self.backend, self.antialiased, self.near, self.far = backend, antialiased, near, far
         self.background = background
 
@@ -91,7 +91,7 @@ class Renderer:
             backend=self.backend,
             absgrad=absgrad,
             depth=depth,
-            blur=self.blur,
+            eps2d=self.eps2d,
         )
         if given == dtype:
             return seen

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from heatsplat.geometry.projection import project_gaussians
 from heatsplat.losses.photometric import C1, C2, WINDOW, l1, ssim_map, window
-from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, BLUR, FOV_MARGIN, rasterization
+from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, EPS2D, FOV_MARGIN, rasterization
 
 Renderer = Callable[..., Tensor]  # arguments of ``rasterization`` up to the height -> image [H, W, C]
 
@@ -44,7 +44,7 @@ def from_path(path: str) -> Renderer:
 
 def render_torch_tiles(means, quats, scales, opacities, features, viewmats, Ks, width, height, tile=16) -> Tensor:
     """The image [H, W, C] by plain torch, tile by tile, as a careful user would write it."""
-    screen = project_gaussians(means, quats, scales, viewmats, Ks, width, height, BLUR, FOV_MARGIN)
+    screen = project_gaussians(means, quats, scales, viewmats, Ks, width, height, EPS2D, FOV_MARGIN)
     with torch.no_grad():
         order = screen.depths.argsort(stable=True)
         reach = (2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)).sqrt()[:, None] * screen.variances.sqrt()

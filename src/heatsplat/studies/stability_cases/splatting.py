@@ -10,7 +10,7 @@ from torch import Tensor
 from heatsplat.geometry.projection import project_gaussians
 from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices, slerp
 from heatsplat.renderers import rasterization
-from heatsplat.renderers.base import BLUR, FOV_MARGIN
+from heatsplat.renderers.base import EPS2D, FOV_MARGIN
 from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 
 COUNT = 150
@@ -44,7 +44,7 @@ def _camera(like: Tensor) -> Tensor:
 
 def _screen_ours(output: str, **inputs: Tensor) -> Tensor:
     rows = _rows(**inputs)
-    screen = project_gaussians(*rows, torch.eye(4).to(rows[0]), _camera(rows[0]), SIDE, SIDE, BLUR, FOV_MARGIN)
+    screen = project_gaussians(*rows, torch.eye(4).to(rows[0]), _camera(rows[0]), SIDE, SIDE, EPS2D, FOV_MARGIN)
     return screen.whitening[:, 0] if output == "whitening" else screen.compensation
 
 
@@ -57,7 +57,7 @@ def _screen_printed(output: str, **inputs: Tensor) -> Tensor:
     jacobian = torch.stack([FOCAL / z, zero, -FOCAL * x / z**2, zero, FOCAL / z, -FOCAL * y / z**2], 1).view(-1, 2, 3)
     screen = jacobian @ (axes @ axes.mT) @ jacobian.mT
     plain = screen[:, 0, 0] * screen[:, 1, 1] - screen[:, 0, 1] ** 2
-    xx, yy, xy = screen[:, 0, 0] + BLUR, screen[:, 1, 1] + BLUR, screen[:, 0, 1]
+    xx, yy, xy = screen[:, 0, 0] + EPS2D, screen[:, 1, 1] + EPS2D, screen[:, 0, 1]
     blurred = xx * yy - xy * xy
     return (yy / blurred).sqrt() if output == "whitening" else (plain / blurred).sqrt()
 
@@ -76,7 +76,7 @@ def _screen_exact(output, q0, q1, q2, q3, growth, x, y, z, s, ratio, second):
     u = [FOCAL / z * (rotation[0][i] - x * rotation[2][i]) * axes[i] for i in range(3)]
     w = [FOCAL / z * (rotation[1][i] - y * rotation[2][i]) * axes[i] for i in range(3)]
     xx, yy, xy = sum(v * v for v in u), sum(v * v for v in w), sum(v * t for v, t in zip(u, w, strict=True))
-    plain, blur = xx * yy - xy * xy, mpmath.mpf(BLUR)
+    plain, blur = xx * yy - xy * xy, mpmath.mpf(EPS2D)
     blurred = plain + blur * (xx + yy) + blur * blur
     return (mpmath.sqrt((yy + blur) / blurred) if output == "whitening" else mpmath.sqrt(plain / blurred),)
 
