@@ -246,7 +246,11 @@ PAPERS = {
 }
 
 DEPARTURES = {  # ours and the published number
-    "hexplane_4dgs": {"thermal.resolution": (32, 64), "thermal.lr": (2e-3, 1.6e-4), "thermal.lr_planes": (1e-2, 1.6e-3)},
+    "hexplane_4dgs": {
+        "thermal.resolution": (32, 64),
+        "thermal.lr": (2e-3, 1.6e-4),
+        "thermal.lr_planes": (1e-2, 1.6e-3),
+    },
     "etgs": {"thermal.l2_reduction": ("mean_over_gaussians", "sum"), "thermal.clip": ("straight_through", "hard")},
     "ntr_gaussian": {"thermal.width": (32, 64), "thermal.feature_size": (8, 32)},
     "srgs": {"teacher": ("lanczos", "SwinIR")},
