@@ -6,7 +6,8 @@ import pytest
 import torch
 from weathered import make_scene
 
-from heatsplat.contracts import ThermalRange
+from heatsplat.contracts import RenderOutput, ThermalRange
+from heatsplat.renderers import settings
 from heatsplat.renderers.settings import Renderer
 
 SCENE = replace(make_scene(), thermal_range=ThermalRange(10.0, 60.0), ambient_c=25.0)
@@ -37,6 +38,22 @@ def test_a_pixel_without_splats_shows_the_background():
         camera, torch.tensor([0.3]), (1,),
     )  # fmt: skip
     assert torch.equal(seen.features, torch.full_like(seen.features, 0.3)) and not seen.alpha.any()
+
+
+def test_every_setting_reaches_the_rasteriser(monkeypatch):
+    given = {}
+
+    def rasterization(*arguments, **named):
+        given.update(named)
+        return RenderOutput(torch.zeros(8, 8, 1), torch.zeros(1, 8, 8), None, {})
+
+    monkeypatch.setattr(settings, "rasterization", rasterization)
+    own = {"backend": "reference", "antialiased": True, "near": 0.3, "far": 40.0, "blur": 0.17}
+    rows = torch.zeros(3, 3), torch.ones(3, 4), torch.ones(3, 3), torch.zeros(1, 3), torch.ones(3, 1)
+    renderer = Renderer(**own)
+    renderer(*rows, SCENE.train.frames[0].camera, torch.tensor([0.3]), (1,), absgrad=True, depth=True)
+    assert given.pop("background") == torch.tensor([0.3])
+    assert given == own | {"modality_channels": (1,), "absgrad": True, "depth": True}
 
 
 @pytest.mark.parametrize(
