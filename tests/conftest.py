@@ -1,9 +1,35 @@
-"""Test processes side by side (pytest -n) share the cores: each, and what it starts, takes its part of them."""
+"""Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
 import os
+
+import pytest
 
 from heatsplat.training.machine import cores
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores() // int(WORKERS))))
+
+FILMED = {}  # settings of a recording -> the scene, which nobody changes
+
+
+@pytest.fixture(scope="module", autouse=True)
+def filmed_once(request):
+    """Runs on the same recording share it: filming takes half of a tiny run. Tests of filming itself film."""
+    if "datamodules" in request.path.parts[:-1]:
+        yield
+        return
+    from heatsplat.datamodules.synthetic import Synthetic
+
+    film = Synthetic.load
+
+    def load(self):
+        own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
+        settings = repr(sorted(own.items()))
+        if settings not in FILMED:
+            FILMED[settings] = film(self)
+        return FILMED[settings]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Synthetic, "load", load)
+        yield

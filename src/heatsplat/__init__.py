@@ -4,8 +4,8 @@ In Python: ``config = heatsplat.compose(["method=etgs", "data.scene=heated"])``,
 ``heatsplat.load("outputs/.../checkpoints/last.ckpt")``. Each brings what it needs when it is first asked for.
 """
 
-from importlib import import_module
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ if CHECKOUT is not None:
 # themselves they spin meanwhile, in two pools, PyTorch's and Numba's: two runs on two cores then take ten times as long as
 # one. The libraries read this when they are loaded, and children inherit it.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from fake_run import FakeModule, camera, evaluate, events, fit, trainer, wall
+from fake_run import FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
 from heatsplat.callbacks.images import ImagePanels, file_stem, spread
@@ -74,8 +74,11 @@ def test_identical_images_give_infinite_psnr_and_null_in_the_file(tmp_path):
 def test_the_course_of_scores_survives_a_resume(tmp_path):
     save = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=6, save_top_k=-1)
     module = FakeModule(wall(), tmp_path)
-    fit(module, trainer(tmp_path, [QualityMetrics(), save], steps=12, every=4))
+    job = trainer(tmp_path, [QualityMetrics(), save], steps=12, every=4)
+    fit(module, job)
     whole = read_table(tmp_path / "curve.csv")
+    job.validate(module, loader(module.scene.val), verbose=False)  # of the last step again: a step has one row
+    assert read_table(tmp_path / "curve.csv") == whole
     again = FakeModule(wall(), tmp_path / "b")
     fit(again, trainer(tmp_path, [QualityMetrics()], steps=12, every=4), ckpt=tmp_path / "step=6.ckpt")
     resumed = read_table(tmp_path / "b" / "curve.csv")

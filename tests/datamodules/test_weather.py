@@ -232,6 +232,17 @@ def test_light_is_split_so_that_it_adds_up_and_night_is_exactly_zero():
     assert clear.max() > 600.0 and direct.max() < 100.0  # of a cloudy sky little comes straight
 
 
+def test_the_sun_shines_until_it_sets():
+    """Minutes around a sunrise: light comes as soon as the sun, refracted by air, stands above the horizon."""
+    when = MIDNIGHT_S + 3600.0 * 3 + 60.0 * np.arange(120)
+    height = np.degrees(np.arcsin(sun_directions(SITE, when)[:, 2]))
+    bright = clear_sky(SITE, when)
+    low = (height > 0.7) & (height < 4.9)
+    assert low.sum() > 20 and (bright[low] > 0).all() and (np.diff(bright[low]) > 0).all()
+    direct, diffuse = split_irradiance(SITE, when, bright)
+    assert (direct[low] + diffuse[low] > 0).all()
+
+
 def test_records_are_resampled_for_the_sun_and_keep_their_samples():
     times, columns = hourly(air_c=15.0, wind_m_s=2.0)
     columns["air_c"] = 15.0 + np.sin(np.arange(25))

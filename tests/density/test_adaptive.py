@@ -63,6 +63,15 @@ def test_the_cap_holds_and_the_strongest_grow_first():
     assert torch.equal(cloud.splats["means"][4], cloud.splats["means"][1])
 
 
+def test_what_pulls_is_the_mean_over_the_views_that_saw_it():
+    policy = Adaptive(start=0, stop=100, every=10, grad_threshold=2e-4)
+    cloud = make_cloud(policy, [0.001] * 3, [0.5] * 3)
+    pull(cloud, [3e-4, 3e-4, 0.0])
+    cloud.state["seen"] = torch.tensor([1.0, 2.0, 0.0])
+    assert refine(policy, cloud, 9).added == 1
+    assert torch.equal(cloud.splats["means"][3], cloud.splats["means"][0])
+
+
 def test_opacity_reset_happens_on_time_and_not_after_stop():
     policy = Adaptive(start=0, stop=250, every=1000, reset_every=100)
     cloud = make_cloud(policy, [0.01] * 2, [0.9, 0.005])

@@ -16,7 +16,6 @@ from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.runs.prices import Price
 
-
 EFFECTS = {effect.name: effect for effect in CATALOGUE}
 
 
@@ -84,7 +83,13 @@ def test_a_part_stands_in_the_recipe_exactly_when_its_effect_is_on(name):
 
 
 def test_light_meets_the_camera_in_order_and_pattern_and_falloff_are_two_effects_of_one_part():
-    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == ["point_spread", "calibration", "frame_offset", "agc", "tone"]
+    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == [
+        "point_spread",
+        "calibration",
+        "frame_offset",
+        "agc",
+        "tone",
+    ]
     pattern, falloff = (recipe(name)["sensor"]["parts"]["calibration"] for name in ("fixed_pattern", "vignetting"))
     assert pattern["vignetting_max"] == 0 < pattern["gain_max"] and pattern["bias_max"] > 0
     assert falloff["vignetting_max"] > 0 == falloff["gain_max"] == falloff["bias_max"]

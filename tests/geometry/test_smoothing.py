@@ -56,7 +56,7 @@ def cameras() -> list[Camera]:
     up, target = torch.tensor([0.0, -1.0, 0.0]), torch.zeros(3)
     found = []
     for k, eye in enumerate(eyes):
-        K = torch.tensor([[40.0 + 9 * k, 0, 20], [0, 38.0 + 9 * k, 13], [0, 0, 1]])
+        K = torch.tensor([[40.0 + 8 * k, 0, 20], [0, 36.0 + 11 * k, 13], [0, 0, 1]])  # the longest is one of the y axis
         found.append(Camera(look_at(torch.tensor(eye), target, up), K, 36, 28))
     return found
 

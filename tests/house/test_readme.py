@@ -1,14 +1,21 @@
-"""Every command of the README runs: on the tiny scene, a few steps, with the paths of a reader's machine replaced."""
+"""Every command of the README runs: on the tiny scene, a few steps, with the paths of a reader's machine replaced.
+
+`make test` runs one command of each kind and composes the configuration of all of them; `make test-slow` runs the rest.
+"""
 
 import os
 import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 from commands import succeeds
+from running import compose_run
+
+from heatsplat import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "README.md").read_text()
@@ -17,6 +24,18 @@ COMMANDS = [
     for block in re.findall(r"^```sh\n(.*?)^```", TEXT, re.M | re.S)
     for line in block.splitlines()
 ]
+PYTHON = [command for command in COMMANDS if command.startswith("python")]
+# What other fast tests run too: sweeps, ablations and tables (tests/studies), budgets and method=auto (tests/training).
+LONG = (
+    " -m ",
+    "ablation=",
+    "experiment=",
+    "budget=",
+    "method=auto",
+    "data=colmap",
+    "data.scene=heated",
+    "trajectory=view",
+)
 SHORT = ["data.size=tiny", "max_steps=6", "callbacks.probes=null", "callbacks.costs.fps_repeats=1"]
 
 
@@ -56,7 +75,19 @@ def test_the_readme_names_its_main_commands():
     assert any(command.startswith("python src/train.py method=etgs data=rhd") for command in COMMANDS)
 
 
-@pytest.mark.parametrize("command", [command for command in COMMANDS if command.startswith("python")])
+@pytest.mark.parametrize("command", [command for command in PYTHON if "train.py" in command])
+def test_training_commands_compose(command, tmp_path):
+    """Names and values of the command line are those of conf/; of a sweep, the first job."""
+    words = [re.sub(r",.*", "", word) for word in command.split()[2:] if word != "-m"]
+    config = compose_run(tmp_path, *words)
+    method = re.search(r"method=(\w+)", command)
+    assert method is None or config.name == method[1]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(one, marks=pytest.mark.slow) if any(word in one for word in LONG) else one for one in PYTHON],
+)
 def test_python_commands_run(command, trained, data, tmp_path):
     words = command.replace("RUN", f"{trained}").replace("/data/", f"{data}/").split()
     words = [str(ROOT / words[1]), *words[2:]]
@@ -86,6 +117,15 @@ def test_python_commands_run(command, trained, data, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_demo_trains_etgs(tmp_path):
+    shown = shell(["make", "-n", "demo", "ARGS=seed=7"], ROOT)
+    words = re.search(r"src/train\.py (.*)", shown)[1].split()
+    config = compose_run(tmp_path, *words)
+    assert (config.name, config.max_steps, config.seed) == ("etgs", 7000, 7)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_make_demo_runs():
     ready = ROOT / ".venv" / ".ready"
     if not ready.exists():
@@ -95,18 +135,25 @@ def test_make_demo_runs():
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-@pytest.mark.parametrize("target", re.findall(r"`?make (\w+)`?", TEXT))
-def test_make_targets_exist(target):
-    assert f"make {target} " in shell(["make", "help"], ROOT)
+def test_make_targets_exist():
+    known = shell(["make", "help"], ROOT)
+    assert [target for target in re.findall(r"`?make (\w+)`?", TEXT) if f"make {target} " not in known] == []
 
 
 @pytest.mark.parametrize("name", ["train", "evaluate", "render", "study"])
-def test_console_commands_answer(name):
-    program = Path(sys.executable).parent / f"heatsplat-{name}"
+def test_console_commands_are_installed(name):
+    programs = [one for one in entry_points(group="console_scripts") if one.name == f"heatsplat-{name}"]
+    if not programs:
+        pytest.skip("heatsplat is not installed (pip install -e .)")
+    assert programs[0].load() is getattr(cli, name)
+    assert (Path(sys.executable).parent / f"heatsplat-{name}").exists()
+
+
+def test_a_console_command_answers():
+    program = Path(sys.executable).parent / "heatsplat-train"
     if not program.exists():
         pytest.skip("heatsplat is not installed (pip install -e .)")
-    choice = {"train": ["method=etgs"], "study": ["study=renderer"]}.get(name, [])
-    assert "threads" in shell([str(program), *choice, "--cfg", "job"], ROOT)
+    assert "threads" in shell([str(program), "method=etgs", "--cfg", "job"], ROOT)
 
 
 def test_its_pictures_exist():

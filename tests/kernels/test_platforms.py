@@ -68,6 +68,7 @@ def test_the_fallback_threading_layer_gives_the_same_bits(numbers, tmp_path):
         assert np.array_equal(found, expected)
 
 
+@pytest.mark.slow  # it compiles every kernel of a training step anew
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="haswell is an x86 processor")
 def test_a_processor_without_avx512_computes_the_same(numbers, tmp_path):
     # Sixteen lanes are then two registers; sums over lanes keep their order, but not what fuses into a multiply-add.

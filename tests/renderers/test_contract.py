@@ -109,6 +109,7 @@ def facing(
         Scene(
             means, rows(quats, 4), rows(scales, 3), opacities[None], features, torch.eye(4, dtype=torch.float64),
             camera_matrix(20.0, *size), *size, background=torch.tensor([0.3], dtype=torch.float64),
+            options={"absgrad": True},
         )
     )  # fmt: skip
 
@@ -337,18 +338,20 @@ def test_reference_runs_on_cuda():
 
 # Every backend against the reference ---------------------------------------------------------------------------------
 
-# Four layouts of channels and no more: the CPU renderer compiles its kernels once for each.
+# The CPU renderer compiles its kernels once for each layout: channels, depth, absolute gradients. Two layouts are used
+# here alone, one channel and two modalities with everything; the others are those of training runs.
+ONE, TWO, BARE = {"channels": (1,), "absgrad": True}, {"channels": (3, 1), "absgrad": True}, {"depth": False}
 PLAIN = {
-    "one channel": plain_scene(channels=(1,)),
-    "one channel, antialiased": plain_scene(channels=(1,), antialiased=True),
-    "one channel, antialiased, less blur": plain_scene(channels=(1,), antialiased=True, eps2d=0.1),
-    "one channel, more blur": plain_scene(channels=(1,), eps2d=0.7),
-    "rgb": plain_scene(channels=(3,)),
-    "rgb, antialiased": plain_scene(channels=(3,), antialiased=True),
-    "four channels": plain_scene(channels=(4,), absgrad=True),
-    "rgb and thermal": plain_scene(channels=(3, 1), absgrad=True),
-    "rgb and thermal, antialiased": plain_scene(channels=(3, 1), absgrad=True, antialiased=True),
-    "width and height of no tile": plain_scene(channels=(1,), width=37, height=29),
+    "one channel": plain_scene(**ONE),
+    "one channel, antialiased": plain_scene(**ONE, antialiased=True),
+    "one channel, antialiased, less blur": plain_scene(**ONE, antialiased=True, eps2d=0.1),
+    "one channel, more blur": plain_scene(**ONE, eps2d=0.7),
+    "rgb": plain_scene(channels=(3,), **BARE),
+    "rgb, antialiased": plain_scene(channels=(3,), **BARE, antialiased=True),
+    "four channels": plain_scene(channels=(4,), **BARE),
+    "rgb and thermal": plain_scene(**TWO),
+    "rgb and thermal, antialiased": plain_scene(**TWO, antialiased=True),
+    "width and height of no tile": plain_scene(**ONE, width=37, height=29),
 }
 
 
@@ -357,7 +360,7 @@ def test_images_and_gradients_of_plain_scenes(backend, name):
     assert_close(run(backend, PLAIN[name]), oracle(PLAIN[name]))
 
 
-@pytest.mark.parametrize("name", ["four channels", "rgb and thermal"])
+@pytest.mark.parametrize("name", ["one channel", "rgb and thermal"])
 def test_absolute_screen_gradients(backend, name):
     # Sums of |gradient| over pixels and modalities: gsplat composites each modality on its own and cannot do otherwise.
     # That they are right is tested above; here, that they are what they claim to be.
@@ -368,7 +371,7 @@ def test_absolute_screen_gradients(backend, name):
 
 
 def test_without_absgrad_there_is_none(backend):
-    assert "means2d.absgrad" not in run(backend, PLAIN["one channel"]).gradients
+    assert "means2d.absgrad" not in run(backend, PLAIN["rgb"]).gradients
 
 
 def test_absolute_screen_gradients_are_taken_pixel_by_pixel():
@@ -392,10 +395,11 @@ def test_no_background_is_black(backend):
 
 
 def test_depth_only_where_it_is_asked_for(backend):
-    with_depth, without = run(backend, PLAIN["rgb"]), run(backend, PLAIN["rgb"], depth=False)
+    scene = PLAIN["one channel"]
+    with_depth, without = run(backend, scene), run(backend, scene, depth=False, absgrad=False)
     assert without.output.depth is None
     assert relative(without.output.features, with_depth.output.features) < 1e-6
-    assert_close(without, oracle(PLAIN["rgb"], depth=False))
+    assert_close(without, oracle(scene, depth=False, absgrad=False))
 
 
 def test_shapes_and_meta(backend):
@@ -452,7 +456,7 @@ def test_features_may_be_a_function_of_the_visible_ids(backend):
 
 def test_screen_gradients_are_those_of_moved_centres(backend):
     # Moving the principal point moves every centre, and nothing else where no slope is at its margin.
-    scene = plain_scene(30, (1,), width=16, height=12)
+    scene = plain_scene(30, **ONE, width=16, height=12)
     scene = rounded(replace(scene, means=0.4 * scene.means))
     for axis in (0, 1):
         shift = torch.zeros(3, 3, dtype=torch.float64)
@@ -531,7 +535,7 @@ def test_nothing_in_view_with_a_function(backend):
     scene = facing([[0, 0, -2.0]], 0.3)
     rows = (getattr(scene, name).to(device, torch.float32) for name in ("means", "quats", "scales", "opacities"))
     cameras = (scene.viewmat.to(device), scene.K.to(device))
-    output = rasterization(*rows, emit, *cameras, 24, 20, backend=backend)
+    output = rasterization(*rows, emit, *cameras, 24, 20, backend=backend, depth=False)
     assert output.features.shape == (20, 24, 3)
     assert [len(ids) for ids in asked] == [0]
 
@@ -622,7 +626,7 @@ def test_a_zero_quaternion_hides_its_gaussian(backend):
 
 
 def test_quaternions_of_any_length(backend):
-    scene = plain_scene(40, (1,))
+    scene = plain_scene(40, **ONE)
     lengths = torch.logspace(-6, 6, 40, dtype=torch.float64)[:, None]
     scaled = rounded(replace(scene, quats=scene.quats * lengths))
     actual = run(backend, scaled)
@@ -702,7 +706,7 @@ def test_a_gaussian_beyond_the_border_is_seen_by_its_tail(backend):
 
 
 def test_a_gaussian_may_be_opaque_in_one_modality_only(backend):
-    scene = plain_scene(40, (3, 1), absgrad=True)
+    scene = plain_scene(40, **TWO)
     opacities = scene.opacities.clone()
     opacities[0, ::2], opacities[1, 1::2] = 0.001, 0.002
     scene = rounded(replace(scene, opacities=opacities))
@@ -719,7 +723,7 @@ def test_a_gaussian_may_be_opaque_in_one_modality_only(backend):
 
 def test_bounds_never_cut_what_counts(backend):
     # Faint Gaussians of every shape: the reference looks at every pixel, so a tight bound would show.
-    scene = plain_scene(150, (1,), seed=5)
+    scene = plain_scene(150, **ONE, seed=5)
     scene = rounded(replace(scene, opacities=torch.logspace(-2.38, -0.5, 150, dtype=torch.float64)[None]))
     actual, expected = run(backend, scene), oracle(scene)
     assert (actual.output.alpha - expected.output.alpha).abs().quantile(0.999) < 1e-5
@@ -727,7 +731,7 @@ def test_bounds_never_cut_what_counts(backend):
 
 
 def test_coordinates_of_a_million(backend):
-    scene = plain_scene(50, (1,))
+    scene = plain_scene(50, **ONE)
     away = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     viewmat = scene.viewmat.clone()
     viewmat[:3, 3] -= viewmat[:3, :3] @ away

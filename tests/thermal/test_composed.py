@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -174,6 +175,22 @@ def test_air_dims_what_lies_far_and_shows_its_own_temperature():
     assert part.effects()["attenuation"]["per_unit"] == pytest.approx(beta)
     part(values, splats, query()).sum().backward()
     assert splats.means.grad is None  # haze moves no walls
+
+
+def test_depth_counts_in_distances_from_a_camera_to_the_middle_of_the_points():
+    """Points about the origin, cameras 3, 4 and 5 from it; an outlier moves neither median."""
+    frames = [Frame(f"{z}.png", z, Camera(shifted(z), torch.eye(3), 4, 4), 10.0 * z) for z in (3, 4, 5)]
+    views = ViewSet(frames, lambda i: None)
+    points = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0], [900, 900, 900]])
+    part = Attenuation(depth=0.5, moments=0)
+    part.prepare(SceneData("row", views, views, views, points, None, ThermalRange(20.0, 70.0), 26.0))
+    assert part.typical.item() == pytest.approx(4.0) and part.extinction().item() == pytest.approx(0.125)
+
+
+def shifted(z):
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[2, 3] = z
+    return viewmat
 
 
 def test_air_of_an_unknown_temperature_is_learned():
@@ -357,6 +374,15 @@ def test_nothing_has_flowed_at_the_start_and_hardly_anything_differs_after_very_
         model.log_flow.fill_(1e4)
     values = model.features(splats, query()).features
     assert values.isfinite().all() and values.std() < 0.2 * model.state.features(splats, query()).features.std()
+
+
+def test_flow_counts_in_spans_of_the_record_from_its_start():
+    model, splats = conducting()
+    before = model.state.features(splats, query(-50.0)).features
+    assert torch.equal(model.features(splats, query(-50.0)).features, before)  # nothing flows back
+    late = ViewSet([replace(frame, time_s=frame.time_s + 1000.0) for frame in scene().train.frames], lambda i: None)
+    model.prepare(replace(scene(), train=late))
+    assert model.span_s.item() == SPAN_S
 
 
 def test_the_graph_is_drawn_anew_when_gaussians_change_and_at_stated_steps():

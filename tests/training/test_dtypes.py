@@ -1,18 +1,17 @@
 """Double precision of a run: every method, the same first step as in float32 but for rounding."""
 
-from pathlib import Path
-
 import pytest
 import torch
+from helpers import ALL_METHODS
 from running import TINY, run
 
-from heatsplat.composition import CONF, build, compose
+from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
 from heatsplat.runs.stepping import Stepper
 
 FOUND_OUT = {"auto"}  # its parts depend on the scene
 SAME_MODULE = {"bicubic_3dgs", "lanczos_3dgs", "direct_3dgs"}  # as 3dgs, on other images
-METHODS = sorted({path.stem for path in (Path(CONF) / "method").glob("*.yaml")} - FOUND_OUT - SAME_MODULE)
+METHODS = sorted(set(ALL_METHODS) - FOUND_OUT - SAME_MODULE)
 SHORT = (*TINY, "max_steps=4", "density=fixed", "trainer.val_check_interval=4", "trainer.limit_val_batches=1")
 
 

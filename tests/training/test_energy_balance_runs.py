@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 import torch
 from running import run
 
@@ -14,30 +13,12 @@ SHORT = (
     "data.downscale=2",
     "threads=1",
     "callbacks.images=null",
+    "callbacks.attributes=null",
     "callbacks.probes=null",
-    "callbacks.attributes.test_views=1",
     "callbacks.costs.fps_repeats=1",
     "trainer.limit_val_batches=1",
     "trainer.limit_test_batches=2",
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_yard():
-    """The yard is filmed once for all runs of this file."""
-    from heatsplat.datamodules.synthetic import Synthetic
-
-    loaded, kept = Synthetic.load, {}
-
-    def load(self):
-        key = self.scene_name, self.downscale, self.weather
-        if key not in kept:
-            kept[key] = loaded(self)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Synthetic, "load", load)
-        yield
 
 
 def test_a_run_learns_tells_its_effects_and_answers_in_other_weather(tmp_path):

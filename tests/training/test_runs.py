@@ -45,6 +45,8 @@ def test_a_run_leaves_metrics_beside_their_cost(tmp_path):
     module, _ = run(tmp_path, *SHORT, "method=etgs")
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert found["test"]["psnr"] > 5 and found["test"]["mae_c"] > 0
+    scene = module.scene
+    assert module.background.tolist() == [pytest.approx(scene.thermal_range.to_unit(scene.ambient_c))] != [0.0]
     assert found["cost"]["gaussians"] == len(module.splats)
     assert found["cost"]["train_seconds"] > 0 and found["cost"]["render_fps"] > 0
     assert found["effects"]["harmonic_source"]["frequencies"] > 0

@@ -34,24 +34,6 @@ SHORT = (
 NETWORK = "thermal.network.own.weight"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_yard(tmp_path_factory):
-    """The yard is filmed once for all runs of this file."""
-    from heatsplat.datamodules.synthetic import Synthetic
-
-    loaded, kept = Synthetic.load, {}
-
-    def load(self):
-        key = self.scene_name, self.downscale
-        if key not in kept:
-            kept[key] = loaded(self)
-        return kept[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Synthetic, "load", load)
-        yield
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("thermogs")

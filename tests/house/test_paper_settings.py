@@ -1,0 +1,316 @@
+"""The papers' hyperparameters, held against the configuration as composed for a run of 30000 steps.
+
+A number here was read in the paper or in its authors' code, as the third column says, and never from conf/. Steps that conf/
+gives as shares of a run may differ by what rounding the share does. Where a method departs from its paper, both numbers
+stand in ``DEPARTURES``: whoever changes one has to say so here.
+"""
+
+import pytest
+from helpers import ALL_METHODS
+from running import compose_run
+
+from heatsplat import cli
+
+TERM = "loss.terms.photometric"
+SUPIRGS_HF = "loss.terms.high_frequency"
+
+GAUSSIANS = {  # 3D Gaussian Splatting, arguments/__init__.py of the authors' code unless another source is named
+    "max_steps": (30000, "iterations"),
+    "optim.means": (1.6e-4, "position_lr_init"),
+    "optim.means_end": (0.01, "position_lr_final / position_lr_init"),
+    "optim.log_scales": (5e-3, "scaling_lr"),
+    "optim.quats": (1e-3, "rotation_lr"),
+    "optim.opacity_logits": (5e-2, "opacity_lr"),
+    "optim.betas": ([0.9, 0.999], "torch.optim.Adam"),
+    "optim.eps": (1e-15, "training_setup"),
+    "init.opacity": (0.1, "create_from_pcd"),
+    "init.scale": (1.0, "create_from_pcd: the distance to three neighbours"),
+}
+GROWTH = {
+    "start": (500, "densify_from_iter"),
+    "stop": (15000, "densify_until_iter"),
+    "every": (100, "densification_interval"),
+    "grad_threshold": (2e-4, "densify_grad_threshold"),
+    "clone_scale": (0.01, "percent_dense"),
+    "prune_opacity": (0.005, "min_opacity of densify_and_prune"),
+    "prune_scale": (0.1, "big_points_ws of densify_and_prune"),
+    "reset_every": (3000, "opacity_reset_interval"),
+    "reset_opacity": (0.01, "reset_opacity"),
+    "absgrad": (False, "as published; AbsGS came later"),
+}
+ADAPTIVE = {f"density.{key}": value for key, value in GROWTH.items()}
+RECIPE = {f"density.recipe.{key}": value for key, value in GROWTH.items()}
+COLOUR = {  # static emission
+    "thermal.lr": (2.5e-3, "feature_lr"),
+    "renderer.blur": (0.3, "compute_cov2D: low-pass filter"),
+    "renderer.antialiased": (False, "as published"),
+    "renderer.far": (1e10, "no far plane"),
+}
+PHOTOMETRIC = {
+    f"{TERM}.dssim_weight": (0.2, "lambda_dssim"),
+    f"{TERM}.dssim_half": (False, "1 - ssim in train.py"),
+}
+BOTH_IMAGES = {  # ThermalGaussian and 3DGS+IR: a colour and a thermal image, each with 3DGS's loss
+    "thermal.degree": (3, "sh_degree"),
+    "thermal.companions.rgb": (3, "RGB"),
+}
+FROZEN = {key: value for key, value in ADAPTIVE.items() if not key.endswith("stop")}
+
+PAPERS = {
+    "3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC,
+    "3dgs_ir": GAUSSIANS
+    | ADAPTIVE
+    | BOTH_IMAGES
+    | {
+        "loss.terms.thermal.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.rgb.dssim_weight": (0.2, "3DGS"),
+        "thermal.shared_opacity": (True, "one opacity"),
+        "thermal.degree_every": (1000, "3DGS: oneupSHdegree"),
+    },
+    "bicubic_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
+    "lanczos_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
+    "direct_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | {"module.supersample": (4, "SupIR-GS, Tab. 1: x4")},
+    "energy_balance": GAUSSIANS | ADAPTIVE | PHOTOMETRIC,
+    "etgs": GAUSSIANS
+    | ADAPTIVE
+    | {
+        "thermal.frequencies": (24, "App. B: K"),
+        "thermal.frequency_gain": (2**-0.5, "App. B: alpha"),
+        "thermal.source_l2": (1e-5, "second-hand: lambda_reg"),
+        "thermal.ambient": ("measured", "constant T_env of the scene"),
+        "thermal.lr_initial": (2.5e-3, "3DGS: feature_lr"),
+        f"{TERM}.dssim_weight": (0.2, "Eq. 36, lambda of 3DGS"),
+        f"{TERM}.dssim_half": (True, "Eq. 36: (1 - SSIM) / 2"),
+    },
+    "hexplane_4dgs": GAUSSIANS
+    | ADAPTIVE
+    | {
+        "first_steps": (3000, "coarse_iterations"),
+        "thermal.scales": ([1, 2], "multires of dnerf_default"),
+        "thermal.width": (64, "net_width"),
+        "thermal.smooth_space": (1e-4, "plane_tv_weight"),
+        "thermal.smooth_time": (1e-2, "time_smoothness_weight"),
+        "thermal.sparse_time": (1e-4, "l1_time_planes"),
+        "thermal.lr_end": (0.1, "deformation_lr_final / deformation_lr_init"),
+        "thermal.emission.lr": (2.5e-3, "feature_lr"),
+    },
+    "mftg": GAUSSIANS
+    | BOTH_IMAGES
+    | {
+        "density.grad_threshold": GROWTH["grad_threshold"],
+        "density.stop": (7500, "15000 of each round's 30000, halved: both rounds are 30000 here"),
+        "first_steps": (15000, "30000 of 60000"),
+        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.smoothness.term.weight": (0.6, "train.py: lambda of smoothness"),
+    },
+    "mip_splatting": GAUSSIANS
+    | ADAPTIVE
+    | PHOTOMETRIC
+    | {
+        "smoothing.variance": (0.2, "compute_3D_filter: sqrt(0.2) of the sampling interval"),
+        "smoothing.every": (100, "train.py"),
+        "smoothing.near": (0.2, "compute_3D_filter"),
+        "smoothing.margin": (0.15, "compute_3D_filter"),
+        "renderer.blur": (0.1, "kernel_size"),
+        "renderer.antialiased": (True, "2D Mip filter"),
+    },
+    "msmg": GAUSSIANS
+    | ADAPTIVE
+    | BOTH_IMAGES
+    | {
+        "thermal.shared_opacity": (False, "two models"),
+        "init.separate": (True, "two clouds"),
+        "loss.terms.thermal.weight": (0.6, "MSMG: .6"),
+        "loss.terms.rgb.weight": (0.3, "MSMG: .3"),
+        "loss.terms.smoothness.weight": (0.36, ".6 of .6"),
+        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
+    },
+    "ntr_gaussian": GAUSSIANS
+    | FROZEN
+    | PHOTOMETRIC
+    | {
+        "thermal.nodes": (6, "nodes of the trapezoid rule"),
+        "thermal.window_s": (3600.0, "one hour"),
+        "thermal.position_frequencies": (10, "L"),
+        "thermal.time_frequencies": (10, "L"),
+        "thermal.environment": (1.0, "mean (env - default)^2"),
+        "thermal.integral": (0.002, "train.py"),
+        "thermal.lr": (1.6e-3, "T-net"),
+    },
+    "ommg": GAUSSIANS
+    | ADAPTIVE
+    | BOTH_IMAGES
+    | {
+        "thermal.shared_opacity": (True, "one opacity"),
+        "loss.terms.thermal.weight": (0.5, "L = 1/2 (L_RGB + L_T)"),
+        "loss.terms.rgb.weight": (0.5, "L = 1/2 (L_RGB + L_T)"),
+        "loss.terms.smoothness.weight": (0.3, "1/2 of .6"),
+        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
+    },
+    "ravigs": GAUSSIANS
+    | RECIPE
+    | {
+        "density.prune_opacity": (0.005, "Eq. 11: tau"),
+        "thermal.dual_opacity": (True, "section 3.1"),
+        "thermal.three_parameter": (True, "section 3.2"),
+        "thermal.lr_attributes": (2.5e-3, "section 4.1"),
+        "thermal.color.degree": (3, "3DGS"),
+        "loss.terms.gradient.weight": (0.5 * 0.05, "lambda_rgb lambda_g"),
+        "loss.terms.guided_variation.weight": (0.5 * 0.02, "lambda_ir lambda_s"),
+        "loss.terms.physical_prior.weight": (0.5 * 0.01, "lambda_ir lambda_p"),
+        "loss.terms.physical_prior.term.tolerance": (0.05, "Eq. 16: delta"),
+        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
+        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
+    },
+    "srgs": GAUSSIANS
+    | ADAPTIVE
+    | COLOUR
+    | {
+        "super_resolution": (4, "x4"),
+        f"{TERM}.factor": (4, "x4"),
+        f"{TERM}.record_weight": (0.6, "train.py, the commented line"),
+        f"{TERM}.sr_only": (False, "the paper: both terms"),
+        f"{TERM}.kernel": ("area", "average pooling"),
+        f"{TERM}.dssim_weight": (0.2, "3DGS"),
+    },
+    "supirgs": GAUSSIANS
+    | ADAPTIVE
+    | COLOUR
+    | {
+        "super_resolution": (4, "x4"),
+        "module.supersample": (4, "x4"),
+        "sensor.parts.calibration.grid": (16, "Eq. 4"),
+        "sensor.parts.calibration.weight": (5e-4, "lambda_cal"),
+        "sensor.parts.tone.width": (64, "Eq. 7: two hidden layers of 64"),
+        "sensor.parts.tone.gain_max": (0.08, "Eq. 8"),
+        "sensor.parts.tone.offset_max": (0.04, "Eq. 8"),
+        "sensor.parts.tone.weight": (1e-3, "lambda_tone"),
+        f"{TERM}.term.ssim_schedule.start": (0.10, "SSIM 10-40 %"),
+        f"{TERM}.term.ssim_schedule.end": (0.40, "SSIM 10-40 %"),
+        f"{TERM}.term.boost_schedule.start": (0.55, "late-stage boosting 55-95 %"),
+        f"{TERM}.term.boost_schedule.end": (0.95, "late-stage boosting 55-95 %"),
+        f"{SUPIRGS_HF}.schedule.start": (0.65, "HF 65-95 %"),
+        f"{SUPIRGS_HF}.schedule.end": (0.95, "HF 65-95 %"),
+    },
+    "thermal3dgs": GAUSSIANS
+    | ADAPTIVE
+    | {
+        "thermal.position_frequencies": (10, "multires"),
+        "thermal.time_frequencies": (10, "t_multires"),
+        "thermal.lr": (8e-4, "1.6e-4 times the spatial scale 5"),
+        "thermal.lr_end": (1.6e-6 / 8e-4, "position_lr_final"),
+        "thermal.exponent": ("printed", "unconstrained"),
+        "sensor.parts.conduction.hidden": (2, "three 1x1 convolutions"),
+        "sensor.parts.conduction.lr": (1.6e-5, "TCM"),
+        "sensor.parts.conduction.lr_end": (0.1, "TCM: 1.6e-6"),
+        f"{TERM}.weight": (0.8, ".6 L1 + .2 (1 - SSIM)"),
+        f"{TERM}.term.dssim_weight": (0.25, ".2 of .8"),
+        "loss.terms.corner.weight": (0.2, "train.py"),
+        "loss.terms.corner.schedule.end": (5000 / 30000, "max(1 - i / 5000, 0)"),
+        "loss.terms.corner.schedule.before": (1.0, "max(1 - i / 5000, 0)"),
+        "loss.terms.corner.schedule.after": (0.0, "max(1 - i / 5000, 0)"),
+    },
+    "thermalgs": GAUSSIANS
+    | FROZEN
+    | PHOTOMETRIC
+    | {
+        "thermal.time_frequencies": (4, "GaussianMeshTimeModel in NTR-Gaussian's code"),
+        "thermal.code_size": (16, "GaussianMeshTimeModel"),
+        "thermal.lr": (2.5e-3, "GaussianMeshTimeModel: MLP"),
+        "thermal.lr_time": (1e-3, "GaussianMeshTimeModel: time encoder"),
+    },
+    "thermogs": GAUSSIANS
+    | FROZEN
+    | {
+        "loss.terms.data.weight": (0.8, "lambda_1"),
+        "loss.terms.edge.weight": (0.2, "lambda_2"),
+        "thermal.weights.smooth": (1.0, "lambda_3"),
+        "thermal.weights.physical": (0.01, "lambda_4"),
+        "thermal.weights.ode": (0.01, "lambda_5"),
+        "thermal.weights.pinn": (1.0, "lambda_6"),
+        "thermal.time_frequencies": (10, "orders of the time encoding"),
+        "thermal.surface_area": ("printed", "Eq. 6"),
+        "thermal.sky": ("none", "Eq. 4: empty space"),
+    },
+    "ti3dgs": GAUSSIANS
+    | RECIPE
+    | {
+        "thermal.position_frequencies": (10, "Eq. 9: L"),
+        "thermal.time_frequencies": (10, "Eq. 9: L"),
+        "thermal.lr": (8e-4, "section IV-A"),
+        "thermal.lr_end": (1.6e-6 / 8e-4, "section IV-A"),
+        f"{TERM}.dssim_weight": (0.2, "3DGS"),
+    },
+}
+
+DEPARTURES = {  # ours and the published number
+    "hexplane_4dgs": {
+        "thermal.resolution": (32, 64),
+        "thermal.lr": (2e-3, 1.6e-4),
+        "thermal.lr_planes": (1e-2, 1.6e-3),
+    },
+    "etgs": {"thermal.l2_reduction": ("mean_over_gaussians", "sum"), "thermal.clip": ("straight_through", "hard")},
+    "ntr_gaussian": {"thermal.width": (32, 64), "thermal.feature_size": (8, 32)},
+    "srgs": {"teacher": ("lanczos", "SwinIR")},
+    "supirgs": {"teacher": ("lanczos", "SwinIR-S"), f"{TERM}.term.boost_weight": (0.0, "undefined")},
+    "thermal3dgs": {
+        "thermal.width": (32, 256),
+        "thermal.depth": (2, 8),
+        "thermal.exponent_max": (4.0, None),
+        "loss.terms.corner.term.weight": ("corners", "published"),
+    },
+    "thermogs": {"thermal.projected_area": ("exact", "printed")},
+    "ti3dgs": {
+        "thermal.exponent": ("positive", "printed"),
+        "thermal.exponent_max": (4.0, None),
+        "thermal.applies_to": ("radiance", "harmonics"),
+    },
+}
+STEPS = ("start", "stop", "every", "first_steps", "degree_every", "reset_every")
+SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
+
+
+@pytest.fixture(scope="module")
+def composed(tmp_path_factory):
+    """method -> its configuration, each composed when it is asked for first."""
+    known, folder = {}, tmp_path_factory.mktemp("composed")
+
+    def of(method):
+        if method not in known:
+            known[method] = cli.resolved(compose_run(folder, f"method={method}"))
+        return known[method]
+
+    return of
+
+
+def at(config, key):
+    for name in key.split("."):
+        config = config[name]
+    return config
+
+
+def test_every_method_here_exists():
+    assert set(PAPERS) <= set(ALL_METHODS) and set(DEPARTURES) <= set(PAPERS)
+
+
+@pytest.mark.parametrize("method", PAPERS)
+def test_settings_are_those_of_the_paper(method, composed):
+    wrong = []
+    for key, (published, source) in PAPERS[method].items():
+        ours = at(composed(method), key)
+        if isinstance(published, float) or key.rpartition(".")[2] in STEPS:
+            same = ours == pytest.approx(published, rel=SHARE_ROUNDED)
+        else:
+            same = ours == published
+        if not same:
+            wrong.append(f"{key} is {ours}, published: {published} ({source})")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("method", DEPARTURES)
+def test_departures_from_the_paper_are_the_stated_ones(method, composed):
+    for key, (ours, published) in DEPARTURES[method].items():
+        assert at(composed(method), key) == ours != published, key

@@ -1,0 +1,41 @@
+"""docs/testing.md: its table names exactly the tests that `make test` may leave out."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "docs" / "testing.md").read_text()
+TABLE = dict(re.findall(r"^\| `(tests/[\w/]+\.py)` \| ([^|]+) \|", TEXT, re.M))
+TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
+
+
+def left_out(path: Path) -> set[str]:
+    """Words for why tests of a file may not run: "slow", "gpu", or "needs" something that is missing."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Attribute):
+            mark = isinstance(node.value, ast.Attribute) and node.value.attr == "mark"
+            if mark and node.attr in ("slow", "gpu"):
+                found.add(node.attr)
+            elif node.attr in ("skipif", "importorskip"):
+                found.add("needs")
+    return found
+
+
+@pytest.mark.parametrize("path", TESTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_may_be_left_out_is_listed_with_its_reason(path):
+    name, reasons = str(path.relative_to(ROOT)), left_out(path)
+    assert (name in TABLE) == bool(reasons), f"docs/testing.md, table: {name} is marked {reasons or 'by nothing'}"
+    stated = TABLE.get(name, "")
+    assert {"slow", "gpu"} & reasons == {word for word in ("slow", "gpu") if word in stated}, name
+    assert "needs" not in reasons or "needs" in stated or "gpu" in stated or stated == "slow", name
+
+
+def test_the_page_names_every_folder_and_no_file_that_is_gone():
+    assert [name for name in TABLE if not (ROOT / name).exists()] == []
+    named = set(re.findall(r"`(?:tests/)?(\w+)`", TEXT.split("Three habits")[0]))
+    folders = {path.parent.name for path in TESTS}
+    assert folders <= named, folders - named
