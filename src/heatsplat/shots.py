@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.geometry import trajectories
+from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import temperature_picture, write_png
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import write_video
@@ -98,8 +101,39 @@ def _moments(time: float | Sequence[float], count: int) -> list[float]:
     return np.linspace(bounds[0], bounds[-1], count).tolist()
 
 
+SIGHTING_SIZE = 192  # pixels of the longer side of the depth maps of training views: coarse enough to keep all of them
+
+
+def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sighting]:
+    """What each training view has seen, for ``geometry.coverage.covered``.
+
+    Args:
+        scene: with its training views.
+        depth_of: gives the depth [H, W] of the surface in a frame, infinite where there is none.
+    """
+    found = []
+    for view in scene.train:
+        camera, mask = view.camera, view.mask
+        shrink = max(1.0, max(camera.width, camera.height) / SIGHTING_SIZE)
+        coarse = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
+        if mask is not None:
+            rows = np.arange(coarse.height) * camera.height // coarse.height
+            columns = np.arange(coarse.width) * camera.width // coarse.width
+            mask = mask[rows][:, columns]
+        found.append(Sighting(coarse, depth_of(replace(view.frame, camera=coarse)).cpu(), mask))
+    return found
+
+
+def beyond_record(scene: SceneData, time_s: float | None) -> float:
+    """Seconds between a moment and the nearest one of the training record; 0 within it, or without times."""
+    if time_s is None or "time" not in scene.metadata:
+        return 0.0
+    times = scene.train.times_s
+    return max(min(times) - time_s, time_s - max(times), 0.0)
+
+
 def develop(
-    images: Iterable[Tensor],
+    images: Iterable[tuple[Tensor, Tensor | None]],
     frames: Sequence[Frame],
     scene: SceneData,
     output_dir: Path,
@@ -109,25 +143,46 @@ def develop(
     fps: float = 15.0,
     range_c: Sequence[float] | None = None,
 ) -> list[Path]:
-    """Paths of the files written for the images [H, W, 1] of a shot: TIFF in °C, PNG with a bar, and one video.
+    """Paths of the files written for a shot: TIFF in °C, PNG with a bar, one video, and ``frames.csv``.
+
+    The table says of each frame its time, which share of its pixels some training view has seen, and how many seconds it
+    lies beyond the training record. What no training view has seen is NaN in TIFF and hatched in pictures: it is no
+    measurement. A frame beyond the record is a prediction, and its picture says so.
 
     Images are taken one by one, so that a long shot needs the memory of one. Without a thermal range they are no
     temperatures: TIFFs then hold image values in [0, 1], and the log says so.
+
+    Args:
+        images: of each frame the image [H, W, 1] and which of its pixels were seen, [H, W] bool (None: all).
+        frames: of the shot.
+        scene: that is shown.
+        output_dir: folder of the files.
+        tiff, png, video: which of them to write.
+        fps: images per second of the video.
+        range_c: °C at the ends of the colours; None takes the scene's range.
     """
     bounds = scene.thermal_range
     if bounds is None:
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     written: list[Path] = []
+    rows: list[tuple[str, float | None, float, float]] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        for frame, image in zip(frames, images, strict=True):
-            values = bounds.to_celsius(image) if bounds else image
+        for frame, (image, seen) in zip(frames, images, strict=True):
+            values = (bounds.to_celsius(image) if bounds else image)[..., 0]
+            share = 1.0
+            if seen is not None:
+                values, share = values.where(seen, torch.nan), seen.float().mean().item()
             stem = Path(frame.name).stem
+            beyond = beyond_record(scene, frame.time_s)
+            rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
             if tiff:
                 written.append(output_dir / "tiff" / f"{stem}.tiff")
                 write_temperature(written[-1], values)
             title = stem if frame.time_s is None else f"{stem}   {frame.time_s:.1f} s"
+            title += f"   {share:.0%} seen" if share < 0.995 else ""
+            title += f"   prediction, {beyond:.0f} s beyond the record" if beyond else ""
             picture = temperature_picture(values, low, high, title, unit="°C" if bounds else "")
             if png:
                 written.append(output_dir / "png" / f"{stem}.png")
@@ -140,4 +195,15 @@ def develop(
     else:
         for _ in pictures():
             pass
+    written.append(output_dir / "frames.csv")
+    with open(written[-1], "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(("frame", "time_s", "seen_share", "beyond_record_s"))
+        table.writerows(rows)
+    unseen = 1.0 - float(np.mean([share for _, _, share, _ in rows])) if rows else 0.0
+    if unseen >= 0.0005:
+        log.warning(
+            "%.1f %% of the pixels show what no training view has seen: NaN in TIFF, hatched in pictures, by frame in %s "
+            "(unseen=keep writes what the model makes of them)", 100 * unseen, written[-1],
+        )  # fmt: skip
     return written

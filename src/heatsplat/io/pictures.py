@@ -24,7 +24,8 @@ from heatsplat.contracts import ThermalRange
 
 THERMAL = "inferno"
 ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
-UNKNOWN = (128, 128, 128)  # NaN and masked pixels
+UNKNOWN = ((128, 128, 128), (176, 176, 176))  # NaN and masked pixels are hatched in two greys
+HATCH = 3  # pixels of a stripe
 
 PAPER = 255
 INK = (45, 45, 45)
@@ -66,7 +67,7 @@ class Panel:
 
 
 def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> np.ndarray:
-    """Colours of values, uint8 RGB [H, W, 3]; values outside low..high take the end's colour, NaN is grey.
+    """Colours of values, uint8 RGB [H, W, 3]; values outside low..high take the end's colour, NaN is hatched grey.
 
     Args:
         values: [H, W], tensor or array.
@@ -77,8 +78,14 @@ def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> n
     known = np.isfinite(values)
     unit = (np.where(known, values, low) - low) / (high - low) if high > low else np.full(values.shape, 0.5)
     colors = _lut(colormap)[(unit.clip(0, 1) * 255).round().astype(np.uint8)]
-    colors[~known] = UNKNOWN
+    colors[~known] = _hatching(values.shape)[~known]
     return colors
+
+
+def _hatching(shape: tuple[int, ...]) -> np.ndarray:
+    """Diagonal stripes, uint8 RGB [H, W, 3] (or [N, 1, 3] and the like), for pixels of which nothing is known."""
+    stripes = sum(np.indices(shape)) // HATCH % 2
+    return np.array(UNKNOWN, dtype=np.uint8)[stripes]
 
 
 def temperature_picture(
@@ -114,7 +121,7 @@ def comparison_picture(
     Args:
         target, prediction: [H, W, C] in [0, 1], C = 1 or 3.
         thermal_range: temperatures of 0 and 1; None labels bars with image values.
-        mask: [H, W] bool, True where a pixel counts; the others are grey in ground truth and difference.
+        mask: [H, W] bool, True where a pixel counts; the others are hatched in ground truth and difference.
         error_limit: end of the difference's bar, in °C (image values without a range); default: chosen from the image.
         title: one line above the panels.
     """
@@ -141,7 +148,7 @@ def comparison_picture(
         bar = Bar(low, high, unit)
     else:
         pictures = [(np.nan_to_num(image).clip(0, 1) * 255).round().astype(np.uint8) for image in (target, prediction)]
-        pictures[0][~counted] = UNKNOWN
+        pictures[0][~counted] = _hatching(counted.shape)[~counted]
         bar = None
     difference = Bar(-error_limit, error_limit, unit, ERROR)
     return compose(

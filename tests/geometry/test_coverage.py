@@ -1,0 +1,67 @@
+"""What training cameras have seen, on a wall whose answers are known without a renderer."""
+
+import torch
+
+from heatsplat.contracts import Camera
+from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.geometry.projection import look_at
+
+K = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def camera(x: float, z: float = 0.0) -> Camera:
+    """At (x, 0, z), looking along z with y downwards; 32 x 24 pixels see 1.6 x 1.2 of a wall at distance 1."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = torch.tensor([-x, 0.0, -z])
+    return Camera(viewmat, K, 32, 24)
+
+
+def wall(distance: float = 2.0) -> torch.Tensor:
+    return torch.full((24, 32), distance, dtype=torch.float64)
+
+
+def test_a_camera_covers_what_it_has_seen_itself():
+    assert covered(camera(0.0), wall(), [Sighting(camera(0.0), wall())]).all()
+
+
+def test_what_lies_beyond_the_training_image_is_not_covered():
+    # At distance 2 a pixel is 0.1 wide: moved by 1 to the right, the ten rightmost columns are new.
+    seen = covered(camera(1.0), wall(), [Sighting(camera(0.0), wall())])
+    assert seen[:, :22].all() and not seen[:, 22:].any()
+    both = covered(camera(1.0), wall(), [Sighting(camera(0.0), wall()), Sighting(camera(2.0), wall())])
+    assert both.all()
+
+
+def test_what_was_hidden_behind_a_surface_is_not_covered():
+    behind = covered(camera(0.0), wall(2.0), [Sighting(camera(0.0), wall(1.0))])
+    assert not behind.any()
+    assert covered(camera(0.0), wall(1.0), [Sighting(camera(0.0), wall(2.0))]).all()  # in front it would have been seen
+    assert covered(camera(0.0), wall(2.08), [Sighting(camera(0.0), wall(2.0))]).all()  # within the tolerance
+
+
+def test_behind_a_camera_nothing_is_covered():
+    viewmat = look_at(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]), torch.tensor([0.0, -1.0, 0.0])).double()
+    assert not covered(Camera(viewmat, K, 32, 24), wall(), [Sighting(camera(0.0), wall())]).any()
+
+
+def test_pixels_without_a_surface_are_directions():
+    open_sky = torch.full((24, 32), torch.inf, dtype=torch.float64)
+    assert covered(camera(5.0), open_sky, [Sighting(camera(0.0), open_sky)]).all()
+    assert not covered(camera(5.0), open_sky, [Sighting(camera(0.0), wall())]).any()
+
+
+def test_masked_pixels_of_training_images_cover_nothing():
+    mask = torch.ones(24, 32, dtype=torch.bool)
+    mask[:, :16] = False
+    seen = covered(camera(0.0), wall(), [Sighting(camera(0.0), wall(), mask)])
+    assert not seen[:, :16].any() and seen[:, 16:].all()
+
+
+def test_depth_maps_may_be_coarser_than_the_image():
+    fine = camera(0.0)
+    assert covered(fine, wall(), [Sighting(fine.resized(8, 6), wall()[:6, :8])]).all()
+
+
+def test_surface_depth_is_infinite_where_a_pixel_is_open():
+    depth = surface_depth(torch.tensor([[1.8, 0.2]]), torch.tensor([[0.9, 0.1]]))
+    assert torch.equal(depth, torch.tensor([[2.0, torch.inf]]))

@@ -1,0 +1,68 @@
+"""The files of a shot: what was not seen is no temperature, what lies beyond the record is a prediction."""
+
+import csv
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from weathered import CAMERA, make_scene
+
+from heatsplat.contracts import View, ViewSet
+from heatsplat.io.tiff import read_temperature
+from heatsplat.shots import beyond_record, develop, plan, sightings
+
+
+def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
+    scene = make_scene()
+    frames = plan(scene, "view", 0.0, 0, 1)
+    height, width = frames[0].camera.height, frames[0].camera.width
+    seen = torch.ones(height, width, dtype=torch.bool)
+    seen[0] = False
+    with caplog.at_level(logging.WARNING, "heatsplat"):
+        develop([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
+    values = read_temperature(next(tmp_path.glob("tiff/*.tiff")))
+    assert np.isnan(values[0]).all()
+    assert np.allclose(values[1:], scene.thermal_range.to_celsius(0.5))
+    (row,) = csv.DictReader((tmp_path / "frames.csv").open())
+    assert float(row["seen_share"]) == pytest.approx(1 - 1 / height, abs=1e-4)
+    assert "no training view has seen" in caplog.text
+
+
+def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
+    scene = make_scene()
+    frames = plan(scene, "view", 0.0, 0, 1)
+    camera = frames[0].camera
+    with caplog.at_level(logging.WARNING, "heatsplat"):
+        develop([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
+    assert np.isfinite(read_temperature(next(tmp_path.glob("tiff/*.tiff")))).all()
+    assert "no training view" not in caplog.text
+
+
+def test_moments_beyond_the_record_are_told_apart():
+    scene = make_scene()
+    first, last = min(scene.train.times_s), max(scene.train.times_s)
+    assert beyond_record(scene, (first + last) / 2) == 0
+    assert beyond_record(scene, last + 60) == pytest.approx(60)
+    assert beyond_record(scene, first - 60) == pytest.approx(60)
+    assert beyond_record(scene, None) == 0
+
+
+def test_every_training_view_is_a_sighting_on_a_coarse_grid():
+    scene = make_scene()
+    frames = [replace(frame, camera=CAMERA.resized(400, 200)) for frame in scene.train.frames]
+    mask = torch.zeros(200, 400, dtype=torch.bool)
+    mask[:, 200:] = True
+    scene = replace(scene, train=ViewSet(frames, lambda index: View(frames[index], mask=mask)))
+    asked = []
+
+    def depth_of(frame):
+        asked.append(frame)
+        return torch.ones(frame.camera.height, frame.camera.width)
+
+    found = sightings(scene, depth_of)
+    assert len(found) == len(scene.train)
+    assert all((one.camera.width, one.camera.height) == (192, 96) for one in found)
+    assert all(not one.mask[:, :96].any() and one.mask[:, 96:].all() for one in found)
+    assert [frame.time_s for frame in asked] == list(scene.train.times_s)
