@@ -145,14 +145,21 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
     from rich.progress import track
 
-    from heatsplat.runs.run import load
+    from heatsplat.contracts import SceneError
+    from heatsplat.runs.run import UNSEEN, load
     from heatsplat.shots import develop, plan
     from heatsplat.training.session import prepare_machine
 
+    if config["unseen"] not in UNSEEN:
+        raise SceneError(f"unseen must be one of {', '.join(UNSEEN)}, got '{config['unseen']}'")
     prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir)
     frames = plan(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
-    images = (trained.module.predict(frame).cpu() for frame in track(frames, "rendering"))
+    keep = config["unseen"] == "keep"
+    images = (
+        (trained.module.predict(frame).cpu(), None if keep else trained.seen(frame))
+        for frame in track(frames, "rendering")
+    )
     options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c")}
     written = develop(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)

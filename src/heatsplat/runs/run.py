@@ -9,23 +9,28 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.geometry.coverage import Sighting, covered, surface_depth
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
 from heatsplat.runs.resume import completed, resumed
 from heatsplat.runs.verdicts import decided, filled
-from heatsplat.shots import at_time, first_free_id
+from heatsplat.shots import at_time, first_free_id, sightings
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
 from heatsplat.training.session import fit, load_checkpoint, prepare_machine, restore
 
 log = logging.getLogger("heatsplat")
+
+UNSEEN = ("nan", "keep")
 
 
 @dataclass(frozen=True)
@@ -125,20 +130,39 @@ class Trained:
         """Its training, validation and test views, thermal range and metadata."""
         return self.data.scene
 
-    def render(self, camera: Camera | Frame, time_s: float | None = None) -> Tensor:
+    def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
         """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
 
         Args:
             camera: where from; a frame of the scene (``scene.test.frames[0]``) has a camera and a time of its own.
             time_s: seconds since the first training frame; None for the frame's own.
+            unseen: "nan" for pixels that show what no training view has seen, "keep" for what the model makes of them.
 
         Raises:
             SceneError: the scene's weather is not known at that time.
+            ValueError: ``unseen`` is neither.
         """
+        if unseen not in UNSEEN:
+            raise ValueError(f"unseen must be one of {', '.join(UNSEEN)}, got '{unseen}'")
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
         image = self.module.predict(frame)[..., 0].cpu()
-        return image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
+        image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
+        return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
+
+    def seen(self, frame: Frame) -> Tensor:
+        """Which pixels of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
+        return covered(frame.camera, self.depth(frame), self._sightings)
+
+    @torch.no_grad()
+    def depth(self, frame: Frame) -> Tensor:
+        """Camera z [H, W] of the surface in a frame, in world units; infinite where there is none."""
+        output = self.module.render(frame, depth=True)
+        return surface_depth(output.depth, output.alpha[0]).cpu()
+
+    @cached_property
+    def _sightings(self) -> list[Sighting]:
+        return sightings(self.scene, self.depth)
 
 
 def load(
