@@ -11,8 +11,7 @@ from heatsplat.datamodules.base import SceneDataModule
 from torch import Tensor
 
 from heatsplat.contracts import WEATHER_COLUMNS, Camera, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
-
-DAY_S = 86400.0
+from heatsplat.physics.units import DAY_S
 
 
 @dataclass(frozen=True)

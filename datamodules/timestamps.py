@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
 from heatsplat.contracts import SceneError
+from heatsplat.physics.units import DAY_S
 
-DAY_S = 86400.0
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from heatsplat.contracts import KELVIN_AT_0_C, SceneError
+from heatsplat.contracts import SceneError
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 # DJI writes its sensor array without a header; these are the sizes its thermal cameras have.
 DJI_SIZES = {640 * 512 * 2: (512, 640), 1280 * 1024 * 2: (1024, 1280)}

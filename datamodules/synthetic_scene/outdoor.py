@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
-    STEFAN_BOLTZMANN,
     Forcing,
     History,
     OutdoorMaterial,
@@ -28,13 +27,13 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from torch import Tensor
 
-from heatsplat.contracts import KELVIN_AT_0_C, SceneError, ThermalRange, Weather
+from heatsplat.contracts import SceneError, ThermalRange, Weather
+from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.training.rng import generator_for
 
 SITE = Site(latitude=47.0, longitude=9.0, altitude_m=500.0)
 START_UTC = "2024-07-11T00:00:00+00:00"
 START_UTC_S = 1720656000.0
-DAY_S = 86400.0
 DURATION_S = 2.0 * DAY_S
 SAMPLE_S = 600.0
 # Weather before the record, so that its start finds the surfaces in the middle of things and not at one temperature.

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dgttrf, dgttrs
 
-STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 
 # Of the two-stage, second-order, L-stable Rosenbrock method ROS2 (Verwer et al., SIAM J. Sci. Comput. 20, 1999).
 _GAMMA = 1.0 - 0.5**0.5

@@ -21,7 +21,7 @@ from heatsplat.datamodules.weather import utc_text, write_weather
 from matplotlib import colormaps
 from PIL import Image
 
-from heatsplat.contracts import KELVIN_AT_0_C
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 # What nerfstudio does to COLMAP's world: it swaps x and y and turns z round.
 APPLIED_TRANSFORM = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0))

@@ -11,7 +11,7 @@ Conventions, once for all of them (docs/conventions.md has the page):
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,11 +19,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-KELVIN_AT_0_C = 273.15
-
 
 class SceneError(ValueError):
     """Input data that cannot be used as it is. The message names the file, key or shape and the remedy."""
+
+
+def check_option(name: str, value: Any, known: Iterable[Any]) -> None:
+    """Raises ValueError, with the values that are known, where an option has another one."""
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
 
 
 @dataclass(frozen=True)

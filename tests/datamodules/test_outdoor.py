@@ -34,7 +34,8 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
 )
 from scipy.integrate import solve_ivp
 
-from heatsplat.contracts import KELVIN_AT_0_C, SceneError
+from heatsplat.contracts import SceneError
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 SOUTH_WALL, ROOF = (0.0, -1.0, 0.0), (0.0, -(0.5**0.5), 0.5**0.5)
 UP = (0.0, 0.0, 1.0)

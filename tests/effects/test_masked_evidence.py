@@ -5,7 +5,7 @@ import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.effects.look import Look
-from heatsplat.effects.noise import noise_of, noise_of_repeats
+from heatsplat.physics.noise import noise_of, noise_of_repeats
 from heatsplat.effects.observations import observe
 from heatsplat.effects.physical.conduction import _kept
 from heatsplat.effects.physical.point_spread import evidence as point_spread

@@ -96,7 +96,7 @@ class Built:
         self.declared = self.thermal.per_gaussian(seeds(sum(self.channels)))
 
     def features(self, splats, query):
-        return self.thermal.features(splats, query).features
+        return self.thermal.features(splats, query)
 
     def recorded(self, image, frame):
         return self.sensor(image, frame)
@@ -122,7 +122,7 @@ class ByHand:
             self.declared |= part.per_gaussian(seeds(1))
 
     def features(self, splats, query):
-        values = self.state.features(splats, query).features
+        values = self.state.features(splats, query)
         for part in self.parts.values():
             values = part(values, splats, query)
         return clipped(values, "straight_through") if self.parts else values
@@ -135,7 +135,7 @@ class ByHand:
     def regularisers(self, splats):
         terms = [*self.state.regularisers(splats).values()]
         for part in self.parts.values():
-            terms += part.regularisers().values()
+            terms += part.regularisers(splats).values()
         terms += [part.regulariser() for part in self.chain.values()]
         return [term for term in terms if term is not None]
 
@@ -180,7 +180,7 @@ class Run:
         splats, model = self.splats, self.model
 
         def emitted(ids):
-            return model.features(splats, Query(ids, frame.camera, frame.time_s, None, frame.frame_id))
+            return model.features(splats, Query(ids, frame.camera, frame.time_s, frame.frame_id))
 
         behind = torch.full((sum(model.channels),), 0.3)
         shown = Renderer("cpu")(
@@ -252,7 +252,7 @@ CASES = {
     "relaxation": Case(
         ("attenuation",),
         lambda: ByHand(Static(floor=False), {"attenuation": Attenuation(moments=12)}),
-        ("initial_state", "log_rate", "ambient", "span_s"),
+        ("initial_state", "log_rate", "ambient"),
     ),
     "harmonic_source": Case(
         ("relaxation", "conduction"),
@@ -287,7 +287,8 @@ CASES = {
     "reflection": Case(
         ("relaxation", "view_dependence"),
         lambda: ByHand(
-            NewtonHarmonic(frequencies=0, clip="none"), {"view_dependence": ViewDependence(degree=2, degree_every=0)}
+            NewtonHarmonic(frequencies=0, clip="none"),
+            {"view_dependence": ViewDependence(sh_degree=2, sh_degree_interval=0)},
         ),
         ("reflectance_logit", "surroundings", "reflection."),
     ),
@@ -496,7 +497,7 @@ def test_without_a_heat_source_no_gains_are_cleared(monkeypatch, frequencies):
     model = NewtonHarmonic(frequencies=frequencies)
     model.prepare(scene())
     run = Run(ByHand(model))
-    model.features(run.splats, Query(torch.tensor([3, 8]), camera(0.0), HOUR_S)).features.sum().backward()
+    model.features(run.splats, Query(torch.tensor([3, 8]), camera(0.0), HOUR_S)).sum().backward()
     assert run.splats["log_rate"].grad[8] != 0 == run.splats["log_rate"].grad[4]
     assert bool(cleared) == (frequencies > 0)
 
@@ -514,7 +515,7 @@ def written_out(model, splats, query, off):
     sunny, radiates, windy = (off != name for name in WEATHER)
 
     def bounds():
-        return ThermalRange(*model.range_c.tolist())
+        return model.range.bounds
 
     def between(low, high, name):
         return low + (high - low) * query.rows(splats[name]).sigmoid()
@@ -583,7 +584,7 @@ def written_out(model, splats, query, off):
 def under_weather(off):
     model = air(**WEATHER[off][0])
     run, query = Run(ByHand(model)), Query(torch.arange(0, COUNT, 2), camera(0.0), 3 * HOUR_S)
-    return model, lambda: model.features(run.splats, query).features, lambda: written_out(model, run.splats, query, off)
+    return model, lambda: model.features(run.splats, query), lambda: written_out(model, run.splats, query, off)
 
 
 @pytest.mark.parametrize("off", WEATHER)

@@ -9,8 +9,8 @@ from heatsplat.datamodules.formats.images import read_image
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
 from heatsplat.effects.catalogue import decide
-from heatsplat.effects.noise import noise_of
 from heatsplat.effects.observations import observe
+from heatsplat.physics.noise import noise_of
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 HEATH, REPEATS = DATA / "m3t_heath" / "colmap_scene", DATA / "flir" / "static_repeats"

@@ -31,7 +31,7 @@ ALLOWED = {
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
-    "datamodules": {"contracts", "geometry", "sensors", "training"},
+    "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
 }
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
 # Third-party package -> places that may import it.

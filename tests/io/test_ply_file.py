@@ -5,7 +5,8 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from heatsplat.io.ply import SH_C0, read_splats, write_splats
+from heatsplat.geometry.spherical_harmonics import C0
+from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.training.rng import generator_for
 
 STANDARD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -34,7 +35,7 @@ def test_layout_is_that_of_3dgs(tmp_path):
     assert names == [*STANDARD, *(f"f_rest_{i}" for i in range(45)), *SHAPE]
     assert {prop.val_dtype for prop in vertex.properties} == {"f4"}
     for i in range(3):
-        assert np.allclose(0.5 + SH_C0 * vertex[f"f_dc_{i}"], made["values"][:, 0], atol=1e-6)
+        assert np.allclose(0.5 + C0 * vertex[f"f_dc_{i}"], made["values"][:, 0], atol=1e-6)
         assert np.array_equal(vertex[f"f_rest_{15 * i + 4}"], made["sh_rest"][:, 4, 0])  # channel by channel
     assert np.array_equal(vertex["opacity"], made["opacity_logits"][:, 0])
     assert np.array_equal(vertex["rot_0"], made["quats"][:, 0])

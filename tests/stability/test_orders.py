@@ -11,6 +11,7 @@ from heatsplat.physics import energy_balance, planck, relaxation
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface
 from heatsplat.physics.relaxation import temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
+from heatsplat.physics.units import celsius
 from heatsplat.sensors import tone
 from heatsplat.splats import Splats
 from heatsplat.thermal.conduction import _ImplicitStep, laplacian
@@ -155,8 +156,8 @@ def test_nodes_of_the_cooling_integral():
     model = NtrGaussian(width=16, time_frequencies=1).double().eval()
     for parameter in model.parameters():
         parameter.data = torch.randn(parameter.shape, generator=generator, dtype=DOUBLE) * 0.3
-    model.bounds_k.copy_(torch.tensor([283.0, 20.0]))
-    model.clock.copy_(torch.tensor([0.0, 3600.0]))
+    model.range.range_c.copy_(celsius(torch.tensor([283.0, 303.0])))
+    model.clock.record.copy_(torch.tensor([0.0, 3600.0]))
     means = torch.rand(20, 3, generator=generator, dtype=DOUBLE)
     feature = torch.rand(20, 8, generator=generator, dtype=DOUBLE)
     shapes = {"log_scales": torch.zeros(20, 3), "quats": torch.ones(20, 4), "opacity_logits": torch.zeros(20, 1)}

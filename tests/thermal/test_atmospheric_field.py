@@ -45,7 +45,7 @@ def query(time_s=20.0, ids=None):
 
 def by_hand(model, means, time_s):
     """The factor in double precision, layer by layer: a plain perceptron on the code of place and of time, side by side."""
-    place = octaves(((means.double() - model.center) / model.edge).clamp(-0.9, 0.9), model.position_frequencies)
+    place = octaves(((means.double() - model.box.center) / model.box.edge).clamp(-0.9, 0.9), model.position_frequencies)
     moment = octaves(torch.tensor([[(time_s - 5.0) / 40.0]], dtype=torch.float64), model.time_frequencies)
     code = torch.cat((place, moment.expand(len(place), -1)), 1)
     hidden = code
@@ -70,7 +70,7 @@ def test_the_factor_is_the_formula_of_a_plain_network_in_double_precision(option
 @pytest.mark.parametrize("exponent", ["printed", "positive"])
 def test_it_is_exactly_absent_at_first(exponent):
     model, splats = make(exponent=exponent)
-    assert torch.equal(model.features(splats, query()).features, model.emission.features(splats, query()).features)
+    assert torch.equal(model.features(splats, query()), model.emission.features(splats, query()))
 
 
 def test_more_of_anything_weakens():
@@ -96,7 +96,7 @@ def test_factor_and_slopes_are_finite_whatever_the_network_says(scale, limit, se
 
 def test_places_get_no_gradient_and_the_network_does_from_the_first_step_on():
     model, splats = make()
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     assert splats.means.grad is None and model.head.weight.grad.abs().max() > 0
 
 
@@ -105,8 +105,8 @@ def test_only_gaussians_in_view_are_evaluated():
     rows = []
     model.head.register_forward_hook(lambda module, inputs, output: rows.append(output.shape[0]))
     ids = torch.tensor([4, 17, 3])
-    some = model.features(splats, query(ids=ids)).features
-    every = model.features(splats, query()).features
+    some = model.features(splats, query(ids=ids))
+    every = model.features(splats, query())
     assert rows == [3, 50] and torch.allclose(some, every[ids], atol=1e-6)
 
 
@@ -134,9 +134,9 @@ def test_what_it_cannot_do_without_is_named():
     with pytest.raises(ValueError, match="exponent must be one of positive, printed, got 'free'"):
         AtmosphericField(Static(), exponent="free")
     with pytest.raises(SceneError, match="AtmosphericField needs time"):
-        AtmosphericField(Static(), time="seconds").prepare(make_scene((None, None)))
+        AtmosphericField(Static(), time="seconds").check(make_scene((None, None)))
     model, splats = make()
-    with pytest.raises(ValueError, match="give time_s, or time=none"):
+    with pytest.raises(ValueError, match="give time_s"):
         model.features(splats, query(None))
 
 
@@ -148,7 +148,7 @@ def test_it_learns_air_that_thickens_which_no_constant_can():
     optimiser = torch.optim.Adam([*model.parameters(), *splats.parameters()], lr=3e-3)
     for _ in range(150):
         optimiser.zero_grad()
-        misses = [model.features(splats, query(t)).features[:, 0] - 0.8 * math.exp(-0.02 * (t - 5.0)) for t in times]
+        misses = [model.features(splats, query(t))[:, 0] - 0.8 * math.exp(-0.02 * (t - 5.0)) for t in times]
         loss = torch.cat(misses).abs().mean()
         loss.backward()
         optimiser.step()

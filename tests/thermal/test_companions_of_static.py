@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from heatsplat.contracts import KELVIN_AT_0_C, Camera, SceneData, ThermalRange, ViewSet
+from heatsplat.contracts import Camera, SceneData, ThermalRange, ViewSet
+from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.static import Static
@@ -34,10 +35,10 @@ def test_channels_are_those_of_two_models(degree):
     tensors = {name: part.initial for name, part in both.per_gaussian(start).items()}
     if degree:
         tensors["sh_rest"] = 0.3 * torch.randn(COUNT, 15, 4, generator=torch.Generator().manual_seed(1))
-    emitted = both.features(splats_of(start.means, tensors), Query(camera=camera())).features
+    emitted = both.features(splats_of(start.means, tensors), Query(camera=camera()))
     for model, part in ((Static(degree), slice(0, 1)), (Static(degree, 3, "rgb"), slice(1, 4))):
         own = {name: tensor[..., part] for name, tensor in tensors.items()}
-        expected = model.features(splats_of(start.means, own), Query(camera=camera())).features
+        expected = model.features(splats_of(start.means, own), Query(camera=camera()))
         assert torch.equal(emitted[:, part], expected)
     if degree == 0:
         assert torch.allclose(emitted, start.values, atol=1e-6)

@@ -63,6 +63,7 @@ def splats_of(model: EnergyBalance, count: int = 6) -> Splats:
 
 def ready(data: SceneData | None = None, **options) -> tuple[EnergyBalance, Splats]:
     model = EnergyBalance(**options)
+    model.check(data or scene())
     model.prepare(data or scene())
     return model, splats_of(model)
 
@@ -72,7 +73,7 @@ def test_it_emits_temperatures_and_all_that_it_learns_gets_a_gradient(solution):
     model, splats = ready(solution=solution)
     assert set(splats.names) >= {"initial_state", *FULL}
     ids = torch.tensor([4, 1])
-    shown = model.features(splats, Query(ids, time_s=13 * HOUR)).features
+    shown = model.features(splats, Query(ids, time_s=13 * HOUR))
     assert shown.shape == (2, 1)
     kelvin = model.temperature(splats, 13 * HOUR)
     torch.testing.assert_close(shown[:, 0], ((kelvin[ids] - 273.15) / 60.0), atol=1e-4, rtol=0)
@@ -167,7 +168,7 @@ def test_attributes_follow_the_assumed_emissivity_by_one_common_factor():
         torch.testing.assert_close(half[name], told[name] / 2)
     for name in ("time_constant_h", "sun_k_per_kw_m2", "radiation_share", "wind_share"):
         torch.testing.assert_close(half[name], told[name])
-    torch.testing.assert_close(model.features(splats, query).features, other.features(splats, query).features)
+    torch.testing.assert_close(model.features(splats, query), other.features(splats, query))
     assert (told["absorptivity"] > 0).all()
 
 

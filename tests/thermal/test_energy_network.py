@@ -8,11 +8,11 @@ import pytest
 import torch
 from weathered import CAMERA, HOUR_S, make_scene, make_weather
 
-from heatsplat.contracts import KELVIN_AT_0_C, SceneError
+from heatsplat.contracts import SceneError
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.physics.ellipsoids import convecting_area_ratio, projected_area_ratio, radiating_area_ratio
-from heatsplat.physics.units import STEFAN_BOLTZMANN
+from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.energy_network import LIMITS, TERMS, EnergyNetwork
@@ -26,6 +26,7 @@ def make(scene=None, count=40, disturb=0.0, **options):
     """A model on a scene with its splats; ``disturb`` gives the heads random weights of that size."""
     model = EnergyNetwork(**{"width": 16, "weights": ALL} | options)
     scene = scene or make_scene()
+    model.check(scene)
     model.prepare(scene)
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 4.0, 1.0])
@@ -59,7 +60,7 @@ def penalties(model, splats, step=0, time_s=HOUR_S, ids=None):
 
 def test_before_training_all_are_as_warm_as_the_images_and_of_typical_materials():
     model, splats = make()
-    emitted = model.features(splats, query()).features
+    emitted = model.features(splats, query())
     assert emitted.shape == (40, 1)
     torch.testing.assert_close(emitted, splats["first_value"].mean().expand(40, 1))
     told = model.attributes(splats, query())
@@ -73,8 +74,8 @@ def test_before_training_all_are_as_warm_as_the_images_and_of_typical_materials(
 def test_only_what_is_in_view_is_evaluated_and_it_is_the_same(options):
     model, splats = make(disturb=1.0, **options)
     ids = torch.tensor([3, 30, 17])
-    everything = model.features(splats, query()).features
-    torch.testing.assert_close(model.features(splats, query(ids=ids)).features, everything[ids])
+    everything = model.features(splats, query())
+    torch.testing.assert_close(model.features(splats, query(ids=ids)), everything[ids])
     for name, values in model.attributes(splats, query()).items():
         torch.testing.assert_close(model.attributes(splats, query(ids=ids))[name], values[ids])
 
@@ -92,7 +93,7 @@ def test_no_head_leaves_its_bounds_and_no_gradient_is_lost_whatever_the_network_
 
 def test_kelvin_and_image_values_are_the_same_temperature():
     model, splats = make(disturb=0.5)
-    image = model.features(splats, query()).features[:, 0]
+    image = model.features(splats, query())[:, 0]
     torch.testing.assert_close(model.temperature(splats, HOUR_S), 0.0 + 50.0 * image + KELVIN_AT_0_C)
 
 
@@ -100,11 +101,11 @@ def test_kelvin_and_image_values_are_the_same_temperature():
 def test_temperature_follows_the_time_of_the_question(time):
     """The weather of the record counts, not that of the frame, which may have been asked at another time."""
     model, splats = make(disturb=1.0, time=time)
-    morning, evening = (model.features(splats, query(hours * HOUR_S)).features for hours in (1, 9))
+    morning, evening = (model.features(splats, query(hours * HOUR_S)) for hours in (1, 9))
     assert (morning - evening).abs().max() > 1e-3
     tomorrow = make_weather()
     model.weather = replace(tomorrow, times_s=tomorrow.times_s + 24 * HOUR_S)  # the same weather a day later
-    again = model.features(splats, query(25 * HOUR_S)).features
+    again = model.features(splats, query(25 * HOUR_S))
     assert ((again - morning).abs().max() < 1e-4) == (time != "record")
 
 
@@ -114,19 +115,19 @@ def test_temperature_follows_the_time_of_the_question(time):
 def test_the_first_stage_shows_one_value_and_leaves_the_network_alone():
     model, splats = make(first_steps=10)
     model.on_step(9)
-    emitted = model.features(splats, query()).features
+    emitted = model.features(splats, query())
     assert torch.equal(emitted[:, 0], splats["first_value"])
     assert model.attributes(splats, query()) == {} and model.regularisers(splats) == {}
     emitted.sum().backward()
     assert all(parameter.grad is None for parameter in model.parameters())
     model.on_step(10)
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     assert model.network.heads["temperature"].bias.grad != 0
     model.on_step(9)
     state = {name: value.clone() for name, value in model.state_dict().items()}
     other, _ = make(first_steps=10)
     other.load_state_dict(state)  # a checkpoint of the first stage shows the first stage
-    assert torch.equal(other.features(splats, query()).features[:, 0], splats["first_value"])
+    assert torch.equal(other.features(splats, query())[:, 0], splats["first_value"])
 
 
 def test_classes_and_features_go_with_their_gaussian():
@@ -143,7 +144,7 @@ def test_classes_and_features_go_with_their_gaussian():
     cloud.keep(keep)
     assert torch.equal(splats["label"].detach(), torch.cat((labels, labels[[5, 7]]))[3:])
     assert torch.equal(splats["feature"].detach(), torch.cat((features, features[[5, 7]]))[3:])
-    assert model.features(splats, query()).features.shape == (39, 1)
+    assert model.features(splats, query()).shape == (39, 1)
 
 
 def test_classes_and_given_features_do_not_learn():
@@ -300,7 +301,7 @@ def test_the_table_in_place_of_heads():
 
 def test_no_loss_reaches_latent_heat():
     model, splats = make(disturb=0.5)
-    (sum(penalties(model, splats).values()) + model.features(splats, query()).features.sum()).backward()
+    (sum(penalties(model, splats).values()) + model.features(splats, query()).sum()).backward()
     assert model.network.heads["latent_heat"].weight.grad is None
     assert model.network.heads["attributes"].weight.grad.abs().min() > 0
 
@@ -322,7 +323,7 @@ def test_a_missing_column_is_left_out_and_said_to_be(column, caplog):
         model, splats = make(make_scene(weather=make_weather(**{column: None})), disturb=1.0)
     assert column in caplog.text
     assert model.effects()["relaxation"]["left_out"] == [column]
-    assert model.features(splats, query()).features.isfinite().all()
+    assert model.features(splats, query()).isfinite().all()
     assert all(term.isfinite() for term in penalties(model, splats).values())
 
 
@@ -347,7 +348,7 @@ def test_a_network_goes_to_another_scene_with_its_measures(tmp_path):
     model, others = make(elsewhere, count=160, network=str(tmp_path / "last.ckpt"), first_steps=10, **options)
     assert model.lr == 0.0
     model.on_step(0)
-    assert torch.equal(model.features(others, query()).features[:, 0], others["first_value"])  # its first stage trains
+    assert torch.equal(model.features(others, query())[:, 0], others["first_value"])  # its first stage trains
     model.eval()
     for label in range(10):
         here, there = ((who["label"] == label).nonzero()[0] for who in (others, splats))
@@ -378,7 +379,7 @@ def test_a_network_goes_to_another_scene_with_its_measures(tmp_path):
 )
 def test_scenes_that_lack_something_are_refused_with_the_way_out(changed, message):
     with pytest.raises(SceneError, match=message):
-        EnergyNetwork(weights=ALL).prepare(replace(make_scene(), **changed))
+        EnergyNetwork(weights=ALL).check(replace(make_scene(), **changed))
 
 
 def test_a_sky_that_needs_humidity_says_so():

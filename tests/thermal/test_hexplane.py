@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import grid_sample
 
-from heatsplat.contracts import KELVIN_AT_0_C, Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.hexplane import HEADS, Deformed, HexPlane
@@ -99,8 +100,8 @@ def test_it_is_exactly_3dgs_at_first(heads):
     if moved is not None:
         for name in ("means", "quats", "scales", "opacities"):
             assert torch.equal(getattr(moved, name), getattr(splats, name)), name
-    emitted = model.features(splats, query(geometry=moved)).features
-    assert torch.equal(emitted, Static().features(splats, query()).features)
+    emitted = model.features(splats, query(geometry=moved))
+    assert torch.equal(emitted, Static().features(splats, query()))
 
 
 def test_heads_change_the_raw_tensors_and_the_radiance():
@@ -122,8 +123,8 @@ def test_heads_change_the_raw_tensors_and_the_radiance():
     for name, values in expected.items():
         tolerance = 2e-2 if name == "means" else 1e-5  # quantiles of drawn points are 0.98 of the edges but for chance
         assert torch.allclose(getattr(moved, name).double(), values.double(), atol=tolerance), name
-    level = Static(floor=False).features(splats, query()).features
-    emitted = model.features(splats, query()).features
+    level = Static(floor=False).features(splats, query())
+    emitted = model.features(splats, query())
     assert torch.allclose(emitted.double(), (level + change["radiance"]).clamp(min=0), atol=1e-5)
     kelvins = KELVIN_AT_0_C + 10 + 20 * (level + change["radiance"])[:, 0]
     assert torch.allclose(model.temperature(splats, 13.7).double(), kelvins, atol=1e-3)
@@ -147,9 +148,9 @@ def test_the_field_is_evaluated_once_a_view_and_radiance_for_gaussians_in_view()
     ids = torch.tensor([4, 17, 3])
     moved = model.geometry(splats, query())
     assert isinstance(moved, Deformed)
-    some = model.features(splats, query(ids=ids, geometry=moved)).features
+    some = model.features(splats, query(ids=ids, geometry=moved))
     assert rows == {"trunk": [25], "radiance": [3]}
-    apart = model.features(splats, query(ids=ids)).features
+    apart = model.features(splats, query(ids=ids))
     assert rows == {"trunk": [25, 3], "radiance": [3, 3]} and torch.allclose(some, apart, atol=1e-6)
 
 
@@ -159,7 +160,7 @@ def test_the_first_stage_evaluates_nothing():
     model.trunk.register_forward_hook(lambda *_: calls.append(1))
     model.on_step(4)
     assert model.geometry(splats, query()) is None and model.regularisers(splats) == {}
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     assert not calls and all(parameter.grad is None for parameter in model.parameters())
     model.on_step(5)
     assert model.geometry(splats, query()) is not None and len(model.regularisers(splats)) == 3 and calls
@@ -199,7 +200,7 @@ def test_everything_is_finite_whatever_the_place_time_and_weights(time_s, weight
     with torch.no_grad():
         splats.means.mul_(spread)
     moved = model.geometry(splats, query(time_s))
-    emitted = model.features(splats, query(time_s, geometry=moved)).features
+    emitted = model.features(splats, query(time_s, geometry=moved))
     shown = (moved.means, moved.quats, moved.scales, moved.opacities, emitted)
     sum(tensor.mean() for tensor in shown).backward()
     assert all(tensor.isfinite().all() for tensor in shown) and (moved.scales > 0).all() and (emitted >= 0).all()
@@ -218,7 +219,7 @@ def test_radiance_learns_what_warms_here_and_cools_there():
     for i in range(240):  # a view at a time, as in training
         time_s = times[i % 3]
         optimiser.zero_grad()
-        found = model.features(splats, query(time_s)).features[:, 0]
+        found = model.features(splats, query(time_s))[:, 0]
         losses.append((found - 0.5 - 0.2 * side * (time_s - 15.5) / 5.5).abs().mean())
         losses[-1].backward()
         optimiser.step()
@@ -233,7 +234,7 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="resolutions must be at least 2"):
         HexPlane(Static(), resolution=1)
     with pytest.raises(SceneError, match="HexPlane needs time, which scene 'yard'"):
-        HexPlane(Static()).prepare(make_scene((None, None)))
+        HexPlane(Static()).check(make_scene((None, None)))
     model, splats = make()
-    with pytest.raises(ValueError, match="4DGS needs the time"):
+    with pytest.raises(ValueError, match="give time_s"):
         model.geometry(splats, query(None))

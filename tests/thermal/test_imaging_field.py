@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ViewSet
 from heatsplat.splats import Splats
-from heatsplat.thermal.atmospheric_field import octaves
-from heatsplat.thermal.base import Emission, Query, Seeds
+from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.coordinates import octaves
 from heatsplat.thermal.imaging_field import ImagingField
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.static import Static
@@ -58,14 +58,14 @@ def test_the_factor_is_exactly_one_at_first(options, count):
     model, splats = make(count, **options)
     assert torch.equal(model.factor(splats.means, query()), torch.ones(count))
     if options.get("applies_to") != "harmonics":  # subtracting and adding 1/2 rounds
-        emitted = model.emission.features(splats, query()).features
-        assert torch.equal(model.features(splats, query()).features, emitted)
+        emitted = model.emission.features(splats, query())
+        assert torch.equal(model.features(splats, query()), emitted)
 
 
 @pytest.mark.parametrize("exponent", ["positive", "printed"])
 def test_all_four_quantities_learn_from_the_first_step_on(exponent):
     model, splats = make(exponent=exponent)
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     moved = model.head.bias.grad.abs() > 1e-6
     # As printed, distance has no effect while both coefficients are zero.
     assert moved.tolist() == [True, True, exponent == "positive", True]
@@ -123,7 +123,7 @@ def test_octaves_agree_with_fifty_digits_and_lose_nothing_at_high_frequencies():
 
 def test_places_get_no_gradient_from_the_field():
     model, splats = make(disturb=0.3)
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     assert splats.means.grad is None
     assert splats["sh0"].grad.abs().max() > 0
 
@@ -133,9 +133,9 @@ def test_only_gaussians_in_view_are_evaluated_and_the_time_once():
     rows = []
     model.head.register_forward_hook(lambda module, inputs, output: rows.append(output.shape[0]))
     ids = torch.tensor([4, 17, 3])
-    some = model.features(splats, query(ids=ids)).features
+    some = model.features(splats, query(ids=ids))
     assert rows == [3]
-    every = model.features(splats, query()).features
+    every = model.features(splats, query())
     assert torch.allclose(some, every[ids], atol=1e-6)
 
 
@@ -143,10 +143,10 @@ def test_scaling_coefficients_leaves_the_constant_half_alone():
     on_radiance, splats = make(disturb=0.3)
     on_harmonics, _ = make(disturb=0.3, applies_to="harmonics")
     factor = on_radiance.factor(splats.means, query())[:, None]
-    emitted = on_radiance.emission.features(splats, query()).features
-    assert torch.allclose(on_radiance.features(splats, query()).features, factor * emitted)
+    emitted = on_radiance.emission.features(splats, query())
+    assert torch.allclose(on_radiance.features(splats, query()), factor * emitted)
     printed = (0.28209479177387814 * splats["sh0"][:, 0] * factor + 0.5).clamp(min=0)  # Eq. 12 at degree 0
-    assert torch.allclose(on_harmonics.features(splats, query()).features, printed, atol=1e-6)
+    assert torch.allclose(on_harmonics.features(splats, query()), printed, atol=1e-6)
     assert not torch.allclose(printed, factor * emitted, atol=1e-3)
 
 
@@ -168,7 +168,7 @@ def test_without_times_the_index_of_the_frame_takes_their_place():
     for stranger in (None, 99):  # a view that no one took: the middle of the record
         assert torch.equal(model.factor(splats.means, query(None, frame_id=stranger)), seen[1])
     with pytest.raises(SceneError, match="ImagingField needs time"):
-        ImagingField(Static(), time="seconds").prepare(make_scene((None, None)))
+        ImagingField(Static(), time="seconds").check(make_scene((None, None)))
 
 
 def test_a_scene_of_one_moment_or_one_frame_is_finite():
@@ -183,7 +183,7 @@ def test_a_scene_of_one_moment_or_one_frame_is_finite():
 def test_the_box_makes_the_code_one_to_one_and_far_points_stay_in_it():
     model, splats = make()
     low, high = torch.quantile(make_scene().points, torch.tensor([0.01, 0.99]), dim=0)
-    inside = (torch.stack((low, high)) - model.center) / model.edge
+    inside = (torch.stack((low, high)) - model.box.center) / model.box.edge
     assert inside.abs().max().item() == pytest.approx(0.5, abs=1e-6)
     far = torch.tensor([[1e6, -1e6, 0.0], [-1e6, 1e6, 0.0]])
     assert not torch.allclose(*model._code_of(far), atol=0.1)  # the two ends do not share a code
@@ -215,8 +215,8 @@ def test_it_wraps_any_emission_and_speaks_for_it():
     assert set(splats.names) >= {"initial_state", "log_rate", "source_gains"}
     assert model.needs == {"time"}
     assert set(model.effects()) == {"relaxation", "harmonic_source", "attenuation"}
-    assert model.features(splats, query()).features.shape == (50, 1)
-    harmonics, _ = make(emission=Static(degree=2, degree_every=10))
+    assert model.features(splats, query()).shape == (50, 1)
+    harmonics, _ = make(emission=Static(sh_degree=2, sh_degree_interval=10))
     harmonics.on_step(10)
     assert harmonics.emission.active_degree == 1
 
@@ -230,14 +230,14 @@ def test_companions_pass_untouched():
             self.companions, self.modality_channels = ("rgb",), (1, 3)
 
         def features(self, splats, query):
-            emitted = super().features(splats, query).features
-            return Emission(torch.cat((emitted, emitted.expand(-1, 3)), 1))
+            emitted = super().features(splats, query)
+            return torch.cat((emitted, emitted.expand(-1, 3)), 1)
 
     _, splats = make()
     model = ImagingField(Joint())
     with torch.no_grad():
         model.head.bias[3] = 1.0
-    features = model.features(splats, query()).features
+    features = model.features(splats, query())
     assert torch.allclose(features[:, 0], 2 / (1 + math.exp(-1.0)) * features[:, 1], rtol=1e-5)
     assert (model.companions, model.modality_channels) == (("rgb",), (1, 3))
 
@@ -265,7 +265,7 @@ def test_cost_counts_the_multiply_adds_of_the_layers():
     paper = ImagingField(Static(), width=256, depth=8, skip=5)
     assert 0.48e6 < paper.cost < 0.50e6
     wide, splats = make(width=32, depth=4, skip=2, disturb=0.2)
-    assert wide.layers[2].in_features == 92 and wide.features(splats, query()).features.isfinite().all()
+    assert wide.layers[2].in_features == 92 and wide.features(splats, query()).isfinite().all()
 
 
 @pytest.mark.parametrize(
@@ -287,5 +287,5 @@ def test_unknown_options_are_named(options, message):
 
 def test_a_time_that_is_missing_is_asked_for():
     model, splats = make()
-    with pytest.raises(ValueError, match="give time_s, or time=none"):
+    with pytest.raises(ValueError, match="give time_s"):
         model.features(splats, query(None))

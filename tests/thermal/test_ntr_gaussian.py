@@ -6,8 +6,8 @@ import pytest
 import torch
 from weathered import CAMERA, HOUR_S, make_scene
 
-from heatsplat.contracts import KELVIN_AT_0_C, SceneError
-from heatsplat.physics.units import STEFAN_BOLTZMANN
+from heatsplat.contracts import SceneError
+from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.ntr_gaussian import EXCHANGE, STORAGE, NtrGaussian
@@ -80,10 +80,10 @@ def test_more_nodes_converge_at_second_order():
 def test_the_first_stage_emits_a_value_per_gaussian_and_the_second_the_integral():
     model, splats, _ = make(first_steps=5)
     model.on_step(0)
-    first = model.features(splats, at(HOUR_S)).features[:, 0]
+    first = model.features(splats, at(HOUR_S))[:, 0]
     assert torch.equal(first, splats["first_value"].clamp(min=0)) and model.regularisers(splats) == {}
     model.on_step(5)
-    assert not torch.equal(model.features(splats, at(HOUR_S)).features[:, 0], first)
+    assert not torch.equal(model.features(splats, at(HOUR_S))[:, 0], first)
     assert "first_value" not in make()[1].names
 
 
@@ -91,13 +91,13 @@ def test_only_the_asked_gaussians_are_evaluated():
     model, splats, _ = make()
     model.eval()
     ids = torch.tensor([3, 17, 4])
-    every = model.features(splats, at(HOUR_S)).features
-    assert torch.allclose(model.features(splats, at(HOUR_S, ids)).features, every[ids], atol=1e-6)
+    every = model.features(splats, at(HOUR_S))
+    assert torch.allclose(model.features(splats, at(HOUR_S, ids)), every[ids], atol=1e-6)
 
 
 def test_penalties_are_there_with_gradients_and_absent_at_weight_zero():
     model, splats, _ = make()
-    loss = model.features(splats, at(2 * HOUR_S)).features.sum()
+    loss = model.features(splats, at(2 * HOUR_S)).sum()
     terms = model.regularisers(splats)
     assert set(terms) == {"ntr/consistency", "ntr/environment", "ntr/variation", "ntr/integral"}
     (loss + sum(terms.values())).backward()

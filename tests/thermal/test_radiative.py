@@ -14,7 +14,7 @@ from heatsplat.thermal.static import Static
 
 
 def model(**options):
-    return Radiative(Static(degree=2, channels=3, modality="rgb", degree_every=0), **options)
+    return Radiative(Static(sh_degree=2, channels=3, modality="rgb", sh_degree_interval=0), **options)
 
 
 def seeds(count=60):
@@ -73,7 +73,7 @@ def test_temperature_is_the_inverse_and_zero_below_what_is_reflected():
 def test_emission_is_the_printed_one():
     thermal = model()
     splats = splats_of(thermal, seeds(), disturb=0.3, dtype=torch.float64)
-    found = thermal.features(splats, query()).features
+    found = thermal.features(splats, query())
     told = thermal.attributes(splats, query())
     ahead = torch.nn.functional.normalize(splats.means - query().camera.center, dim=1)
     harmonics = torch.stack([-ahead[:, 1], ahead[:, 2], -ahead[:, 0]], dim=1)
@@ -84,7 +84,7 @@ def test_emission_is_the_printed_one():
     assert torch.allclose(told["reflectance"], (C0 * splats["reflectance"][:, 0, 0]).sigmoid())  # degree 0
     expected = told["emissivity"] * thermal.gain * told["temperature"] ** 4 + told["reflectance"] * thermal.surroundings
     assert torch.allclose(found[:, 0], expected.clamp(0, 1))
-    assert torch.equal(found[:, 1:], thermal.color.features(splats, query()).features)
+    assert torch.equal(found[:, 1:], thermal.color.features(splats, query()))
 
 
 # Start ----------------------------------------------------------------------------------------------
@@ -93,7 +93,7 @@ def test_emission_is_the_printed_one():
 @pytest.mark.parametrize("options", [{}, {"three_parameter": False}, {"reflectance": "kirchhoff"}])
 def test_emission_starts_at_the_seed_values(options):
     thermal, start = model(**options), seeds()
-    emitted = thermal.features(splats_of(thermal, start), query()).features
+    emitted = thermal.features(splats_of(thermal, start), query())
     assert torch.allclose(emitted, start.values, atol=2e-5)
 
 
@@ -102,7 +102,7 @@ def test_a_dark_seed_starts_warm_enough_to_learn():
     thermal = model()
     start = Seeds(torch.randn(5, 3), torch.zeros(5, 4), torch.Generator())
     splats = splats_of(thermal, start)
-    thermal.features(splats, query()).features[:, 0].sum().backward()
+    thermal.features(splats, query())[:, 0].sum().backward()
     assert thermal.attributes(splats, query())["temperature"].min() > 0.049
     assert splats["temperature"].grad.abs().min() > 1e-6
 
@@ -114,7 +114,7 @@ def test_saturated_attributes_stay_finite(logit):
     with torch.no_grad():
         for name in ATTRIBUTES:
             splats.raw[name].fill_(logit)
-    emitted = thermal.features(splats, query()).features
+    emitted = thermal.features(splats, query())
     emitted.sum().backward()
     assert emitted.isfinite().all() and emitted[:, 0].min() >= 0 and emitted[:, 0].max() <= 1
     assert all(parameter.grad is None or parameter.grad.isfinite().all() for parameter in splats.parameters())
@@ -131,7 +131,7 @@ def test_float32_agrees_with_float64(some):
     for dtype in (torch.float32, torch.float64):
         thermal = model().to(dtype)
         splats = splats_of(thermal, start, disturb=0.3, dtype=dtype)
-        emitted = thermal.features(splats, query(ids)).features
+        emitted = thermal.features(splats, query(ids))
         (emitted * torch.linspace(-1, 1, emitted.numel(), dtype=dtype).view_as(emitted)).sum().backward()
         tensors = {name: splats[name].grad for name in splats.names if splats[name].grad is not None}
         tensors |= {name: parameter.grad for name, parameter in thermal.named_parameters()}
@@ -144,8 +144,8 @@ def test_float32_agrees_with_float64(some):
 def test_only_gaussians_in_view_are_evaluated():
     thermal = model()
     splats, ids = splats_of(thermal, seeds(), disturb=0.3), torch.tensor([7, 3, 50])
-    emitted = thermal.features(splats, query(ids)).features
-    assert torch.allclose(emitted, thermal.features(splats, query()).features[ids])
+    emitted = thermal.features(splats, query(ids))
+    assert torch.allclose(emitted, thermal.features(splats, query())[ids])
     emitted.sum().backward()
     for name in (*ATTRIBUTES, "emissivity_rest", "sh0"):
         touched = splats[name].grad.flatten(1).abs().sum(1).nonzero().squeeze(1).tolist()
@@ -163,7 +163,7 @@ def test_emission_above_one(clip, shown, slope):
     with torch.no_grad():
         for name in ATTRIBUTES:
             splats.raw[name].fill_(10.0)
-    emitted = thermal.features(splats, query()).features[:, 0]
+    emitted = thermal.features(splats, query())[:, 0]
     emitted.sum().backward()
     assert (emitted == 1).all() if shown == 1 else (emitted > shown).all()
     assert (splats["temperature"].grad.abs().sum() > 0) == slope

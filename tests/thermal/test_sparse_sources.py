@@ -11,7 +11,7 @@ from heatsplat.density.ops import Cloud
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.splats import Splats
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
-from heatsplat.thermal.sparse_sources import RATES, SparseSources, noise_of, relaxation_of
+from heatsplat.thermal.sparse_sources import RATES, SparseSources, relaxation_of
 
 COUNT, SPAN_S = 60, 400.0
 OMEGA = 2 * math.pi * torch.linspace(1, 9, 24, dtype=torch.float64)
@@ -195,9 +195,9 @@ def scene(noise=0.002):
 
 
 def test_the_noise_is_that_of_the_camera():
-    views = scene(0.002).train
-    assert noise_of(views[0], "thermal") == pytest.approx(0.002, rel=0.1)
-    assert noise_of(scene(0.0).train[0], "thermal") < 1e-6
+    sources = SparseSources([1])
+    sources.prepare(scene(0.002), "thermal")
+    assert sources.noise == pytest.approx(0.002, rel=0.1)
 
 
 @pytest.mark.parametrize("param", ["rate", "faithful"])
@@ -232,7 +232,7 @@ def test_sources_go_where_relaxation_tells_the_same(param):
         assert heat > 20 * 0.002  # its heat alone is far above the noise
     cloud = Cloud(splats)
     for step in (4, 5, 6):
-        for needless in model.needless_rows(splats, step):
+        for needless in model.rows_to_drop(splats, step):
             cloud.drop(*needless)
         assert (splats.places("source_gains") is not None) == (step >= 5)
     assert splats.places("source_gains").tolist() == [0, -1, -1]

@@ -46,7 +46,7 @@ def splats_of(model, seeds, rest=0.0, dtype=torch.float32):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_emission_starts_at_the_seed_values(degree, channels):
     model, start = Static(degree, channels, modality="rgb"), seeds(channels=channels)
-    emitted = model.features(splats_of(model, start), Query(camera=camera_at([0, 0, -3.0]))).features
+    emitted = model.features(splats_of(model, start), Query(camera=camera_at([0, 0, -3.0])))
     assert torch.allclose(emitted, start.values, atol=1e-6)
 
 
@@ -54,7 +54,7 @@ def test_degree_zero_has_neither_directions_nor_further_bands():
     model = Static()
     assert list(model.per_gaussian(seeds())) == ["sh0"]
     splats = splats_of(model, seeds())
-    emitted = model.features(splats, Query(ids=torch.tensor([3, 1]))).features  # no camera to ask
+    emitted = model.features(splats, Query(ids=torch.tensor([3, 1])))  # no camera to ask
     emitted.sum().backward()
     assert emitted.shape == (2, 1)
     assert splats.means.grad is None
@@ -62,7 +62,7 @@ def test_degree_zero_has_neither_directions_nor_further_bands():
 
 
 def test_learning_rates_are_those_of_3dgs():
-    parts = Static(degree=3).per_gaussian(seeds())
+    parts = Static(sh_degree=3).per_gaussian(seeds())
     assert (parts["sh0"].lr, parts["sh_rest"].lr) == (2.5e-3, 2.5e-3 / 20)
     assert parts["sh_rest"].initial.shape == (50, 15, 1)
 
@@ -77,7 +77,7 @@ def test_float32_emission_and_gradients_agree_with_float64(degree, channels, som
     results = []
     for dtype in (torch.float32, torch.float64):
         splats = splats_of(model, start, rest=0.3, dtype=dtype)
-        emitted = model.features(splats, query).features
+        emitted = model.features(splats, query)
         weights = torch.randn(emitted.shape, generator=torch.Generator().manual_seed(2)).to(dtype)
         (emitted * weights).sum().backward()
         names = ["sh0", "sh_rest", "means"] if degree > 0 else ["sh0"]
@@ -88,14 +88,14 @@ def test_float32_emission_and_gradients_agree_with_float64(degree, channels, som
 
 
 def test_the_number_of_threads_changes_no_bit():
-    model, start = Static(degree=3), seeds(1100)
+    model, start = Static(sh_degree=3), seeds(1100)
     query = Query(ids=torch.arange(1, 1100, 2), camera=camera_at([0.3, 0.1, -2.0]))
     before, results = numba.get_num_threads(), []
     try:
         for threads in {1, min(2, numba.config.NUMBA_NUM_THREADS)}:
             numba.set_num_threads(threads)
             splats = splats_of(model, start, rest=0.3)
-            emitted = model.features(splats, query).features
+            emitted = model.features(splats, query)
             emitted.square().sum().backward()
             results.append([emitted] + [splats[name].grad for name in ("sh0", "sh_rest", "means")])
     finally:
@@ -104,24 +104,24 @@ def test_the_number_of_threads_changes_no_bit():
 
 
 def test_emission_depends_on_the_direction_from_the_camera():
-    model, start = Static(degree=1), seeds(2)
+    model, start = Static(sh_degree=1), seeds(2)
     splats = splats_of(model, start)
     with torch.no_grad():
         splats.raw["means"].zero_()
         splats.raw["sh0"].zero_()
         splats.raw["sh_rest"][:, 1] = 0.5  # the band of z
-    ahead = model.features(splats, Query(camera=camera_at([0, 0, -2.0]))).features
-    behind = model.features(splats, Query(camera=camera_at([0, 0, 2.0]))).features
+    ahead = model.features(splats, Query(camera=camera_at([0, 0, -2.0])))
+    behind = model.features(splats, Query(camera=camera_at([0, 0, 2.0])))
     change = 0.5 * 0.4886025119029199
     assert torch.allclose(ahead, torch.full((2, 1), 0.5 + change))
     assert torch.allclose(behind, torch.full((2, 1), 0.5 - change))
 
 
 def test_a_gaussian_at_the_camera_is_finite():
-    model, start = Static(degree=3), seeds(3)
+    model, start = Static(sh_degree=3), seeds(3)
     splats = splats_of(model, start, rest=0.3)
     query = Query(camera=camera_at(splats.means[1].tolist()))
-    emitted = model.features(splats, query).features
+    emitted = model.features(splats, query)
     emitted.sum().backward()
     assert emitted.isfinite().all()
     assert emitted[1, 0].item() == pytest.approx(start.values[1, 0].item(), abs=1e-5)
@@ -134,14 +134,14 @@ def test_emission_below_zero_is_clamped_without_a_gradient():
     splats = splats_of(model, seeds(2))
     with torch.no_grad():
         splats.raw["sh0"][0] = -10.0
-    emitted = model.features(splats, Query()).features
+    emitted = model.features(splats, Query())
     emitted.sum().backward()
     assert emitted[0, 0] == 0
     assert splats["sh0"].grad[0] == 0 and splats["sh0"].grad[1] == pytest.approx(spherical_harmonics.C0)
 
 
 def test_degrees_join_one_by_one():
-    model = Static(degree=2, degree_every=10)
+    model = Static(sh_degree=2, sh_degree_interval=10)
     degrees = []
     for step in (0, 9, 10, 19, 20, 1000):
         model.on_step(step)
@@ -149,20 +149,20 @@ def test_degrees_join_one_by_one():
     assert degrees == [0, 0, 1, 1, 2, 2]
     splats = splats_of(model, seeds(), rest=0.3)
     model.on_step(10)
-    model.features(splats, Query(camera=camera_at([0, 0, -3.0]))).features.sum().backward()
+    model.features(splats, Query(camera=camera_at([0, 0, -3.0]))).sum().backward()
     gradient = splats["sh_rest"].grad
     assert gradient[:, :3].abs().max() > 0 and gradient[:, 3:].abs().max() == 0
 
 
 def test_all_degrees_are_active_without_training_and_without_a_schedule():
-    assert Static(degree=3).active_degree == 3
-    model = Static(degree=3, degree_every=0)
+    assert Static(sh_degree=3).active_degree == 3
+    model = Static(sh_degree=3, sh_degree_interval=0)
     model.on_step(0)
     assert model.active_degree == 3
 
 
 def test_temperature_is_that_of_the_constant_part_in_kelvin():
-    model, start = Static(degree=1), seeds(4)
+    model, start = Static(sh_degree=1), seeds(4)
     splats = splats_of(model, start, rest=0.3)
     model.prepare(scene())
     assert model.temperature(splats, 0.0) is None
@@ -186,15 +186,15 @@ def test_the_range_survives_a_checkpoint():
 
 
 def test_effects_and_cost_say_what_is_simulated():
-    assert Static(degree=3).effects() == {"view_dependence": {"degree": 3}}
-    assert Static(degree=0).cost < Static(degree=1).cost < Static(degree=3).cost
+    assert Static(sh_degree=3).effects() == {"view_dependence": {"degree": 3}}
+    assert Static(sh_degree=0).cost < Static(sh_degree=1).cost < Static(sh_degree=3).cost
 
 
 def test_errors():
     with pytest.raises(ValueError, match="degree 0 to 3 here, got 5"):
-        Static(degree=5)
+        Static(sh_degree=5)
     with pytest.raises(ValueError, match=r"channels=3 needs seed values \[50, 3\], got \[50, 1\]"):
         Static(channels=3).per_gaussian(seeds())
-    model = Static(degree=1)
+    model = Static(sh_degree=1)
     with pytest.raises(ValueError, match="depends on the view: give a camera"):
         model.features(splats_of(model, seeds()), Query())

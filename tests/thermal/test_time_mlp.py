@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from heatsplat.contracts import KELVIN_AT_0_C, Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import octaves
 from heatsplat.thermal.base import Query, Seeds
@@ -43,7 +44,7 @@ def test_it_is_exactly_3dgs_at_first_also_below_zero():
     model, splats = make()
     with torch.no_grad():
         splats["sh0"][:5] = -3.0
-    assert torch.equal(model.features(splats, query()).features, Static().features(splats, query()).features)
+    assert torch.equal(model.features(splats, query()), Static().features(splats, query()))
 
 
 def test_the_change_is_that_of_a_plain_network_in_double_precision():
@@ -60,10 +61,8 @@ def test_the_change_is_that_of_a_plain_network_in_double_precision():
     expected = (hidden @ weights["head.weight"].T)[:, 0] + weights["head.bias"]
     assert expected.abs().max() > 0.05
     assert torch.allclose(model.change(splats["feature"], 20.0).double(), expected, atol=1e-6)
-    level = model.emission.features(splats, query()).features[:, 0].double()
-    assert torch.allclose(
-        model.features(splats, query()).features[:, 0].double(), (level + expected).clamp(min=0), atol=1e-6
-    )
+    level = model.emission.features(splats, query())[:, 0].double()
+    assert torch.allclose(model.features(splats, query())[:, 0].double(), (level + expected).clamp(min=0), atol=1e-6)
     found = model.temperature(splats, 20.0).double()
     assert torch.allclose(found, KELVIN_AT_0_C + 10.0 + 20.0 * (level + expected), atol=1e-3)
 
@@ -74,9 +73,9 @@ def test_only_gaussians_in_view_are_evaluated_and_the_time_once():
     for layer in (model.head, model.code):
         layer.register_forward_hook(lambda module, inputs, output: rows.append(output.shape))
     ids = torch.tensor([4, 17, 3])
-    some = model.features(splats, query(ids=ids)).features
+    some = model.features(splats, query(ids=ids))
     assert rows == [(16,), (3, 1)]
-    assert torch.allclose(some, model.features(splats, query()).features[ids], atol=1e-6)
+    assert torch.allclose(some, model.features(splats, query())[ids], atol=1e-6)
 
 
 def test_the_first_stage_evaluates_nothing_and_learns_no_network():
@@ -84,13 +83,13 @@ def test_the_first_stage_evaluates_nothing_and_learns_no_network():
     calls = []
     model.head.register_forward_hook(lambda *_: calls.append(1))
     model.on_step(4)
-    emitted = model.features(splats, query()).features
+    emitted = model.features(splats, query())
     emitted.sum().backward()
-    assert not calls and torch.equal(emitted, Static().features(splats, query()).features)
+    assert not calls and torch.equal(emitted, Static().features(splats, query()))
     assert splats["feature"].grad is None and all(parameter.grad is None for parameter in model.parameters())
     assert torch.equal(model.temperature(splats, 20.0), model.emission.temperature(splats, 20.0))
     model.on_step(5)
-    model.features(splats, query()).features.sum().backward()
+    model.features(splats, query()).sum().backward()
     assert calls and splats["feature"].grad.abs().max() > 0
 
 
@@ -104,7 +103,7 @@ def test_every_gaussian_learns_a_curve_of_its_own():
     optimiser = torch.optim.Adam([*model.parameters(), *splats.parameters()], lr=1e-2)
     for _ in range(120):
         optimiser.zero_grad()
-        found = torch.cat([model.features(splats, query(t)).features for t in times.tolist()], 1)
+        found = torch.cat([model.features(splats, query(t)) for t in times.tolist()], 1)
         loss = (found - target).abs().mean()
         loss.backward()
         optimiser.step()
@@ -117,7 +116,7 @@ def test_values_and_slopes_are_finite_at_any_time_and_feature(time_s, scale):
     model, splats = make(disturb=1.0)
     with torch.no_grad():
         splats["feature"].mul_(scale)
-    emitted = model.features(splats, query(time_s)).features
+    emitted = model.features(splats, query(time_s))
     emitted.sum().backward()
     assert emitted.isfinite().all() and (emitted >= 0).all() and splats["feature"].grad.isfinite().all()
     assert all(parameter.grad.isfinite().all() for parameter in model.parameters())
@@ -134,7 +133,7 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="must be at least 1, got 0, 64, 16, 4"):
         TimeMlp(Static(), feature_size=0)
     with pytest.raises(SceneError, match="TimeMlp needs time, which scene 'yard'"):
-        TimeMlp(Static()).prepare(make_scene((None, None)))
+        TimeMlp(Static()).check(make_scene((None, None)))
     model, splats = make()
-    with pytest.raises(ValueError, match="ThermalGS needs the time"):
+    with pytest.raises(ValueError, match="give time_s"):
         model.features(splats, query(None))

@@ -37,8 +37,8 @@ def test_an_edge_pixel_shows_the_temperature_of_the_mean_radiance(name, sent, ex
     """Half 280 K, half 400 K: 340 K where temperatures are blended."""
     edges = torch.tensor([[280.0], [400.0]], dtype=torch.float64)
     composite = prepared(name)
-    carried = composite.carried(SCENE_RANGE.to_unit(edges - 273.15), 1)
-    shown = SCENE_RANGE.to_celsius(composite.shown(carried.mean(0, keepdim=True), 1)).item() + 273.15
+    carried = composite.encode(SCENE_RANGE.to_unit(edges - 273.15), 1)
+    shown = SCENE_RANGE.to_celsius(composite.decode(carried.mean(0, keepdim=True), 1)).item() + 273.15
     assert shown == pytest.approx(expected_k, abs=0.01)
     with mpmath.workdps(30):
         mean = (sent(mpmath.mpf(280)) + sent(mpmath.mpf(400))) / 2
@@ -48,7 +48,7 @@ def test_an_edge_pixel_shows_the_temperature_of_the_mean_radiance(name, sent, ex
 @pytest.mark.parametrize("name", RADIANCES)
 def test_what_is_not_blended_comes_back_with_its_slope(name):
     values = torch.linspace(-0.2, 1.2, 29, requires_grad=True)[:, None]
-    shown = prepared(name).shown(prepared(name).carried(values, 1), 1)
+    shown = prepared(name).decode(prepared(name).encode(values, 1), 1)
     assert (shown - values).abs().max() < 1e-6
     (slope,) = torch.autograd.grad(shown.sum(), values)
     assert (slope - 1).abs().max() < 1e-5
@@ -58,22 +58,22 @@ def test_what_is_not_blended_comes_back_with_its_slope(name):
 def test_other_channels_pass_as_they_are(name):
     values = torch.rand(5, 4)
     composite = prepared(name)
-    carried = composite.carried(values, 1)
+    carried = composite.encode(values, 1)
     assert torch.equal(carried[:, 1:], values[:, 1:]) and not torch.equal(carried[:, :1], values[:, :1])
-    assert torch.equal(composite.shown(carried, 1)[:, 1:], values[:, 1:])
+    assert torch.equal(composite.decode(carried, 1)[:, 1:], values[:, 1:])
 
 
 @pytest.mark.parametrize("name", RADIANCES)
 def test_values_far_outside_the_range_are_finite(name):
     values = torch.tensor([[-1e6], [-3.0], [1e6]], requires_grad=True)
-    shown = prepared(name).shown(prepared(name).carried(values, 1), 1)
+    shown = prepared(name).decode(prepared(name).encode(values, 1), 1)
     shown.sum().backward()
     assert shown.isfinite().all() and values.grad.isfinite().all()
 
 
 def test_blending_temperatures_returns_the_very_tensors():
     values = torch.rand(3, 1)
-    assert Composite().carried(values, 1) is values and Composite().shown(values, 1) is values
+    assert Composite().encode(values, 1) is values and Composite().decode(values, 1) is values
 
 
 @pytest.mark.parametrize("name", RADIANCES)
@@ -92,7 +92,7 @@ def test_a_run_blends_what_it_is_told(tmp_path):
     frame = module.scene.train.frames[0]
     found = module.predict(frame)
     # The same splats blended as temperatures: pixels that a single surface fills hardly change, edges get colder.
-    module.background.copy_(module.composite.shown(module.background, 1))
+    module.background.copy_(module.composite.decode(module.background, 1))
     module.composite = Composite()
     change = found - module.predict(frame)
     assert found.isfinite().all() and change.min() > -1e-4 and 1e-4 < change.max() < 0.5

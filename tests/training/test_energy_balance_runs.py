@@ -5,7 +5,7 @@ import json
 import torch
 from running import run
 
-from heatsplat.contracts import KELVIN_AT_0_C
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 SHORT = (
     "method=energy_balance",

@@ -53,8 +53,8 @@ def terms_at_start(scene, folder, *overrides):
 
 def test_losses_are_those_of_a_model_for_each_image(scene, tmp_path):
     """Before the first step the cloud shows in each image what a cloud of that image alone would show."""
-    thermal = terms_at_start(scene, tmp_path, "method=3dgs", "thermal.degree=3")
-    colour = ("method=3dgs", "thermal.degree=3", "thermal.modality=rgb", "thermal.channels=3")
+    thermal = terms_at_start(scene, tmp_path, "method=3dgs", "thermal.sh_degree=3")
+    colour = ("method=3dgs", "thermal.sh_degree=3", "thermal.modality=rgb", "thermal.channels=3")
     colour = terms_at_start(scene, tmp_path, *colour)
     both = terms_at_start(scene, tmp_path, "method=3dgs_ir")
     halves = terms_at_start(scene, tmp_path, "method=ommg")

@@ -94,13 +94,11 @@ class TemperatureCurves(pl.Callback):
     def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
         """Image values of the probes' pixels, [n, F] float64; one render per camera and time serves all its probes."""
         values = np.empty((len(self._probes), len(times)))
-        weather = _weather(module.scene)
         for frame_id in {probe.frame.frame_id for probe in self._probes}:
             seen = [i for i, probe in enumerate(self._probes) if probe.frame.frame_id == frame_id]
             frame = self._probes[seen[0]].frame
             for j, time_s in enumerate(times.tolist()):
-                at_time = replace(frame, time_s=time_s, environment=_nearest(weather, time_s))
-                image = module.predict(at_time).mean(-1)
+                image = module.predict(replace(frame, time_s=time_s)).mean(-1)
                 rows, columns = ([getattr(self._probes[i], axis) for i in seen] for axis in ("row", "column"))
                 values[seen, j] = image[rows, columns].double().cpu().numpy()
         return values
@@ -202,17 +200,6 @@ def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float]
             times.append(frame.time_s)
             values.append(value)
     return times, values
-
-
-def _weather(scene: SceneData) -> list[tuple[float, object]]:
-    """Times and environments of all frames that have both."""
-    frames = [frame for views in (scene.train, scene.val, scene.test) for frame in views.frames]
-    return [(f.time_s, f.environment) for f in frames if f.time_s is not None and f.environment is not None]
-
-
-def _nearest(weather: list[tuple[float, object]], time_s: float):
-    """The environment closest in time, or None."""
-    return min(weather, key=lambda pair: abs(pair[0] - time_s))[1] if weather else None
 
 
 def _figure(

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import SceneData, View
-from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
 from heatsplat.geometry.projection import to_camera, to_pixels
+from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
 MAX_FRAMES = 64
 # Points whose tracks are fitted, and their observations, by which time goes; all points, up to MAX_IN_FRONT, hide each other.

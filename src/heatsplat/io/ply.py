@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.pictures import colorize
-
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 
 
 def write_splats(
@@ -28,7 +27,7 @@ def write_splats(
 
     **Convention:** one float32 vertex per Gaussian with x y z nx ny nz, f_dc_0..2, f_rest_* (channel by channel),
     opacity (logit), scale_0..2 (logarithm), rot_0..3 (wxyz), and ``temperature`` in kelvin where it is given. A viewer
-    shows the colour 0.5 + SH_C0 * f_dc.
+    shows the colour 0.5 + C0 * f_dc.
 
     Args:
         path: ends in .ply; its folder is made.
@@ -77,7 +76,7 @@ def write_splats(
     columns = {
         ("x", "y", "z"): arrays["means"],
         ("nx", "ny", "nz"): np.zeros((count, 3), dtype=np.float32),
-        tuple(f"f_dc_{i}" for i in range(3)): np.broadcast_to((colors - 0.5) / SH_C0, (count, 3)),
+        tuple(f"f_dc_{i}" for i in range(3)): np.broadcast_to((colors - 0.5) / C0, (count, 3)),
         tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
         ("opacity",): arrays["opacity_logits"],
         tuple(f"scale_{i}" for i in range(3)): arrays["log_scales"],
@@ -120,7 +119,7 @@ def read_splats(path: str | Path) -> dict[str, np.ndarray]:
         "log_scales": columns("scale_0", "scale_1", "scale_2"),
         "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
         "opacity_logits": columns("opacity"),
-        "values": 0.5 + SH_C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        "values": 0.5 + C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
     }
     rest = sum(name.startswith("f_rest_") for name in there)
     if rest:

@@ -12,6 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import check_option
+
 SMALLEST_AXIS_M = 0.01  # heat goes this deep at least; a splat's own thin axis is fitted to images, not to heat
 THOMSEN_POWER = 1.6075  # Knud Thomsen's exponent: error of the area below 1.061 % for any axes (the paper writes 1.61)
 SURFACE_AREAS = ("consistent", "printed")
@@ -50,8 +52,7 @@ def convecting_area_ratio(axes: Tensor, surface_area: str = "consistent") -> Ten
     Raises:
         ValueError: the option is unknown.
     """
-    if surface_area not in SURFACE_AREAS:
-        raise ValueError(f"surface_area must be one of {', '.join(SURFACE_AREAS)}, got '{surface_area}'")
+    check_option("surface_area", surface_area, SURFACE_AREAS)
     if surface_area == "consistent":
         return radiating_area_ratio(axes)
     return axes.reciprocal().sum(-1) / 4
@@ -68,8 +69,7 @@ def projected_area_ratio(axes: Tensor, directions: Tensor, projected_area: str =
     Raises:
         ValueError: the option is unknown.
     """
-    if projected_area not in PROJECTED_AREAS:
-        raise ValueError(f"projected_area must be one of {', '.join(PROJECTED_AREAS)}, got '{projected_area}'")
+    check_option("projected_area", projected_area, PROJECTED_AREAS)
     if projected_area == "exact":
         return 0.75 * _length(directions / axes)
     return 0.75 / _length(directions * axes)

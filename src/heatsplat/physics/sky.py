@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from heatsplat.contracts import check_option
 from heatsplat.physics.units import celsius
 
 LAWS = ("brutsaert", "berdahl_martin", "brunt", "swinbank")
@@ -37,8 +38,7 @@ def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str) 
     Raises:
         ValueError: the law is unknown, or lacks the humidity.
     """
-    if law not in LAWS:
-        raise ValueError(f"law of the sky must be one of {', '.join(LAWS)}, got '{law}'")
+    check_option("law of the sky", law, LAWS)
     if law == "swinbank":
         return 0.0552 * air_k**1.5
     if humidity_percent is None:

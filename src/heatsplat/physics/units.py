@@ -1,4 +1,4 @@
-"""Kelvin and degrees Celsius. Physics is in kelvin; °C appears at files, metrics and pictures only."""
+"""Constants of physics, each defined here alone. Physics is in kelvin; °C appears at files, metrics and pictures only."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TypeVar
 from torch import Tensor
 
 KELVIN_AT_0_C = 273.15
+DAY_S = 86400.0
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 
 Temperature = TypeVar("Temperature", float, Tensor)

@@ -82,10 +82,10 @@ class Composite(nn.Module):
         """Takes what it needs from a scene. Called once, before anything else."""
         return
 
-    def carried(self, values: Tensor, channels: int) -> Tensor:
+    def encode(self, values: Tensor, channels: int) -> Tensor:
         """What is blended of image values [..., C], of which the first ``channels`` are the thermal image's."""
         return values
 
-    def shown(self, blended: Tensor, channels: int) -> Tensor:
+    def decode(self, blended: Tensor, channels: int) -> Tensor:
         """The image values of what was blended, [..., C]."""
         return blended

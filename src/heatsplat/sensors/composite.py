@@ -46,13 +46,13 @@ class RadianceComposite(Composite):
         ends = torch.tensor([self._range.min_c, self._range.max_c], dtype=torch.float64)
         self._ends = tuple(self.radiance(kelvin(ends)).tolist())
 
-    def carried(self, values: Tensor, channels: int) -> Tensor:
+    def encode(self, values: Tensor, channels: int) -> Tensor:
         low, high = self._ends
         celsius = self._range.to_celsius(values[..., :channels].double())
         share = (self.radiance(kelvin(celsius)) - low) / (high - low)
         return self._beside(share, values, channels)
 
-    def shown(self, blended: Tensor, channels: int) -> Tensor:
+    def decode(self, blended: Tensor, channels: int) -> Tensor:
         low, high = self._ends
         radiance = low + (high - low) * blended[..., :channels].double()
         values = (self.temperature(radiance) - kelvin(self._range.min_c)) / self._range.span_k

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Frame
+from heatsplat.contracts import Frame, check_option
 from heatsplat.sensors.base import SensorPart
 
 NORMS = ("image", "columns", "none")
@@ -50,8 +50,7 @@ class ConductionResidual(SensorPart):
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
-        if norm not in NORMS:
-            raise ValueError(f"norm must be one of {', '.join(NORMS)}, got '{norm}'")
+        check_option("norm", norm, NORMS)
         if width < 1 or hidden < 1 or not bound > 0:
             raise ValueError(f"width, hidden and bound must be positive, got {width}, {hidden}, {bound}")
         self.norm, self.bound, self.lr, self.lr_end = norm, bound, lr, lr_end

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, check_option
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.coordinates import Box, Clock, octaves
 from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.wrapper import Wrapper
 
 TIMES = ("auto", "seconds", "index", "none")
 EXPONENTS = ("positive", "printed")
 POSITIONS = ("box", "world")
-BOX_EDGE = 0.9  # encoded coordinates end here: the code has period 2 and would repeat from 1 on
 START = -1.0  # of absorption, scattering and distance before softplus: an exponent of 0.2, not yet saturated
 
 
-class AtmosphericField(ThermalModel):
+class AtmosphericField(Wrapper):
     """Emission times e^{-(μ_a + μ_s) d}, where a network gives the three from place and time (Thermal3D-GS, section 3.2).
 
     The emission is another thermal model, such as ``Static``. The network sees positions without passing gradients to
@@ -69,14 +68,10 @@ class AtmosphericField(ThermalModel):
         lr: float = 8e-4,
         lr_end: float = 2e-3,
     ) -> None:
-        super().__init__()
-        for name, value, known in (
-            ("time", time, TIMES),
-            ("exponent", exponent, EXPONENTS),
-            ("positions", positions, POSITIONS),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        super().__init__({"emission": emission}, needs={"time"} if time == "seconds" else ())
+        check_option("time", time, TIMES)
+        check_option("exponent", exponent, EXPONENTS)
+        check_option("positions", positions, POSITIONS)
         if width < 1 or depth < 1 or position_frequencies < 1 or time_frequencies < 1:
             raise ValueError(
                 "width, depth and the numbers of frequencies must be at least 1, got "
@@ -86,14 +81,10 @@ class AtmosphericField(ThermalModel):
             raise ValueError(f"skip must name a hidden layer from 1 to {depth - 1}, or be null, got {skip}")
         if exponent_max is not None and not exponent_max > 0:
             raise ValueError(f"exponent_max must be positive or null, got {exponent_max}")
-        self.emission = emission
         self.positive, self.exponent_max = exponent == "positive", exponent_max
         self.positions = positions
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         self.time, self.lr, self.lr_end = time, lr, lr_end
-        self.needs = emission.needs | (frozenset({"time"}) if time == "seconds" else frozenset())
-        self.modality, self.companions = emission.modality, emission.companions
-        self.modality_channels, self.shared_opacity = emission.modality_channels, emission.shared_opacity
         codes = 6 * position_frequencies
         inputs = [codes if i == 0 else width + codes if i == skip else width for i in range(depth)]
         self.layers = nn.ModuleList(nn.Linear(count, width) for count in inputs)
@@ -107,67 +98,43 @@ class AtmosphericField(ThermalModel):
         with torch.no_grad():
             self.head.bias.copy_(torch.tensor([*start, *self.further]))
         self.register_buffer("start", self.head.bias.detach().clone())
-        self.register_buffer("center", torch.zeros(3))
-        self.register_buffer("edge", torch.ones(()))
-        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))  # origin and span of time
+        self.box, self.clock = Box(), Clock()  # where there are no times, the clock counts frames
         self.register_buffer("by_index", torch.tensor(time == "index"))
 
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
-        self.emission.prepare(scene)
-        if self.positions == "box":
-            center, edge = scene.bulk
-            self.center.copy_(center)
-            self.edge.fill_(edge)
+        super().prepare(scene)
+        self.box.prepare(scene)
         if self.time == "auto":
             self.by_index.fill_("time" not in scene.metadata)
         if self.by_index:
             ids = [frame.frame_id for part in (scene.train, scene.val, scene.test) for frame in part.frames]
-            self.clock.copy_(torch.tensor([0.0, max(*ids, 1)]))
+            self.clock.record.copy_(torch.tensor([0.0, max(*ids, 1)]))
         elif self.time != "none":
-            self.clock.copy_(torch.tensor(scene.record, dtype=torch.float64))
+            self.clock.prepare(scene)
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((*self.layers, *self.moment_layers.values()), seeds.generator)
-        return self.emission.per_gaussian(seeds)
+        return super().per_gaussian(seeds)
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        emitted = self.emission.features(splats, query).features
-        factor = self.factor(query.rows(splats.means), query)[:, None].to(emitted)
-        channels = self.modality_channels[0]  # companions take another way to another sensor
-        emitted, others = emitted[:, :channels], emitted[:, channels:]
-        emitted = self._weakened(emitted, factor)
-        return Emission(torch.cat((emitted, others), 1) if others.shape[1] else emitted)
-
-    def geometry(self, splats: Splats, query: Query) -> Geometry | None:
-        return self.emission.geometry(splats, query)
-
-    def on_step(self, step: int) -> None:
-        self.emission.on_step(step)
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        return self.emission.regularisers(splats)
+    def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        return self._weakened(values, self.factor(query.rows(splats.means), query)[:, None].to(values))
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """The emission's, and the factor by which the field weakens what is emitted."""
         with torch.no_grad():
             factor = self.factor(query.rows(splats.means), query)
-        return self.emission.attributes(splats, query) | {self.factor_name: factor}
-
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        """That of the emission: what a sensor would see without anything in between."""
-        return self.emission.temperature(splats, time_s)
+        return super().attributes(splats, query) | {self.factor_name: factor}
 
     def effects(self) -> dict[str, dict]:
         network = f"{self.head.in_features} x {len(self.layers)}"
-        return self.emission.effects() | {"attenuation": {"network": network, "time": self._time_source}}
+        return super().effects() | {"attenuation": {"network": network, "time": self._time_source}}
 
     @property
     def cost(self) -> int:
         products = sum(layer.weight.numel() for layer in (*self.layers, self.head))
-        return self.emission.cost + products + 6 * self.position_frequencies + 20  # the code, and the formula itself
+        return super().cost + products + 6 * self.position_frequencies + 20  # the code, and the formula itself
 
     # The field ------------------------------------------------------------------------------------------
 
@@ -202,39 +169,23 @@ class AtmosphericField(ThermalModel):
         return self.head(hidden)
 
     def _code_of(self, means: Tensor) -> Tensor:
-        if self.positions == "box":
-            means = ((means - self.center) / self.edge).clamp(-BOX_EDGE, BOX_EDGE)
+        means = self.box.places(means) if self.positions == "box" else means
         return octaves(means, self.position_frequencies).to(self.head.weight)
 
     def _moment_of(self, query: Query) -> Tensor | None:
         """The encoded time of a query, [2 F], or None without time."""
         if self.time == "none":
             return None
-        origin, span = self.clock.tolist()
-        value = query.frame_id if self.by_index else query.time_s
-        if value is None and not self.by_index:
-            raise ValueError("the network needs the time at which a scene is seen: give time_s, or time=none")
-        # A view that no one took has no index of its own: it is shown as at the middle of the record.
-        middle = self.by_index and (value is None or not 0 <= value <= span)
-        fraction = 0.5 if middle else (float(value) - origin) / span
-        when = torch.tensor([[fraction]], dtype=torch.float64, device=self.clock.device)
+        moment = query.frame_id if self.by_index else query.time_s
+        if self.by_index and (moment is None or not 0 <= moment <= self.clock.span_s):
+            fraction = (
+                0.5  # a view that no one took has no index of its own: it is shown as at the middle of the record
+            )
+        else:
+            fraction = self.clock.spans(moment)
+        when = torch.tensor([[fraction]], dtype=torch.float64, device=self.start.device)
         return octaves(when, self.time_frequencies)[0].to(self.head.weight)
 
     @property
     def _time_source(self) -> str:
         return "none" if self.time == "none" else "index" if self.by_index else "seconds"
-
-
-def octaves(values: Tensor, count: int) -> Tensor:
-    """sin(2^k π p) and cos(2^k π p) of every column p for k below ``count``, [n, 2 count D] (TI-3DGS, Eq. 11).
-
-    Multiples of the period are taken away before π comes in, which is exact; sin(2^9 π p) taken directly has lost three
-    digits to the rounding of its argument.
-
-    Args:
-        values: [n, D].
-        count: octaves.
-    """
-    scaled = values[:, :, None] * 2.0 ** torch.arange(count, dtype=values.dtype, device=values.device)
-    phase = math.pi * (scaled - 2.0 * torch.round(scaled / 2.0))
-    return torch.cat((phase.sin(), phase.cos()), 2).flatten(1)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query
+from heatsplat.thermal.coordinates import Clock
 from heatsplat.thermal.part import HeatPart
 
 LOG_DEPTHS = (-12.0, 3.0)  # of β times the typical distance: from nothing to a wall of fog, finite in float32
@@ -46,7 +47,7 @@ class Attenuation(HeatPart):
         self.register_buffer("level", torch.tensor(0.5))
         self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
         if moments > 0:
-            self.register_buffer("record", torch.tensor([0.0, 1.0], dtype=torch.float64))
+            self.clock = Clock()
 
     def prepare(self, scene: SceneData) -> None:
         centers = torch.stack([frame.camera.center for frame in scene.train.frames])
@@ -60,11 +61,10 @@ class Attenuation(HeatPart):
             self.level = nn.Parameter(level)
         if self.moments > 0 and "time" not in scene.metadata:
             self.moments = 0
-            del self.record
+            del self.clock
             self.log_depth = nn.Parameter(self.log_depth.detach()[:1])
         if self.moments > 0:
-            times = torch.tensor(scene.train.times_s, dtype=torch.float64)
-            self.record.copy_(torch.stack([times.min(), times.max().clamp(min=times.min() + 1e-9)]))
+            self.clock.prepare(scene)
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         return self.level + (values - self.level) * self.transmission(splats, query)
@@ -84,14 +84,11 @@ class Attenuation(HeatPart):
     def _log_depth_at(self, time_s: float | None) -> Tensor:
         if self.moments == 0:
             return self.log_depth[0]
-        if time_s is None:
-            raise ValueError("extinction changes over the record: give time_s, or set moments to 0")
-        start, end = self.record.tolist()
-        place = min(max((time_s - start) / (end - start), 0.0), 1.0) * (self.moments - 1)
+        place = min(max(self.clock.spans(time_s), 0.0), 1.0) * (self.moments - 1)
         before = min(int(place), self.moments - 2)
         return torch.lerp(self.log_depth[before], self.log_depth[before + 1], place - before)
 
-    def regularisers(self) -> dict[str, Tensor]:
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         if self.moments == 0 or self.smooth == 0:
             return {}
         return {"extinction_smooth": self.smooth * self.log_depth.diff().square().mean()}

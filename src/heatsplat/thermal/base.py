@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Camera, Environment, SceneData, SceneError
+from heatsplat.contracts import Camera, SceneData, SceneError
 from heatsplat.splats import Splats
 
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
@@ -23,7 +24,6 @@ class Query:
         ids: [n] int64 indices of the Gaussians in view, or None for all of them.
         camera: the camera that looks.
         time_s: float64 seconds since the first training frame, or None.
-        environment: weather at that time, or None.
         frame_id: id of the frame, or None for a view that no one took.
         geometry: what the model answered when it was asked for the geometry of this very view: None where it answered
             nothing or was not asked. A deforming model may return a subclass of ``Geometry`` that carries what its
@@ -33,7 +33,6 @@ class Query:
     ids: Tensor | None = None
     camera: Camera | None = None
     time_s: float | None = None
-    environment: Environment | None = None
     frame_id: int | None = None
     geometry: Geometry | None = None
 
@@ -50,13 +49,6 @@ class Geometry:
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-
-
-@dataclass(frozen=True)
-class Emission:
-    """What splats emit: ``features`` [n, C] in image units."""
-
-    features: Tensor
 
 
 @dataclass(frozen=True)
@@ -94,38 +86,24 @@ class PerGaussian:
     lr_end: float = 1.0
 
 
-class ThermalModel(nn.Module, ABC):
-    """What a splat emits. One model is one file with one subclass and one yaml in conf/thermal/.
+class Heat(nn.Module, ABC):
+    """What thermal models and the parts of them (``HeatPart``) have in common. Whatever holds some asks all of them.
 
     Class attributes:
-        needs: metadata the model cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
-        modality: the image that it explains, "thermal" or "rgb"; this is what metrics score.
-        companions: further images that it explains with the same Gaussians, such as ("rgb",).
-        modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
-            features.
-        shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
-        narrowest_range_k: narrowest range of temperatures in kelvin that the model can show; checked at set-up.
-        lr: learning rate of the model's own parameters (those that are not per Gaussian).
+        needs: metadata it cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
+        narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
+        lr: learning rate of its own parameters (those that are not per Gaussian).
         lr_end: factor on it at the last step of the run, log-linear in between.
     """
 
     needs: frozenset[str] = frozenset()
-    modality: str = "thermal"
-    companions: tuple[str, ...] = ()
-    modality_channels: tuple[int, ...] = (1,)
-    shared_opacity: bool = False
     narrowest_range_k: float = 0.0
     lr: float = 1e-3
     lr_end: float = 1.0
 
-    @property
-    def opacity_channels(self) -> tuple[int, ...]:
-        """Channels that each set of opacities composites: those of the renderer's modalities."""
-        return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels
-
     def check(self, scene: SceneData) -> None:
-        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs``, its range
-        is too narrow, or a view has no image of a companion."""
+        """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs`` or its range
+        is too narrow. Called once, before ``prepare``."""
         missing = sorted(self.needs - scene.metadata)
         if missing:
             raise SceneError(
@@ -139,6 +117,77 @@ class ThermalModel(nn.Module, ABC):
                 f"computes in kelvin, which float32 holds to 3e-5 K: give a range of at least {self.narrowest_range_k:g} K "
                 "(no camera resolves less), or choose a method that works in image values, such as etgs."
             )
+
+    def prepare(self, scene: SceneData) -> None:
+        """Takes constants (time grids, ranges) from the scene into buffers. Called once, before anything else."""
+        return
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        """The tensors that every Gaussian carries for it, by the name under which they live in Splats."""
+        return {}
+
+    def on_step(self, step: int) -> None:
+        """Told the training step before it runs, for schedules such as the degree of spherical harmonics."""
+        return
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        """Extra loss terms by name, each a weighted scalar with a gradient. Penalties x² belong in PerGaussian.l2."""
+        return {}
+
+    def rows_to_drop(self, splats: Splats, step: int) -> Iterable[tuple[str, Tensor, Mapping[str, Tensor]]]:
+        """Rows of tensors that some Gaussians can do without from now on, asked for after every step of the optimiser.
+
+        Each is the name of a tensor, the Gaussians that lose their row of it, [N] bool, and the values [N, ...] that their
+        other tensors take instead, by name (see ``density.ops.Cloud.drop``).
+        """
+        return ()
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
+        return {}
+
+    def prior(self, splats: Splats) -> dict[str, Tensor]:
+        """What a table says of attributes that training pulls towards it, by name, each [N]; NaN where it says nothing."""
+        return {}
+
+    def rate_of(self, name: str) -> tuple[float, float]:
+        """Learning rate of its own parameter of that name, and the factor on it at the end of the run."""
+        return self.lr, self.lr_end
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """The physical effects that it simulates: catalogue name -> settings (for metrics.json)."""
+        return {}
+
+    @property
+    @abstractmethod
+    def cost(self) -> int:
+        """Multiply-adds per Gaussian and view."""
+
+
+class ThermalModel(Heat):
+    """What a splat emits. One model is one file with one subclass and one yaml in conf/thermal/.
+
+    Class attributes, beside those of ``Heat``:
+        modality: the image that it explains, "thermal" or "rgb"; this is what metrics score.
+        companions: further images that it explains with the same Gaussians, such as ("rgb",).
+        modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
+            features.
+        shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
+    """
+
+    modality: str = "thermal"
+    companions: tuple[str, ...] = ()
+    modality_channels: tuple[int, ...] = (1,)
+    shared_opacity: bool = False
+
+    @property
+    def opacity_channels(self) -> tuple[int, ...]:
+        """Channels that each set of opacities composites: those of the renderer's modalities."""
+        return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels
+
+    def check(self, scene: SceneData) -> None:
+        """As ``Heat.check``; raises SceneError also when a view has no image of a companion."""
+        super().check(scene)
         for modality in self.companions:
             parts = scene.train, scene.val, scene.test
             without = [view.frame.name for part in parts for view in part if getattr(view, modality) is None]
@@ -150,57 +199,13 @@ class ThermalModel(nn.Module, ABC):
                 )
 
     @abstractmethod
-    def prepare(self, scene: SceneData) -> None:
-        """Takes constants (time grids, ranges) from the scene into buffers. Called once, before anything else."""
-
-    @abstractmethod
-    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
-        """The tensors that every Gaussian carries for this model, by the name under which they live in Splats."""
-
-    @abstractmethod
-    def features(self, splats: Splats, query: Query) -> Emission:
-        """What the Gaussians in ``query.ids`` emit. Evaluates those only."""
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        """What the Gaussians in ``query.ids`` emit, [n, C] in image units. Evaluates those only."""
 
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
         """Geometry at ``query.time_s`` for deforming models; None means that splats stay as they are."""
         return None
 
-    def on_step(self, step: int) -> None:
-        """Told the training step before it runs, for schedules such as the degree of spherical harmonics."""
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        """Extra loss terms by name, each a weighted scalar with a gradient. Penalties x² belong in PerGaussian.l2."""
-        return {}
-
-    def needless_rows(self, splats: Splats, step: int) -> Iterable[tuple[str, Tensor, Mapping[str, Tensor]]]:
-        """Rows of tensors that some Gaussians can do without from now on, asked for after every step of the optimiser.
-
-        Each is the name of a tensor, the Gaussians that lose their row of it, [N] bool, and the values [N, ...] that their
-        other tensors take instead, by name (see ``density.ops.Cloud.drop``).
-        """
-        return ()
-
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """Temperature of every Gaussian in kelvin at a time, [N]; None where the model has no temperature."""
         return None
-
-    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
-        return {}
-
-    def rate_of(self, name: str) -> tuple[float, float]:
-        """Learning rate of the model's own parameter of that name, and the factor on it at the end of the run."""
-        return self.lr, self.lr_end
-
-    def prior(self, splats: Splats) -> dict[str, Tensor]:
-        """What a table says of attributes that training pulls towards it, by name, each [N]; NaN where it says nothing."""
-        return {}
-
-    def effects(self) -> dict[str, dict]:
-        """The physical effects that the model simulates: catalogue name -> settings (for metrics.json)."""
-        return {}
-
-    @property
-    @abstractmethod
-    def cost(self) -> int:
-        """Multiply-adds per Gaussian and view."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import torch
@@ -14,14 +13,16 @@ from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import Query, ThermalModel
+from heatsplat.thermal.coordinates import Clock
+from heatsplat.thermal.wrapper import Wrapper
 
 LOG_FLOWS = (-12.0, 3.5)  # of κ per span; at the upper end neighbours are as good as one body
 SOLVER_STEPS = 60  # conjugate gradients; at the largest κ the error falls tenfold in about 12 of them
 SOLVER_TOLERANCE = 1e-6  # residual against the right-hand side: float32 knows no better
 
 
-class Conducting(ThermalModel):
+class Conducting(Wrapper):
     """(I + κ t L)^{-1} T(t): the temperatures of another model after one implicit step of conduction over the time t.
 
     L is the Laplacian of the graph that joins every Gaussian with its nearest neighbours, divided by their mean number,
@@ -32,7 +33,7 @@ class Conducting(ThermalModel):
     **Convention:** time counts from the first training frame; before it nothing flows.
 
     Args:
-        state: temperatures without conduction; its emission has one channel.
+        state: temperatures without conduction.
         neighbours: of a Gaussian.
         every: steps after which the graph is drawn anew; also when the number of Gaussians has changed.
         flow: κ at the start, per span; positive.
@@ -51,48 +52,41 @@ class Conducting(ThermalModel):
         lr: float = 0.01,
         lr_end: float = 0.1,
     ) -> None:
-        super().__init__()
+        super().__init__({"state": state}, needs={"time"})
         if neighbours < 1 or every < 1 or flow <= 0:
             raise ValueError(
                 f"neighbours and every must be at least 1 and flow positive, got {neighbours}, {every} and {flow}"
             )
-        self.state, self.neighbours, self.every, self.lr, self.lr_end = state, neighbours, every, lr, lr_end
-        self.needs = state.needs | {"time"}
-        self.modality, self.modality_channels = state.modality, state.modality_channels
+        self.neighbours, self.every, self.lr, self.lr_end = neighbours, every, lr, lr_end
         self.log_flow = nn.Parameter(torch.tensor(math.log(flow)))
-        self.register_buffer("span_s", torch.ones((), dtype=torch.float64))
+        self.clock = Clock()
         self.register_buffer("edges", torch.zeros(2, 0, dtype=torch.int64))  # each pair once
         self.register_buffer("joined", torch.zeros((), dtype=torch.int64))  # number of Gaussians in the graph
         self._due = False
         self._laplacian: tuple[Tensor, Tensor] | None = None  # of these edges
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
-        self.state.prepare(scene)
-        times = [time for time in scene.train.times_s if time is not None]
-        self.span_s.fill_(max(max(times) - min(times), 1e-9))
-
-    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
-        return self.state.per_gaussian(seeds)
+        super().prepare(scene)
+        self.clock.prepare(scene)
 
     def on_step(self, step: int) -> None:
-        self.state.on_step(step)
+        super().on_step(step)
         self._due = self._due or step % self.every == 0
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        alone = self.state.features(splats, replace(query, ids=None)).features
-        return Emission(query.rows(self.conducted(alone, splats, query.time_s)))
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        return query.rows(super().features(splats, replace(query, ids=None)))
+
+    def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        return self.conducted(values, splats, query.time_s)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        alone = self.state.temperature(splats, time_s)
+        alone = super().temperature(splats, time_s)
         return None if alone is None else self.conducted(alone[:, None], splats, time_s)[:, 0]
 
     def conducted(self, values: Tensor, splats: Splats, time_s: float | None) -> Tensor:
         """Values [N, C] of all Gaussians after they exchanged heat until ``time_s``."""
-        if time_s is None:
-            raise ValueError("how far heat has flowed depends on the time: give time_s")
+        spans = max(self.clock.spans(time_s), 0.0)
         self._join(splats)
-        spans = max(float(time_s) / self.span_s.item(), 0.0)
         return _ImplicitStep.apply(values, spans * self.log_flow.clamp(*LOG_FLOWS).exp(), self._laplacian[1])
 
     def _join(self, splats: Splats) -> None:
@@ -110,29 +104,13 @@ class Conducting(ThermalModel):
         if self._laplacian is None or self._laplacian[0] is not self.edges:
             self._laplacian = self.edges, laplacian(self.edges, count)
 
-    def geometry(self, splats: Splats, query: Query) -> Geometry | None:
-        return self.state.geometry(splats, query)
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        return self.state.regularisers(splats)
-
-    def needless_rows(self, splats: Splats, step: int) -> Iterable[tuple[str, Tensor, Mapping[str, Tensor]]]:
-        return self.state.needless_rows(splats, step)
-
-    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return self.state.attributes(splats, query)
-
-    def rate_of(self, name: str) -> tuple[float, float]:
-        inner = name.removeprefix("state.")
-        return (self.lr, self.lr_end) if inner == name else self.state.rate_of(inner)
-
     def effects(self) -> dict[str, dict]:
         flow = self.log_flow.detach().clamp(*LOG_FLOWS).exp().item()
-        return self.state.effects() | {"conduction": {"neighbours": self.neighbours, "per_span": flow}}
+        return super().effects() | {"conduction": {"neighbours": self.neighbours, "per_span": flow}}
 
     @property
     def cost(self) -> int:
-        return self.state.cost + SOLVER_STEPS * (2 * self.neighbours + 10)
+        return super().cost + SOLVER_STEPS * (2 * self.neighbours + 10)
 
 
 def laplacian(edges: Tensor, count: int) -> Tensor:

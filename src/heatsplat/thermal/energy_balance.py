@@ -10,15 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange, Weather
-from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.contracts import SceneData, SceneError, Weather, check_option
+from heatsplat.geometry.rotations import shortest_axes
 from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
+from heatsplat.thermal.coordinates import ImageRange
 
 log = logging.getLogger(__name__)
 
@@ -99,8 +100,7 @@ class EnergyBalance(ThermalModel):
             ("clip", clip, CLIPS),
             ("sky", sky, (*SKIES, None)),
         ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+            check_option(name, value, known)
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
@@ -110,7 +110,7 @@ class EnergyBalance(ThermalModel):
         self.climate: Climate | None = None
         self.simulated: dict[str, dict] = {}
         # What trained parameters count from; another weather leaves it as it is.
-        self.register_buffer("range_c", torch.zeros(2, dtype=torch.float64))
+        self.range = ImageRange()
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
         if wind:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
@@ -122,13 +122,11 @@ class EnergyBalance(ThermalModel):
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
         weather = scene.weather
         if weather.air_c is None:
             raise SceneError(f"the weather of scene '{scene.name}' has no air_c, the temperature of the air; add it")
         if self.reference_k == 0:  # otherwise this is another weather for what was trained
-            bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
-            self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
+            self.range.prepare(scene)
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self._wind and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
@@ -167,12 +165,12 @@ class EnergyBalance(ThermalModel):
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         return tensors
 
-    def features(self, splats: Splats, query: Query) -> Emission:
+    def features(self, splats: Splats, query: Query) -> Tensor:
         if query.time_s is None:
             raise ValueError("a scene that changes needs the time at which it is seen: give time_s")
         celsius_above = self._temperature(splats, query) + celsius(self.reference_k).item()
-        unit = self._range.to_unit(celsius_above)
-        return Emission(clipped(unit, self.clip)[:, None])
+        unit = self.range.bounds.to_unit(celsius_above)
+        return clipped(unit, self.clip)[:, None]
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         return self._temperature(splats, Query(time_s=time_s)) + self.reference_k.item()
@@ -206,10 +204,6 @@ class EnergyBalance(ThermalModel):
     # The balance ----------------------------------------------------------------------------------------
 
     @property
-    def _range(self) -> ThermalRange:
-        return ThermalRange(*self.range_c.tolist())
-
-    @property
     def _sunlit(self) -> bool:
         return self.climate.drivers.light is not None
 
@@ -234,7 +228,7 @@ class EnergyBalance(ThermalModel):
         initial = query.rows(splats["initial_state"])
         drivers = self.climate.drivers
         return Surface(
-            start=self._range.to_celsius(initial) - celsius(self.reference_k).item(),
+            start=self.range.bounds.to_celsius(initial) - celsius(self.reference_k).item(),
             log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
             share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
@@ -248,9 +242,7 @@ class EnergyBalance(ThermalModel):
 
         Images and not heat decide how a Gaussian lies, so that no gradient passes.
         """
-        axes = quats_to_matrices(query.rows(splats.quats))
-        shortest = query.rows(splats["log_scales"]).argmin(1)
-        normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(2)
+        normals = shortest_axes(query.rows(splats.quats), query.rows(splats["log_scales"]))
         outwards = ((self.outside - query.rows(splats.means)) * normals).sum(1, keepdim=True)
         return torch.where(outwards < 0, -normals, normals)
 
@@ -259,7 +251,7 @@ class EnergyBalance(ThermalModel):
         drivers, share = self.climate.drivers, START_SHARE if self.climate.drivers.sky is not None else 0.0
         mean = partial(driver_means, drivers.times_s)
         light = drivers.light if drivers.beams is None else drivers.light + (drivers.beams @ drivers.up).clamp(min=0.0)
-        excess = (self._range.to_celsius(grey) - celsius(self.reference_k).item()).double()
+        excess = (self.range.bounds.to_celsius(grey) - celsius(self.reference_k).item()).double()
         loss = (1 - share) * (excess - mean(drivers.air))
         if share:
             loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))

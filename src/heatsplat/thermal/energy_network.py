@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import KELVIN_AT_0_C, WEATHER_COLUMNS, SceneData, SceneError, Weather
+from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_option
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.physics.ellipsoids import (
     PROJECTED_AREAS,
@@ -25,11 +25,11 @@ from heatsplat.physics.ellipsoids import (
 )
 from heatsplat.physics.heat_flow import heating_rate
 from heatsplat.physics.sky import LAWS, sky_temperature_k
-from heatsplat.physics.units import kelvin
+from heatsplat.physics.units import DAY_S, kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
-from heatsplat.thermal.atmospheric_field import BOX_EDGE, octaves
-from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
 from heatsplat.thermal.weather_drive import columns_at, source_of_sunlight, sunlight_at
@@ -50,9 +50,15 @@ LIMITS = {
     "convection": (0.0, 50.0),  # W/(m² K); wind over 15 m/s
     "capacity": (0.5e6, 6.0e6),  # J/(m³ K); water has 4.2e6
 }
-DAY_S = 86400.0
 GOLDEN = 0.6180339887498949  # multiples of it, without their whole part, fill [0, 1) evenly however many are taken
-TRAVELS = ("bounds_k", "clock", "weather_mean", "weather_scale", "feature_mean", "feature_scale")  # with the network
+TRAVELS = (
+    "bounds_k",
+    "clock.record",
+    "weather_mean",
+    "weather_scale",
+    "feature_mean",
+    "feature_scale",
+)  # with the network
 
 
 @dataclass(frozen=True)
@@ -150,8 +156,7 @@ class EnergyNetwork(ThermalModel):
             ("surface_area", surface_area, SURFACE_AREAS),
             ("sky", sky, SKIES),
         ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+            check_option(name, value, known)
         if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
             raise ValueError(
                 "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
@@ -197,10 +202,7 @@ class EnergyNetwork(ThermalModel):
         self.network = ResidualNetwork(own, timed + len(WEATHER_COLUMNS), width, blocks, heads)
 
         self.register_buffer("emits", torch.tensor(True))  # the network, not the value of the first stage
-        self.register_buffer("center", torch.zeros(3))
-        self.register_buffer("edge", torch.ones(()))
-        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))  # origin and span of time
-        self.register_buffer("range_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # image value 0, and its span
+        self.box, self.clock, self.range = Box(), Clock(), ImageRange()
         self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # T_min, and T_max - T_min
         self.register_buffer("weather_mean", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
         self.register_buffer("weather_scale", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
@@ -254,14 +256,12 @@ class EnergyNetwork(ThermalModel):
             )
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
         self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
-        times = torch.tensor(scene.train.times_s, dtype=torch.float64)
-        span = times.max() - times.min()
-        self.clock.copy_(torch.stack([times.min(), span if span > 0 else torch.ones_like(span)]))
+        for constants in (self.box, self.clock, self.range):
+            constants.prepare(scene)
         for frame in (*scene.test.frames, *scene.val.frames):
             scene.weather.at(frame.time_s)  # refuses now what would fail after training
-        columns = torch.stack([columns_at(scene.weather, time) for time in times.tolist()])
+        columns = torch.stack([columns_at(scene.weather, time) for time in scene.train.times_s])
         spread = columns.std(0, unbiased=False)
         there = ~columns[0].isnan()
         self.weather_mean.copy_(torch.where(there, columns.mean(0), 0.0))
@@ -269,12 +269,8 @@ class EnergyNetwork(ThermalModel):
         self.weather_scale.copy_(torch.where(there & (spread > 1e-9), 1.0 / spread.clamp(min=1e-9), 0.0))
         if missing := self._missing_columns:
             log.warning("the weather of scene '%s' has no %s: the network does without", scene.name, ", ".join(missing))
-        center, edge = scene.bulk
-        self.center.copy_(center)
-        self.edge.fill_(edge)
-        lower, width = scene.thermal_range.min_c + KELVIN_AT_0_C, scene.thermal_range.span_k
+        lower, width = self.range.lowest_k, self.range.bounds.span_k
         bounds = [lower - self.margin * width, (1 + 2 * self.margin) * width]
-        self.range_k.copy_(torch.tensor([lower, width], dtype=torch.float64))
         self.bounds_k.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._points = {"means": scene.points.float()}
         if self.labelled:
@@ -314,16 +310,16 @@ class EnergyNetwork(ThermalModel):
         self._step = step
         self.emits.fill_(step >= self.first_steps)
 
-    def features(self, splats: Splats, query: Query) -> Emission:
+    def features(self, splats: Splats, query: Query) -> Tensor:
         if not self._network_emits:
-            return Emission(query.rows(splats["first_value"]).clamp(min=0.0)[:, None])
+            return query.rows(splats["first_value"]).clamp(min=0.0)[:, None]
         base = self._base(splats, query.ids)
         hidden = self.network(base, self._moment(query.time_s))
         units = self._units(hidden)
         if torch.is_grad_enabled() and self.training:
             ids = torch.arange(len(splats), device=units.device) if query.ids is None else query.ids
             self._seen = _Seen(ids, base, hidden, units, query.time_s)
-        return Emission(self._image_values(units)[:, None])
+        return self._image_values(units)[:, None]
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """Those of "smooth", "physical", "ode" and "pinn" that are on, of the Gaussians last seen with a gradient."""
@@ -361,8 +357,7 @@ class EnergyNetwork(ThermalModel):
         return {name: weights[name] * term for name, term in terms.items()}
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        lower, width = self.range_k.tolist()
-        return lower + width * self.features(splats, Query(time_s=time_s)).features[:, 0]
+        return self.range.kelvin(self.features(splats, Query(time_s=time_s))[:, 0])
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Emissivity, absorptivity, convection and capacity at the time of the query; nothing in the first stage."""
@@ -430,8 +425,7 @@ class EnergyNetwork(ThermalModel):
         rows = Query(ids).rows
         parts = []
         if self.position_frequencies:
-            places = ((rows(splats.means.detach()) - self.center) / self.edge).clamp(-BOX_EDGE, BOX_EDGE)
-            parts.append(octaves(places, self.position_frequencies))
+            parts.append(octaves(self.box.places(rows(splats.means.detach())), self.position_frequencies))
         if self.features_from == "labels":
             labels = rows(splats["label"].detach())[:, None]
             parts.append((labels == torch.arange(len(CLASSES), device=labels.device)).float())
@@ -441,14 +435,12 @@ class EnergyNetwork(ThermalModel):
 
     def _moment(self, time_s: float) -> Tensor:
         """Encoded time and weather of a moment, as the network sees them."""
-        if time_s is None:
-            raise ValueError("ThermoGS needs the time at which a scene is seen: give time_s")
+        spans = self.clock.spans(time_s)
         mean, scale = self.weather_mean.cpu(), self.weather_scale.cpu()
         weather = torch.where(scale > 0, (columns_at(self.weather, time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
         if self.time != "none":
-            origin, span = self.clock.tolist()
-            share = (time_s - origin) / span if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
+            share = spans if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
             parts.append(octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0])
         return torch.cat(parts).to(self.network.own.weight)
 
@@ -457,12 +449,14 @@ class EnergyNetwork(ThermalModel):
         return self.network.heads["temperature"](hidden)[:, 0].sigmoid()
 
     def _image_values(self, units: Tensor) -> Tensor:
-        (lower, width), (coldest, span) = self.range_k.tolist(), self.bounds_k.tolist()
+        lower, width = self.range.lowest_k, self.range.bounds.span_k
+        coldest, span = self.bounds_k.tolist()
         return (coldest - lower) / width + (span / width) * units
 
     def _raw_of(self, value: Tensor) -> Tensor:
         """What the head must give for an image value."""
-        (lower, width), (coldest, span) = self.range_k.tolist(), self.bounds_k.tolist()
+        lower, width = self.range.lowest_k, self.range.bounds.span_k
+        coldest, span = self.bounds_k.tolist()
         return torch.logit(((lower + width * value - coldest) / span).clamp(0.05, 0.95))
 
     # The balance ----------------------------------------------------------------------------------------

@@ -11,8 +11,10 @@ from torch.nn import functional
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.coordinates import Clock, ImageRange
 from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.wrapper import Wrapper
 
 # Head -> numbers that it gives and the bound of each, which is approached smoothly: a moved mean in half edges of the box,
 # natural logarithms of scales, parts of a quaternion as stored, the logit of opacity, image units.
@@ -31,7 +33,7 @@ class Deformed(Geometry):
     hidden: Tensor
 
 
-class HexPlane(ThermalModel):
+class HexPlane(Wrapper):
     """Gaussians with changes Δ_m = head_m(φ(f(x, t))) of their raw tensors and of their radiance (4DGS, CVPR 2024, Eq. 3-8).
 
     f multiplies bilinear samples of six planes, xy, xz, yz and xt, yt, zt, and puts the products of all scales side by
@@ -81,7 +83,7 @@ class HexPlane(ThermalModel):
         lr_planes: float = 1e-2,
         lr_end: float = 0.1,
     ) -> None:
-        super().__init__()
+        super().__init__({"emission": emission}, needs={"time"})
         unknown = [name for name in heads if name not in HEADS]
         if unknown or not heads:
             raise ValueError(f"heads must name some of {', '.join(HEADS)}, got {list(heads)}")
@@ -90,10 +92,6 @@ class HexPlane(ThermalModel):
                 "resolutions must be at least 2, scales, channels and width at least 1, got "
                 f"{resolution}, {time_resolution}, {list(scales)}, {channels}, {width}"
             )
-        self.emission = emission
-        self.needs = emission.needs | {"time"}
-        self.modality, self.companions = emission.modality, emission.companions
-        self.modality_channels, self.shared_opacity = emission.modality_channels, emission.shared_opacity
         self.scales, self.time_resolution, self.first_steps = tuple(scales), time_resolution, first_steps
         self.weights = {"smooth_space": smooth_space, "smooth_time": smooth_time, "sparse_time": sparse_time}
         self.lr, self.lr_planes, self.lr_end = lr, lr_planes, lr_end
@@ -116,18 +114,15 @@ class HexPlane(ThermalModel):
                 head[-1].bias.zero_()
         self.register_buffer("center", torch.zeros(3))
         self.register_buffer("reach", torch.ones(3))  # half edges of the box, world units
-        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))  # origin and span of time
-        self.register_buffer("span_k", torch.full((), torch.nan))
+        self.clock, self.range = Clock(), ImageRange()
         self.register_buffer("changes", torch.tensor(first_steps == 0))
 
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
-        self.emission.prepare(scene)
-        self.clock.copy_(torch.tensor(scene.record, dtype=torch.float64))
-        if scene.thermal_range is not None:
-            self.span_k.fill_(scene.thermal_range.span_k)
+        super().prepare(scene)
+        self.clock.prepare(scene)
+        self.range.prepare(scene)
         low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
         half = BOX * (high - low) / 2
         self.center.copy_((low + high) / 2)
@@ -141,16 +136,16 @@ class HexPlane(ThermalModel):
         with torch.no_grad():
             for plane in self.space:
                 nn.init.uniform_(plane, *SPATIAL_START, generator=seeds.generator)
-        return self.emission.per_gaussian(seeds)
+        return super().per_gaussian(seeds)
 
     def on_step(self, step: int) -> None:
-        self.emission.on_step(step)
+        super().on_step(step)
         self.changes.fill_(step >= self.first_steps)
 
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
-        """Changed geometry and opacities; None where none of their heads is there, and in the first stage."""
+        """Changed geometry and opacities; the emission's where none of their heads is there, and in the first stage."""
         if not self.changes or not self.moves:
-            return None
+            return super().geometry(splats, query)
         hidden = self.hidden(splats.means, query.time_s)
         change = {name: self._change(name, hidden) for name in self.heads if name != "radiance"}
         means, quats, log_scales = splats.means, splats.quats, splats["log_scales"]
@@ -163,21 +158,21 @@ class HexPlane(ThermalModel):
             hidden,
         )
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        emitted = self.emission.features(splats, query).features
-        if self.changes and "radiance" in self.heads:
-            if isinstance(query.geometry, Deformed):
-                hidden = query.rows(query.geometry.hidden)
-            else:
-                hidden = self.hidden(query.rows(splats.means), query.time_s)
-            channels = self.modality_channels[0]
-            change = self._change("radiance", hidden).to(emitted)
-            emitted = torch.cat((emitted[:, :channels] + change, emitted[:, channels:]), 1)
-        return Emission(emitted.clamp(min=0.0))
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        return super().features(splats, query).clamp(min=0.0)
+
+    def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        if not self.changes or "radiance" not in self.heads:
+            return values
+        if isinstance(query.geometry, Deformed):
+            hidden = query.rows(query.geometry.hidden)
+        else:
+            hidden = self.hidden(query.rows(splats.means), query.time_s)
+        return values + self._change("radiance", hidden).to(values)
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """The emission's, and those of the planes; none of weight 0 and none while the field is not used."""
-        terms = self.emission.regularisers(splats)
+        terms = super().regularisers(splats)
         if not self.changes:
             return terms
         found = {
@@ -190,29 +185,22 @@ class HexPlane(ThermalModel):
         }
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        level = self.emission.temperature(splats, time_s)
+        level = super().temperature(splats, time_s)
         if level is None or not self.changes or "radiance" not in self.heads:
             return level
         with torch.no_grad():
-            return level + self.span_k * self._change("radiance", self.hidden(splats.means, time_s))[:, 0]
-
-    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return self.emission.attributes(splats, query)
-
-    def effects(self) -> dict[str, dict]:
-        return self.emission.effects()
+            change = self._change("radiance", self.hidden(splats.means, time_s))[:, 0]
+            return level + self.range.bounds.span_k * change
 
     def rate_of(self, name: str) -> tuple[float, float]:
-        if name.startswith("emission."):
-            return self.emission.rate_of(name.removeprefix("emission."))
-        return self.lr_planes if name.startswith(("space.", "time.")) else self.lr, self.lr_end
+        return (self.lr_planes, self.lr_end) if name.startswith(("space.", "time.")) else super().rate_of(name)
 
     @property
     def cost(self) -> int:
         channels = self.space[0].shape[1] * len(self.scales)
         heads = sum(layer.weight.numel() for head in self.heads.values() for layer in (head[1], head[3]))
         samples = channels * (3 * 4 + 3 * 2 + 5)  # planes, lines and their product
-        return self.emission.cost + samples + self.trunk.weight.numel() + heads
+        return super().cost + samples + self.trunk.weight.numel() + heads
 
     # The field ------------------------------------------------------------------------------------------
 
@@ -222,23 +210,21 @@ class HexPlane(ThermalModel):
         Raises:
             ValueError: there is no time.
         """
-        if time_s is None:
-            raise ValueError("4DGS needs the time at which a scene is seen: give time_s")
+        spans = self.clock.spans(time_s)
         places = (means - self.center) / self.reach
         flat = torch.stack([places[:, pair] for pair in PAIRS])[:, :, None]  # [3, n, 1, 2]
         along = torch.stack((places.T, torch.zeros_like(places.T)), 2)[:, :, None]
         samples = []
         for space, time in zip(self.space, self.time, strict=True):
-            planes, lines = _sampled(space, flat), _sampled(self._at(time, time_s), along)
+            planes, lines = _sampled(space, flat), _sampled(self._at(time, spans), along)
             product = planes[0] * planes[1] * planes[2] * lines[0] * lines[1] * lines[2]
             samples.append(product)
         return self.trunk(torch.cat(samples).T)
 
-    def _at(self, planes: Tensor, time_s: float) -> Tensor:
+    def _at(self, planes: Tensor, spans: float) -> Tensor:
         """Time planes [3, C, nodes, R] at a time: lines [3, C, 1, R]. All Gaussians share the time, so it comes first."""
-        origin, span = self.clock.tolist()
         nodes = planes.shape[2]
-        place = min(max((float(time_s) - origin) / span, 0.0), 1.0) * (nodes - 1)
+        place = min(max(spans, 0.0), 1.0) * (nodes - 1)
         before = min(int(place), nodes - 2)
         return torch.lerp(planes[:, :, before], planes[:, :, before + 1], place - before)[:, :, None]
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import check_option
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import AtmosphericField
 from heatsplat.thermal.base import ThermalModel
@@ -45,8 +46,7 @@ class ImagingField(AtmosphericField):
         exponent: str = "positive",
         **field: Any,
     ) -> None:
-        if applies_to not in TARGETS:
-            raise ValueError(f"applies_to must be one of {', '.join(TARGETS)}, got '{applies_to}'")
+        check_option("applies_to", applies_to, TARGETS)
         super().__init__(emission, exponent=exponent, **field)
         self.on_radiance, self.gauge = applies_to == "radiance", gauge
         self._sensitivity: Tensor | None = None

@@ -10,13 +10,13 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 from heatsplat.physics.fused import visible_temperature
-from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
+from heatsplat.thermal.coordinates import Clock, ImageRange
 from heatsplat.thermal.sparse_sources import SparseSources
 
 log = logging.getLogger(__name__)
@@ -87,13 +87,9 @@ class NewtonHarmonic(ThermalModel):
         source_noise: float | None = None,
     ) -> None:
         super().__init__()
-        for name, value, known in (
-            ("param", param, PARAMS),
-            ("l2_reduction", l2_reduction, REDUCTIONS),
-            ("clip", clip, CLIPS),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        check_option("param", param, PARAMS)
+        check_option("l2_reduction", l2_reduction, REDUCTIONS)
+        check_option("clip", clip, CLIPS)
         if isinstance(ambient, str) and ambient not in ("measured", "learned"):
             raise ValueError(f"ambient must be measured, learned or a number in °C, got '{ambient}'")
         self.frequencies, self.param = frequencies, param
@@ -106,36 +102,31 @@ class NewtonHarmonic(ThermalModel):
         self._ambient_from = ambient
         self._ambient_unknown = False
         self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
-        self.register_buffer("span_s", torch.ones((), dtype=torch.float64))
-        self.register_buffer("range_c", torch.full((2,), torch.nan, dtype=torch.float64))
+        self.clock, self.range = Clock(), ImageRange()
         self.register_buffer("ambient", torch.tensor(0.5))
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
         times = torch.tensor(scene.train.times_s, dtype=torch.float64)
-        span_s = (times.max() - times.min()).item()
-        if span_s > 0:
-            self.span_s.fill_(span_s)
+        self.clock.prepare(scene)
+        self.range.prepare(scene)
+        if times.max() > times.min():
             tau_min_s = default_tau_min(times) if self.tau_min_s is None else self.tau_min_s
-            self.omega = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain) * span_s
+            self.omega = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain) * self.clock.span_s
         else:
             log.warning("scene '%s' shows one moment only: the model has no heat source", scene.name)
         if scene.thermal_range is None:
             log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
-        else:
-            bounds = [scene.thermal_range.min_c, scene.thermal_range.max_c]
-            self.range_c.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._set_ambient(scene)
         if self.sources is not None and self.omega.numel() > 0:
             self.sources.prepare(scene, self.modality)
 
     @torch.no_grad()
-    def needless_rows(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
+    def rows_to_drop(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
         """At the steps of ``drop_sources_at``, the sources of Gaussians that relaxation alone can tell."""
         if self.sources is None or self.omega.numel() == 0 or step not in self.sources.drop_at:
             return
         gone, initial, log_rate = self.sources.needless(
-            lambda time_s: self._state(splats, time_s, None), self.ambient, self.span_s.item()
+            lambda time_s: self._state(splats, time_s, None), self.ambient, self.clock.span_s
         )
         instead = {"initial_state": initial}
         if self.param == "rate":
@@ -186,24 +177,20 @@ class NewtonHarmonic(ThermalModel):
             tensors["source_gains"] = tensor(gains, self.lr_gain, self.source_l2)
         return tensors
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        if query.time_s is None:
-            raise ValueError("a scene that changes needs the time at which it is seen: give time_s")
+    def features(self, splats: Splats, query: Query) -> Tensor:
         state = self._state(splats, query.time_s, query.ids)
-        return Emission(clipped(state, self.clip)[:, None])
+        return clipped(state, self.clip)[:, None]
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        if self.range_c.isnan().any():
-            return None
-        return kelvin(ThermalRange(*self.range_c.tolist()).to_celsius(self._state(splats, time_s, None)))
+        return None if self.range.bounds is None else self.range.kelvin(self._state(splats, time_s, None))
 
-    def _state(self, splats: Splats, time_s: float, ids: Tensor | None) -> Tensor:
+    def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
         """Temperature in image units of the Gaussians ``ids``, [n], not clipped."""
         faithful = self.param == "faithful"
         log_rate = splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"]
         source = self.omega.numel() > 0
         return visible_temperature(
-            torch.as_tensor(time_s, dtype=torch.float64, device=self.span_s.device) / self.span_s,
+            torch.tensor(self.clock.spans(time_s), dtype=torch.float64, device=self.omega.device),
             self.ambient,
             splats["initial_state"],
             log_rate.clamp(*LOG_RATES).exp(),

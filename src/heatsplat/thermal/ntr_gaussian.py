@@ -7,11 +7,11 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from heatsplat.contracts import SceneData
-from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
+from heatsplat.physics.units import STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
-from heatsplat.thermal.atmospheric_field import BOX_EDGE, octaves
-from heatsplat.thermal.base import KELVIN_RANGE, Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
+from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
 from heatsplat.thermal.layers import draw_uniform
 
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
@@ -95,11 +95,8 @@ class NtrGaussian(ThermalModel):
         self.of_feature, self.of_place = nn.Linear(feature_size, 3 * half), nn.Linear(places, half)
         self.of_state = nn.Linear(3 + times, 3 * half)
         self.attribute_heads = nn.Parameter(torch.zeros(3, half))
-        self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # lowest, span
+        self.clock, self.box, self.range = Clock(), Box(), ImageRange()
         self.register_buffer("ambient", torch.full((), 0.5))
-        self.register_buffer("center", torch.zeros(3))
-        self.register_buffer("edge", torch.ones(()))
-        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))
         self.register_buffer("emits", torch.tensor(first_steps == 0))
         self._storage = STORAGE
         self._terms: dict[str, Tensor] = {}
@@ -107,17 +104,12 @@ class NtrGaussian(ThermalModel):
     # What the contract asks -----------------------------------------------------------------------------
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
+        for constants in (self.clock, self.box, self.range):
+            constants.prepare(scene)
         bounds = scene.thermal_range
-        self.bounds_k.copy_(torch.tensor([kelvin(bounds.min_c), bounds.span_k], dtype=torch.float64))
         self.ambient.fill_(0.5 if scene.ambient_c is None else bounds.to_unit(scene.ambient_c))
-        center, edge = scene.bulk
-        self.center.copy_(center)
-        self.edge.fill_(edge)
-        times = torch.tensor(scene.train.times_s, dtype=torch.float64)
-        self.clock.copy_(torch.stack([times.min(), (times.max() - times.min()).clamp(min=1e-3)]))
         # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
-        sent = 0.5 * STEFAN_BOLTZMANN * kelvin(bounds.min_c) ** 4 * min(float(self.clock[1]), self.window_s)
+        sent = 0.5 * STEFAN_BOLTZMANN * self.range.lowest_k**4 * min(self.clock.span_s, self.window_s)
         self._storage = max(STORAGE, sent / (FIRST_COOLING * bounds.span_k))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
@@ -131,11 +123,11 @@ class NtrGaussian(ThermalModel):
     def on_step(self, step: int) -> None:
         self.emits.fill_(step >= self.first_steps)
 
-    def features(self, splats: Splats, query: Query) -> Emission:
+    def features(self, splats: Splats, query: Query) -> Tensor:
         if not self.emits:
-            return Emission(query.rows(splats["first_value"]).clamp(min=0.0)[:, None])
+            return query.rows(splats["first_value"]).clamp(min=0.0)[:, None]
         units = self._units(splats, query.ids, float(query.time_s))
-        return Emission(clipped(units, "straight_through")[:, None])
+        return clipped(units, "straight_through")[:, None]
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """The penalties of the Gaussians that were last evaluated with a gradient; those of weight 0 are absent."""
@@ -145,8 +137,8 @@ class NtrGaussian(ThermalModel):
     def temperature(self, splats: Splats, time_s: float) -> Tensor:
         with torch.no_grad():
             if not self.emits:
-                return self._kelvin(splats["first_value"])
-            return self._kelvin(self._units(splats, None, time_s))
+                return self.range.kelvin(splats["first_value"])
+            return self.range.kelvin(self._units(splats, None, time_s))
 
     def effects(self) -> dict[str, dict]:
         return {"relaxation": {"nodes": self.nodes, "window_s": self.window_s}, "radiation": {}, "convection": {}}
@@ -163,10 +155,10 @@ class NtrGaussian(ThermalModel):
         """Temperatures [n] in image units at ``time_s``."""
         rows = (lambda tensor: tensor) if ids is None else (lambda tensor: tensor.index_select(0, ids))
         means, feature = rows(splats.means).detach(), rows(splats["feature"])
-        code = octaves(((means - self.center) / self.edge).clamp(-BOX_EDGE, BOX_EDGE), self.position_frequencies)
-        start = max(float(self.clock[0]), time_s - self.window_s)
+        code = octaves(self.box.places(means), self.position_frequencies)
+        start = max(self.clock.first_s, time_s - self.window_s)
         times = torch.linspace(start, time_s, self.nodes, dtype=torch.float64)
-        moments = octaves(((times - self.clock[0]) / self.clock[1])[:, None], self.time_frequencies).to(code)
+        moments = octaves(((times - self.clock.first_s) / self.clock.span_s)[:, None], self.time_frequencies).to(code)
         env, wind = self.env(moments).sigmoid().unbind(1)
         units = self._network(self.place(code), moments)
         rates = self._rates(units, env, wind, moments, feature, code)
@@ -200,9 +192,8 @@ class NtrGaussian(ThermalModel):
         raw = (hidden.unflatten(2, (3, -1)) * self.attribute_heads).sum(-1)
         emissivity, exchange = raw[..., 0].sigmoid(), EXCHANGE * softplus(raw[..., 1])
         storage = self._storage * (softplus(raw[..., 2]) + 0.05)  # 5 kJ/m²/K at least: a sheet of metal
-        span = float(self.bounds_k[1])
-        flux = emissivity * STEFAN_BOLTZMANN * self._kelvin(units).square().square() + exchange * span * (units - env)
+        span = self.range.bounds.span_k
+        flux = emissivity * STEFAN_BOLTZMANN * self.range.kelvin(units).square().square() + exchange * span * (
+            units - env
+        )
         return flux / (storage * span)
-
-    def _kelvin(self, units: Tensor) -> Tensor:
-        return float(self.bounds_k[0]) + float(self.bounds_k[1]) * units

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics.grey_body import radiance, temperature_of
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Emission, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.harmonics import harmonics
+from heatsplat.thermal.wrapper import Wrapper
 
 DEGREES = {"emissivity": 1, "temperature": 1, "reflectance": 0}
 ATTRIBUTES = tuple(DEGREES)
@@ -24,7 +25,7 @@ REFLECTANCES = ("free", "kirchhoff")
 START = (0.05, 0.98)  # of temperature: below, 4 T³ leaves hardly a gradient; above, hardly the sigmoid's
 
 
-class Radiative(ThermalModel):
+class Radiative(Wrapper):
     """Thermal emission clip(ε σ T⁴ + ρ L, 0, 1) beside a colour image, on the same Gaussians (RaViGS, Eq. 4-9).
 
     Emissivity ε, temperature T and reflectance ρ of a Gaussian are sigmoids of spherical harmonics of the direction of
@@ -77,10 +78,9 @@ class Radiative(ThermalModel):
         lr_attributes_end: float = 0.1,
         lr: float = 1e-3,
     ) -> None:
-        super().__init__()
-        for name, value, known in (("reflectance", reflectance, REFLECTANCES), ("clip", clip, CLIPS)):
-            if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got '{value}'")
+        super().__init__({"color": color}, own_channels=1)
+        check_option("reflectance", reflectance, REFLECTANCES)
+        check_option("clip", clip, CLIPS)
         if not (0 < emissivity < 1 and 0 < reflectance_start < 1 and 0 < surroundings < 1 and gain > 0):
             raise ValueError(
                 "emissivity, reflectance_start and surroundings lie between 0 and 1 and gain is positive, got "
@@ -96,8 +96,7 @@ class Radiative(ThermalModel):
         else:
             self.degrees = {name: degrees[name] for name in ATTRIBUTES[: 2 if self.kirchhoff else 3]}
         self.bands = {name: spherical_harmonics.band_count(degree) for name, degree in self.degrees.items()}
-        self.color, self.companions, self.needs = color, (color.modality,), color.needs
-        self.modality_channels, self.shared_opacity = (1, *color.modality_channels), not dual_opacity
+        self.shared_opacity = not dual_opacity
         self.emissivity, self.reflectance = emissivity, 1 - emissivity if self.kirchhoff else reflectance_start
         self.color_l2, self.lr = color_l2, lr
         self.lr_attributes, self.lr_rest, self.lr_attributes_end = lr_attributes, lr_rest, lr_attributes_end
@@ -117,9 +116,6 @@ class Radiative(ThermalModel):
 
     # What the contract asks -----------------------------------------------------------------------------
 
-    def prepare(self, scene: SceneData) -> None:
-        self.color.prepare(scene)
-
     @torch.no_grad()
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         grey, tensors = seeds.values[:, :1], {}
@@ -129,7 +125,7 @@ class Radiative(ThermalModel):
             if self.bands[name] > 1:
                 rest = grey.new_zeros(len(grey), self.bands[name] - 1, 1)
                 tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end)
-        colored = self.color.per_gaussian(Seeds(seeds.means, seeds.values[:, 1:], seeds.generator))
+        colored = super().per_gaussian(seeds)
         for name, part in colored.items():
             if name.endswith("_rest") and self.color_l2 > 0:
                 colored[name] = replace(part, l2=self.color_l2, l2_mean=True)
@@ -144,21 +140,18 @@ class Radiative(ThermalModel):
         values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
         return {name: torch.logit(values[name]) for name in self.degrees}
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        heat = self._heat(splats, query)
-        return Emission(torch.cat((heat, self.color.features(splats, query).features), dim=1))
-
-    def on_step(self, step: int) -> None:
-        self.color.on_step(step)
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        return torch.cat((self._heat(splats, query), self.color.features(splats, query)), dim=1)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Emissivity, temperature (in (0, 1), no kelvin) and reflectance; nothing without the three parameters."""
+        """Emissivity, temperature (in (0, 1), no kelvin) and reflectance; none of them without the three parameters."""
+        told = super().attributes(splats, query)
         if not self.three_parameter:
-            return {}
-        return {name: values[:, 0] for name, values in self._body(splats, query).items()}
+            return told
+        return told | {name: values[:, 0] for name, values in self._body(splats, query).items()}
 
     def effects(self) -> dict[str, dict]:
-        effects = self.color.effects()
+        effects = super().effects()
         if self.three_parameter:
             effects["radiation"] = {"law": "ε σ T⁴", "degrees": dict(self.degrees)}
             effects["reflection"] = {"reflectance": "1 - ε" if self.kirchhoff else "learned"}
@@ -170,7 +163,7 @@ class Radiative(ThermalModel):
     def cost(self) -> int:
         directions = {1: 0, 4: 12, 9: 27, 16: 48}  # by number of harmonics: normalising, and the polynomials
         formula = 6 + 4 * len(self.degrees) if self.three_parameter else 1  # the sum, and a sigmoid per attribute
-        return self.color.cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
+        return super().cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
 
     # The thermal band -----------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
-from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.geometry.rotations import shortest_axes
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
 from heatsplat.thermal.part import HeatPart
@@ -74,9 +74,7 @@ class Reflection(HeatPart):
         if query.camera is None:
             raise ValueError("what a surface mirrors depends on the view: give a camera")
         means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
-        axes = quats_to_matrices(query.rows(splats.quats).detach())
-        shortest = query.rows(splats["log_scales"]).detach().argmin(1)
-        normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+        normals = shortest_axes(query.rows(splats.quats).detach(), query.rows(splats["log_scales"]).detach())
         sight = spherical_harmonics.unit(means - query.camera.center.to(means))
         mirrored = sight - 2 * (sight * normals).sum(1, keepdim=True) * normals
         return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]

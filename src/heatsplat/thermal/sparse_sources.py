@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, View
+from heatsplat.contracts import SceneData
+from heatsplat.physics.noise import MIN_NOISE, noise_of, quantum_of
 
 log = logging.getLogger(__name__)
 
@@ -16,8 +17,6 @@ MOMENTS = 64  # of the record at which temperatures are compared, at most
 RATES = torch.logspace(-2, 2, 512, dtype=torch.float64)  # per span; neighbours tell at most 4e-4 of the start apart
 CHUNK = 8192  # Gaussians fitted at a time: 30 MB
 NOISY_VIEWS = 5  # from which the noise is estimated
-_MAD_TO_SIGMA = 1.4826
-_MASK_GAIN = 6.0  # root of the sum of squares of [1, -2, 1] by [1, -2, 1]
 
 
 class SparseSources:
@@ -57,10 +56,8 @@ class SparseSources:
         places = torch.linspace(0, len(times) - 1, min(MOMENTS, len(times))).round().long().tolist()
         self.times_s = [times[i] for i in places]
         if self.noise is None:
-            shown = torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long().tolist()
-            estimates = [noise_of(scene.train[i], modality) for i in shown]
-            self.noise = torch.tensor(estimates).median().item()
-            if self.noise == 0:
+            self.noise = _noise_of(scene, modality)
+            if self.noise <= MIN_NOISE:
                 log.warning(
                     "neighbouring pixels of scene '%s' are equal, so its noise is unknown and no source is dropped; "
                     "give source_noise in image units (a third of a quantisation step at least)",
@@ -84,6 +81,15 @@ class SparseSources:
         return error <= self.floor * self.noise, (start + ambient).float(), rate.log().float()
 
 
+def _noise_of(scene: SceneData, modality: str) -> float:
+    """Standard deviation of the noise of a pixel, from a few views spread over the record."""
+    views = [scene.train[i] for i in torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long()]
+    images = torch.stack([view.image(modality)[..., 0] for view in views]).double()
+    every = torch.ones(images.shape[1:], dtype=torch.bool)
+    masks = torch.stack([every if view.mask is None else view.mask for view in views])
+    return noise_of(images, quantum_of(images[0]), masks)
+
+
 def relaxation_of(above: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Start and rate of the decay start e^{-rate t} closest to each column of ``above`` [F, n], and its rms error; [n] each.
 
@@ -100,14 +106,3 @@ def relaxation_of(above: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]
     decay = torch.exp(-rates[best] * times[:, None])
     start = (decay * above).sum(0) / decay.square().sum(0)
     return start, rates[best], (above - start * decay).square().mean(0).sqrt()
-
-
-def noise_of(view: View, modality: str) -> float:
-    """Standard deviation of the noise of a pixel, from second differences both ways (Immerkaer, CVIU 64, 1996)."""
-    image = view.image(modality)[..., 0].double()
-    if min(image.shape) < 3:
-        return 0.0
-    curved = image.diff(n=2, dim=0).diff(n=2, dim=1)
-    if view.mask is not None and bool(view.mask.any()):
-        curved = curved[view.mask[1:-1, 1:-1]] if bool(view.mask[1:-1, 1:-1].any()) else curved
-    return _MAD_TO_SIGMA / _MASK_GAIN * curved.abs().median().item()

@@ -7,14 +7,15 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.atmospheric_field import octaves
-from heatsplat.thermal.base import Emission, Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.coordinates import Clock, ImageRange, octaves
 from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.wrapper import Wrapper
 
 ENCODER = ("moment", "code")  # parameters of the time encoder begin so
 
 
-class TimeMlp(ThermalModel):
+class TimeMlp(Wrapper):
     """max(0, emission + ΔT), with ΔT a network's answer to a feature of the Gaussian and a code of the time.
 
     A reimplementation in the style of ThermalGS (Remote Sensing 2025, 17(2), 335), which has no public code: the paper ties
@@ -52,16 +53,12 @@ class TimeMlp(ThermalModel):
         lr_end: float = 1.0,
         lr_feature: float = 2.5e-3,
     ) -> None:
-        super().__init__()
+        super().__init__({"emission": emission}, needs={"time"})
         if min(feature_size, width, code_size, time_frequencies) < 1:
             raise ValueError(
                 "feature_size, width, code_size and time_frequencies must be at least 1, got "
                 f"{feature_size}, {width}, {code_size}, {time_frequencies}"
             )
-        self.emission = emission
-        self.needs = emission.needs | {"time"}
-        self.modality, self.companions = emission.modality, emission.companions
-        self.modality_channels, self.shared_opacity = emission.modality_channels, emission.shared_opacity
         self.feature_size, self.time_frequencies, self.first_steps = feature_size, time_frequencies, first_steps
         self.lr, self.lr_time, self.lr_end, self.lr_feature = lr, lr_time, lr_end, lr_feature
         self.moment, self.code = nn.Linear(1 + 2 * time_frequencies, code_size), nn.Linear(code_size, code_size)
@@ -71,62 +68,45 @@ class TimeMlp(ThermalModel):
         with torch.no_grad():
             self.head.weight.zero_()
             self.head.bias.zero_()
-        self.register_buffer("clock", torch.tensor([0.0, 1.0], dtype=torch.float64))  # origin and span of time
-        self.register_buffer("span_k", torch.full((), torch.nan))
+        self.clock, self.range = Clock(), ImageRange()
         self.register_buffer("changes", torch.tensor(first_steps == 0))
 
     def prepare(self, scene: SceneData) -> None:
-        self.check(scene)
-        self.emission.prepare(scene)
-        self.clock.copy_(torch.tensor(scene.record, dtype=torch.float64))
-        if scene.thermal_range is not None:
-            self.span_k.fill_(scene.thermal_range.span_k)
+        super().prepare(scene)
+        self.clock.prepare(scene)
+        self.range.prepare(scene)
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((self.moment, self.code, self.of_code, self.of_feature, self.hidden), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
-        return self.emission.per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature)}
+        return super().per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature)}
 
     def on_step(self, step: int) -> None:
-        self.emission.on_step(step)
+        super().on_step(step)
         self.changes.fill_(step >= self.first_steps)
 
-    def features(self, splats: Splats, query: Query) -> Emission:
-        emitted = self.emission.features(splats, query).features
-        if self.changes:
-            channels = self.modality_channels[0]
-            change = self.change(query.rows(splats["feature"]), query.time_s)[:, None].to(emitted)
-            emitted = torch.cat((emitted[:, :channels] + change, emitted[:, channels:]), 1)
-        return Emission(emitted.clamp(min=0.0))
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        return super().features(splats, query).clamp(min=0.0)
 
-    def geometry(self, splats: Splats, query: Query) -> Geometry | None:
-        return self.emission.geometry(splats, query)
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        return self.emission.regularisers(splats)
+    def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        if not self.changes:
+            return values
+        return values + self.change(query.rows(splats["feature"]), query.time_s)[:, None].to(values)
 
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        level = self.emission.temperature(splats, time_s)
+        level = super().temperature(splats, time_s)
         if level is None or not self.changes:
             return level
         with torch.no_grad():
-            return level + self.span_k * self.change(splats["feature"], time_s)
-
-    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return self.emission.attributes(splats, query)
-
-    def effects(self) -> dict[str, dict]:
-        return self.emission.effects()
+            return level + self.range.bounds.span_k * self.change(splats["feature"], time_s)
 
     def rate_of(self, name: str) -> tuple[float, float]:
-        if name.startswith("emission."):
-            return self.emission.rate_of(name.removeprefix("emission."))
-        return self.lr_time if name.startswith(ENCODER) else self.lr, self.lr_end
+        return (self.lr_time, self.lr_end) if name.startswith(ENCODER) else super().rate_of(name)
 
     @property
     def cost(self) -> int:
         products = sum(layer.weight.numel() for layer in (self.of_feature, self.hidden, self.head))
-        return self.emission.cost + products
+        return super().cost + products
 
     def change(self, features: Tensor, time_s: float | None) -> Tensor:
         """ΔT in image units of Gaussians with ``features`` [n, F] at a time, [n].
@@ -134,10 +114,7 @@ class TimeMlp(ThermalModel):
         Raises:
             ValueError: there is no time.
         """
-        if time_s is None:
-            raise ValueError("ThermalGS needs the time at which a scene is seen: give time_s")
-        origin, span = self.clock.tolist()
-        when = torch.tensor([[(float(time_s) - origin) / span]], dtype=torch.float64, device=self.clock.device)
+        when = torch.tensor([[self.clock.spans(time_s)]], dtype=torch.float64, device=features.device)
         moment = torch.cat((when, octaves(when, self.time_frequencies)), 1)[0].to(features)
         code = self.code(self.moment(moment).relu())
         hidden = (self.of_feature(features) + self.of_code(code)).relu()

@@ -19,28 +19,28 @@ class ViewDependence(HeatPart):
     Tensor: "view_rest" [N, B - 1, 1], zero at the start.
 
     Args:
-        degree: of the harmonics, 1 to 3.
-        degree_every: steps after which training adds the next degree; 0 trains all from the start.
+        sh_degree: of the harmonics, 1 to 3.
+        sh_degree_interval: steps after which training adds the next degree; 0 trains all from the start.
         lr_rest: learning rate.
 
     Raises:
         ValueError: the degree is not 1 to 3.
     """
 
-    def __init__(self, degree: int = 2, degree_every: int = 1000, lr_rest: float = 1.25e-4) -> None:
+    def __init__(self, sh_degree: int = 2, sh_degree_interval: int = 1000, lr_rest: float = 1.25e-4) -> None:
         super().__init__()
-        self.bands = spherical_harmonics.band_count(degree)
-        if degree == 0:
+        self.bands = spherical_harmonics.band_count(sh_degree)
+        if sh_degree == 0:
             raise ValueError("view dependence of degree 0 is none: give a degree of 1 to 3, or leave the part out")
-        self.degree = self.active_degree = degree
-        self.degree_every, self.lr_rest = degree_every, lr_rest
+        self.sh_degree = self.active_degree = sh_degree
+        self.sh_degree_interval, self.lr_rest = sh_degree_interval, lr_rest
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         return {"view_rest": PerGaussian(seeds.values.new_zeros(len(seeds.means), self.bands - 1, 1), self.lr_rest)}
 
     def on_step(self, step: int) -> None:
-        if self.degree_every > 0:
-            self.active_degree = min(self.degree, step // self.degree_every)
+        if self.sh_degree_interval > 0:
+            self.active_degree = min(self.sh_degree, step // self.sh_degree_interval)
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         if self.active_degree == 0:
@@ -49,8 +49,8 @@ class ViewDependence(HeatPart):
         return values + harmonics(nothing, splats["view_rest"], splats.means, query, self.active_degree)
 
     def effects(self) -> dict[str, dict[str, Any]]:
-        return {"view_dependence": {"degree": self.degree}}
+        return {"view_dependence": {"degree": self.sh_degree}}
 
     @property
     def cost(self) -> int:
-        return {1: 12, 2: 27, 3: 48}[self.degree] + self.bands - 1  # normalising, polynomials and the sum
+        return {1: 12, 2: 27, 3: 48}[self.sh_degree] + self.bands - 1  # normalising, polynomials and the sum

@@ -117,7 +117,7 @@ class SplatTraining(pl.LightningModule):
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
-        self.register_buffer("background", self.composite.carried(torch.cat(behind), self.thermal.modality_channels[0]))
+        self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
             self.double()
 
@@ -168,7 +168,7 @@ class SplatTraining(pl.LightningModule):
 
         def emitted(ids: Tensor) -> Tensor:
             query = _query(frame, ids, moved)
-            return self.composite.carried(self.thermal.features(self.splats, query).features, channels)
+            return self.composite.encode(self.thermal.features(self.splats, query), channels)
 
         output = self.renderer(
             *self._shapes(moved),
@@ -179,7 +179,7 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
         )
-        return replace(output, features=self.composite.shown(output.features, channels))
+        return replace(output, features=self.composite.decode(output.features, channels))
 
     def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are."""
@@ -232,7 +232,7 @@ class SplatTraining(pl.LightningModule):
             optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
         here = self.stages.round_step(step)
-        for name, gone, instead in self.thermal.needless_rows(self.splats, here):
+        for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
@@ -325,7 +325,7 @@ class SplatTraining(pl.LightningModule):
 
 def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = None) -> Query:
     """What is asked of the thermal model for a frame: the Gaussians ``ids``, or all, with the geometry it gave them."""
-    return Query(ids, frame.camera, frame.time_s, frame.environment, frame.frame_id, geometry)
+    return Query(ids, frame.camera, frame.time_s, frame.frame_id, geometry)
 
 
 def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None:

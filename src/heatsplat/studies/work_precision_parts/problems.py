@@ -20,14 +20,13 @@ from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_ex
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import harmonic_response, temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
-from heatsplat.physics.units import STEFAN_BOLTZMANN
+from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 from heatsplat.studies.stability_cases.case import log_uniform, uniform
 from heatsplat.studies.stability_cases.closed_form import CASES
 
 DIGITS = 50
 AMBIENT_K = 290.0
 REFERENCE_K = 288.0
-DAY_S = 86400.0
 SAMPLE_S = 600.0  # between two samples of weather
 WEATHER_S = 2 * DAY_S
 PRINTED = CASES[0].naive  # responses to sin and cos as ETGS prints them

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from heatsplat.effects.noise import noise_of, noise_of_repeats, quantum_of
+from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
 
 def scene_images(frames: int, noise: float, seed: int = 0) -> torch.Tensor:

@@ -14,6 +14,7 @@ _MASK_GAIN = 6.0  # root of the sum of its squares
 _MAD_TO_SIGMA = 1.4826
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
+MIN_NOISE = 1e-6  # image units; what an image without any shows
 _UNIFORM = 1.0 / math.sqrt(12.0)
 
 
@@ -24,7 +25,7 @@ def noise_of(images: Tensor, step: float = 0.0, masks: Tensor | None = None) -> 
 
     **Convention:** never below that of rounding to steps of ``step``; a sensor cannot be judged finer than its files.
     """
-    least = max(_UNIFORM * step, 1e-6)
+    least = max(_UNIFORM * step, MIN_NOISE)
     if min(images.shape[1:]) < 5:
         return least
     whole = torch.ones_like(images, dtype=torch.bool) if masks is None else _whole(masks)

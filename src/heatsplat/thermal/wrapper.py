@@ -1,0 +1,153 @@
+"""The one way to build a thermal model out of others: what it does not change is theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import SceneData
+from heatsplat.splats import Splats
+from heatsplat.thermal.base import Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
+
+
+class Wrapper(ThermalModel):
+    """A thermal model around its members: models and parts that are its attributes, or in a ModuleDict among them.
+
+    Every hook asks all members; a subclass overrides what it changes, calls ``super()`` for the rest, and mostly overrides
+    ``changed`` alone. The first model is the one that is wrapped: its images come first, geometry and temperature are
+    its own. Further models are companions, whose images come after.
+
+    Args:
+        members: name of the attribute -> model or part, or a ModuleDict of them; None leaves it away.
+        needs: metadata that the wrapper needs beside what its members do.
+        own_channels: channels of a thermal image of the wrapper's own, before those of its members.
+    """
+
+    def __init__(
+        self, members: Mapping[str, nn.Module | None], needs: Iterable[str] = (), own_channels: int = 0
+    ) -> None:
+        super().__init__()
+        for name, member in members.items():
+            setattr(self, name, member)
+        self.own_channels = own_channels
+        every, models = self.members.values(), self._models
+        self.needs = frozenset(needs).union(*(member.needs for member in every))
+        self.narrowest_range_k = max(member.narrowest_range_k for member in every)
+        self.shared_opacity = models[0].shared_opacity
+        explained = [(name, count) for model in models for name, count in _images_of(model)]
+        if own_channels:
+            explained.insert(0, ("thermal", own_channels))
+        (self.modality, *companions), self.modality_channels = zip(*explained, strict=True)
+        self.companions = tuple(companions)
+
+    @property
+    def members(self) -> dict[str, Heat]:
+        """Models and parts under the prefixes of their parameters."""
+        found = {}
+        for name, child in self.named_children():
+            inner = (
+                {name: child} if isinstance(child, Heat) else {f"{name}.{key}": m for key, m in child.named_children()}
+            )
+            found |= {prefix: member for prefix, member in inner.items() if isinstance(member, Heat)}
+        return found
+
+    @property
+    def _models(self) -> list[ThermalModel]:
+        return [member for member in self.members.values() if isinstance(member, ThermalModel)]
+
+    def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        """What becomes of the image's values [n, C] of the Gaussians in ``query.ids``; companions stay as they are."""
+        return values
+
+    # What the contract asks -----------------------------------------------------------------------------
+
+    def check(self, scene: SceneData) -> None:
+        for member in self.members.values():
+            member.check(scene)
+        super().check(scene)
+
+    def prepare(self, scene: SceneData) -> None:
+        for member in self.members.values():
+            member.prepare(scene)
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        """Those of all members, each of which sees the seed values of its own images.
+
+        Raises:
+            ValueError: two members have tensors of the same name.
+        """
+        tensors: dict[str, PerGaussian] = {}
+        channel = self.own_channels
+        for member in self.members.values():
+            own = seeds
+            if isinstance(member, ThermalModel):
+                last = channel + sum(member.modality_channels)
+                own, channel = replace(seeds, values=seeds.values[:, channel:last]), last
+            found = member.per_gaussian(own)
+            if twice := ", ".join(sorted(tensors.keys() & found.keys())):
+                raise ValueError(
+                    f"two members of {type(self).__name__} call a tensor {twice}: give one a prefix, such as "
+                    "thermal.companion.prefix=companion_"
+                )
+            tensors |= found
+        return tensors
+
+    def features(self, splats: Splats, query: Query) -> Tensor:
+        image, *others = (model.features(splats, query) for model in self._models)
+        channels = self.modality_channels[0]
+        if image.shape[1] > channels:
+            image, further = image[:, :channels], image[:, channels:]
+            others = [further, *others]
+        image = self.changed(image, splats, query)
+        return torch.cat((image, *others), dim=1) if others else image
+
+    def geometry(self, splats: Splats, query: Query) -> Geometry | None:
+        return self._models[0].geometry(splats, query)
+
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        """That of what is wrapped: what a camera would see without anything in between."""
+        return self._models[0].temperature(splats, time_s)
+
+    def on_step(self, step: int) -> None:
+        for member in self.members.values():
+            member.on_step(step)
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        return _merged(member.regularisers(splats) for member in self.members.values())
+
+    def rows_to_drop(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
+        for member in self.members.values():
+            yield from member.rows_to_drop(splats, step)
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        return _merged(member.attributes(splats, query) for member in self.members.values())
+
+    def prior(self, splats: Splats) -> dict[str, Tensor]:
+        return _merged(member.prior(splats) for member in self.members.values())
+
+    def rate_of(self, name: str) -> tuple[float, float]:
+        """Of the member whose parameter it is, else the wrapper's own."""
+        for prefix, member in self.members.items():
+            if name.startswith(f"{prefix}."):
+                return member.rate_of(name.removeprefix(f"{prefix}."))
+        return super().rate_of(name)
+
+    def effects(self) -> dict[str, dict[str, Any]]:
+        return _merged(member.effects() for member in self.members.values())
+
+    @property
+    def cost(self) -> int:
+        return sum(member.cost for member in self.members.values())
+
+
+def _images_of(model: ThermalModel) -> Iterator[tuple[str, int]]:
+    """Name and channels of the images that a model explains."""
+    return zip((model.modality, *model.companions), model.modality_channels, strict=True)
+
+
+def _merged(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    return {name: value for part in parts for name, value in part.items()}

@@ -1,0 +1,198 @@
+"""Models around models: every hook, rate, penalty and row of the model inside comes out, whatever is around it."""
+
+import importlib
+import pkgutil
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+import heatsplat.thermal
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.splats import Splats
+from heatsplat.thermal.atmospheric_field import AtmosphericField
+from heatsplat.thermal.base import Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.composed import Composed
+from heatsplat.thermal.conduction import Conducting
+from heatsplat.thermal.hexplane import HexPlane
+from heatsplat.thermal.imaging_field import ImagingField
+from heatsplat.thermal.newton_harmonic import NewtonHarmonic
+from heatsplat.thermal.radiative import Radiative
+from heatsplat.thermal.reflection import Reflection
+from heatsplat.thermal.static import Static
+from heatsplat.thermal.time_mlp import TimeMlp
+from heatsplat.thermal.wrapper import Wrapper
+
+COUNT = 12
+CAMERA = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+QUERY = Query(None, CAMERA, 5.0, 1)
+MOVED = Geometry(torch.ones(COUNT, 3), torch.ones(COUNT, 4), torch.ones(COUNT, 3), torch.ones(1, COUNT))
+DROPPED = ("probe", torch.arange(COUNT) < 3, {})
+
+
+class Probe(ThermalModel):
+    """Answers every hook as nothing else does, and remembers what it was told."""
+
+    needs = frozenset({"time", "ambient"})
+    narrowest_range_k = 0.25
+
+    def __init__(self, modality="thermal"):
+        super().__init__()
+        self.modality, self.modality_channels = modality, (3,) if modality == "rgb" else (1,)
+        self.own = nn.Parameter(torch.ones(()))
+        self.told = []
+
+    def check(self, scene):
+        super().check(scene)
+        self.told.append("check")
+
+    def prepare(self, scene):
+        self.told.append("prepare")
+
+    def on_step(self, step):
+        self.told.append(step)
+
+    def per_gaussian(self, seeds):
+        return {"probe": PerGaussian(seeds.values.clone(), 0.77, l2=0.66, lr_end=0.55)}
+
+    def features(self, splats, query):
+        self.told.append("features")
+        return query.rows(splats["probe"])
+
+    def geometry(self, splats, query):
+        return MOVED
+
+    def temperature(self, splats, time_s):
+        return torch.full((COUNT,), 321.0)
+
+    def regularisers(self, splats):
+        return {"probe/term": 0.25 * self.own}
+
+    def rows_to_drop(self, splats, step):
+        yield DROPPED
+
+    def attributes(self, splats, query):
+        return {"probed": query.rows(splats.means)[:, 0]}
+
+    def prior(self, splats):
+        return {"probed": splats.means[:, 1]}
+
+    def rate_of(self, name):
+        return {"own": (0.123, 0.456)}[name]
+
+    def effects(self):
+        return {"probing": {"how": "deep"}}
+
+    @property
+    def cost(self):
+        return 10**9
+
+
+AROUND = {
+    "AtmosphericField": AtmosphericField,
+    "ImagingField": ImagingField,
+    "TimeMlp": TimeMlp,
+    "HexPlane": lambda inner: HexPlane(inner, heads=["radiance"]),
+    "Conducting": lambda inner: Conducting(inner, neighbours=2),
+    "Composed": lambda inner: Composed(inner, {"reflection": Reflection()}),
+    "Composed with a companion": lambda inner: Composed(inner, companion=Static(channels=3, modality="rgb")),
+    "Radiative": Radiative,
+    "two of them": lambda inner: ImagingField(Conducting(inner, neighbours=2)),
+}
+
+
+def make_scene(timed=True):
+    generator = torch.Generator().manual_seed(0)
+    frames = [Frame(f"{i}.png", i, CAMERA, 5.0 * i if timed else None) for i in range(4)]
+    image = torch.full((16, 16, 1), 0.5)
+    views = ViewSet(frames, lambda i: View(frames[i], image, image.expand(-1, -1, 3)))
+    points = torch.randn(30, 3, generator=generator)
+    return SceneData("yard", views, views, views, points, None, ThermalRange(10.0, 30.0), 20.0)
+
+
+@pytest.fixture(params=AROUND)
+def wrapped(request):
+    """A probe in a wrapper, on a scene with splats."""
+    probe = Probe("rgb" if request.param == "Radiative" else "thermal")
+    model, scene = AROUND[request.param](probe), make_scene()
+    model.check(scene)
+    model.prepare(scene)
+    generator = torch.Generator().manual_seed(1)
+    means = torch.randn(COUNT, 3, generator=generator) + torch.tensor([0, 0, 5.0])
+    values = 0.2 + 0.6 * torch.rand(COUNT, sum(model.modality_channels), generator=generator)
+    declared = model.per_gaussian(Seeds(means, values, generator))
+    shapes = {"means": means, "log_scales": torch.zeros(COUNT, 3), "quats": torch.ones(COUNT, 4)}
+    shapes["opacity_logits"] = torch.zeros(COUNT, len(model.opacity_channels))
+    splats = Splats(shapes | {name: item.initial for name, item in declared.items()})
+    return SimpleNamespace(model=model, probe=probe, declared=declared, values=values, splats=splats)
+
+
+def test_all_wrappers_are_tried():
+    for module in pkgutil.iter_modules(heatsplat.thermal.__path__):
+        importlib.import_module(f"heatsplat.thermal.{module.name}")
+
+    def below(kind):
+        return {kind.__name__}.union(*(below(other) for other in kind.__subclasses__()))
+
+    assert below(Wrapper) - {"Wrapper"} == {name for name in AROUND if " " not in name}
+
+
+def test_no_hook_of_a_model_is_left_out():
+    """A new hook of models must come to the wrapper and to the probe, too."""
+    hooks = {name for kind in (Heat, ThermalModel) for name in vars(kind) if not name.startswith("_")}
+    own = {"lr", "lr_end"}  # of the wrapper's own parameters; see rate_of
+    made = {"modality", "companions", "modality_channels", "shared_opacity", "needs", "narrowest_range_k"}
+    hooks -= own | {"opacity_channels"}  # which follows from others
+    assert hooks - made <= vars(Wrapper).keys()
+    assert hooks - made <= vars(Probe).keys()
+    assert made <= vars(Wrapper({"inner": Static()})).keys()
+
+
+def test_what_the_model_inside_answers_comes_out(wrapped):
+    model, probe, splats = wrapped.model, wrapped.probe, wrapped.splats
+    assert model.needs >= probe.needs and model.narrowest_range_k == 0.25
+    assert model.geometry(splats, QUERY) is MOVED
+    assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
+    model.features(splats, QUERY)
+    assert model.regularisers(splats)["probe/term"].grad_fn is not None
+    assert list(model.rows_to_drop(splats, 3)) == [DROPPED]
+    ids = torch.tensor([4, 1])
+    assert torch.equal(model.attributes(splats, Query(ids, CAMERA, 5.0, 1))["probed"], splats.means[ids, 0])
+    assert torch.equal(model.prior(splats)["probed"], splats.means[:, 1])
+    assert model.effects()["probing"] == {"how": "deep"}
+    assert model.cost >= 10**9
+
+
+def test_what_the_model_inside_is_told_comes_in(wrapped):
+    wrapped.model.on_step(17)
+    wrapped.model.features(wrapped.splats, QUERY)
+    assert wrapped.probe.told == ["check", "prepare", 17, "features"]
+
+
+def test_tensors_and_parameters_keep_their_rates_and_penalties(wrapped):
+    item, names = wrapped.declared["probe"], dict(wrapped.model.named_parameters())
+    assert (item.lr, item.l2, item.lr_end) == (0.77, 0.66, 0.55)
+    first = 1 if isinstance(wrapped.model, Radiative) else 0  # colours come after heat
+    assert torch.equal(item.initial, wrapped.values[:, first : first + item.initial.shape[1]])
+    (own,) = (name for name in names if name.endswith(".own"))
+    assert wrapped.model.rate_of(own) == (0.123, 0.456)
+    assert all(len(wrapped.model.rate_of(name)) == 2 for name in names)
+
+
+def test_a_learned_ambient_keeps_its_rate_in_a_field():
+    model = ImagingField(NewtonHarmonic(ambient="learned"))
+    model.prepare(make_scene())
+    assert model.rate_of("emission.ambient") == (1e-3, 0.1)
+    assert model.rate_of("head.weight") == (8e-4, 2e-3)
+
+
+def test_a_scene_that_the_model_inside_cannot_do_with_is_refused(wrapped):
+    with pytest.raises(SceneError, match="Probe needs time"):
+        wrapped.model.check(make_scene(timed=False))
+
+
+def test_two_members_with_a_tensor_of_the_same_name_are_refused():
+    model = Composed(Static(), companion=Static(channels=3, modality="rgb"))
+    with pytest.raises(ValueError, match="call a tensor sh0: give one a prefix"):
+        model.per_gaussian(Seeds(torch.zeros(2, 3), torch.rand(2, 4), torch.Generator()))
