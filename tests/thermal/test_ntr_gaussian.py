@@ -53,7 +53,7 @@ def test_a_steady_balance_integrates_exactly():
         flux = 0.5 * STEFAN_BOLTZMANN * (low + 0.7 * span) ** 4 + EXCHANGE * math.log(2.0) * 0.2 * span
         window = min(1800.0, 2 * HOUR_S)
         expected = low + 0.7 * span - window * flux / (STORAGE * (math.log(2.0) + 0.05))
-        found = model._kelvin(model._units(splats, None, 2 * HOUR_S))
+        found = model.range.kelvin(model._units(splats, None, 2 * HOUR_S))
         assert torch.allclose(found, torch.full_like(found, expected), atol=2e-3)
 
 
