@@ -5,11 +5,11 @@ import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.effects.look import Look
-from heatsplat.physics.noise import noise_of, noise_of_repeats
 from heatsplat.effects.observations import observe
 from heatsplat.effects.physical.conduction import _kept
 from heatsplat.effects.physical.point_spread import evidence as point_spread
 from heatsplat.effects.physical.thermal_opacity import _nearer
+from heatsplat.physics.noise import noise_of, noise_of_repeats
 
 HEIGHT, WIDTH, NOISE = 48, 64, 0.01
 

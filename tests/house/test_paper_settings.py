@@ -51,7 +51,7 @@ PHOTOMETRIC = {
     f"{TERM}.dssim_half": (False, "1 - ssim in train.py"),
 }
 BOTH_IMAGES = {  # ThermalGaussian and 3DGS+IR: a colour and a thermal image, each with 3DGS's loss
-    "thermal.degree": (3, "sh_degree"),
+    "thermal.sh_degree": (3, "sh_degree"),
     "thermal.companions.rgb": (3, "RGB"),
 }
 FROZEN = {key: value for key, value in ADAPTIVE.items() if not key.endswith("stop")}
@@ -65,7 +65,7 @@ PAPERS = {
         "loss.terms.thermal.dssim_weight": (0.2, "3DGS"),
         "loss.terms.rgb.dssim_weight": (0.2, "3DGS"),
         "thermal.shared_opacity": (True, "one opacity"),
-        "thermal.degree_every": (1000, "3DGS: oneupSHdegree"),
+        "thermal.sh_degree_interval": (1000, "3DGS: oneupSHdegree"),
     },
     "bicubic_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
     "lanczos_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
@@ -157,7 +157,7 @@ PAPERS = {
         "thermal.dual_opacity": (True, "section 3.1"),
         "thermal.three_parameter": (True, "section 3.2"),
         "thermal.lr_attributes": (2.5e-3, "section 4.1"),
-        "thermal.color.degree": (3, "3DGS"),
+        "thermal.color.sh_degree": (3, "3DGS"),
         "loss.terms.gradient.weight": (0.5 * 0.05, "lambda_rgb lambda_g"),
         "loss.terms.guided_variation.weight": (0.5 * 0.02, "lambda_ir lambda_s"),
         "loss.terms.physical_prior.weight": (0.5 * 0.01, "lambda_ir lambda_p"),
@@ -269,7 +269,7 @@ DEPARTURES = {  # ours and the published number
         "thermal.applies_to": ("radiance", "harmonics"),
     },
 }
-STEPS = ("start", "stop", "every", "first_steps", "degree_every", "reset_every")
+STEPS = ("start", "stop", "every", "first_steps", "sh_degree_interval", "reset_every")
 SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
 
 
