@@ -98,6 +98,8 @@ def _cache_on_disk(compiled: Any, function: Callable) -> None:
 # at once; and two kernels at once would only share the same cores.
 _ONE_AT_A_TIME = threading.Lock()
 
+_start_pool = functools.cache(_launch_threads)  # once, before code that calls it is loaded
+
 
 def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
@@ -107,7 +109,7 @@ def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
         with _ONE_AT_A_TIME:
-            _launch_threads()  # before code that calls them is loaded; does nothing the second time
+            _start_pool()
             return compiled(*arguments)
 
     call.compiled = compiled
