@@ -42,7 +42,7 @@ ADAPTIVE = {f"density.{key}": value for key, value in GROWTH.items()}
 RECIPE = {f"density.recipe.{key}": value for key, value in GROWTH.items()}
 COLOUR = {  # static emission
     "thermal.lr": (2.5e-3, "feature_lr"),
-    "renderer.blur": (0.3, "compute_cov2D: low-pass filter"),
+    "renderer.eps2d": (0.3, "compute_cov2D: low-pass filter"),
     "renderer.antialiased": (False, "as published"),
     "renderer.far": (1e10, "no far plane"),
 }
@@ -112,7 +112,7 @@ PAPERS = {
         "smoothing.every": (100, "train.py"),
         "smoothing.near": (0.2, "compute_3D_filter"),
         "smoothing.margin": (0.15, "compute_3D_filter"),
-        "renderer.blur": (0.1, "kernel_size"),
+        "renderer.eps2d": (0.1, "kernel_size"),
         "renderer.antialiased": (True, "2D Mip filter"),
     },
     "msmg": GAUSSIANS

@@ -61,7 +61,7 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
     [
         ({"backend": "opengl"}, "renderer.backend 'opengl' is unknown"),
         ({"background": "black"}, "renderer.background must be 'ambient' or a number"),
-        ({"blur": 0.0}, "renderer.blur must be above 0"),
+        ({"eps2d": 0.0}, "renderer.eps2d must be above 0"),
     ],
 )
 def test_wrong_settings_are_refused(options, message):
