@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from heatsplat.kernels import simd
-from heatsplat.kernels.compilation import inline, serial_kernel
+from heatsplat.kernels.compilation import inline, kernel
 
 NAN, INF = np.nan, np.inf
 SPECIAL = np.array([0, -0.0, 1, -1, NAN, INF, -INF, 1e-38, -1e38, 3.7, -3.7, 0.5, 2.5, 1e9, NAN, 7], np.float32)
 PLAIN = np.array([1, 2, -3, 0.25, 5, NAN, 2, -INF, 1e38, 3.7, -3.6, 1, 2, -1e9, 4, NAN], np.float32)
 
 
-@serial_kernel
+@kernel
 def arithmetic(x, y, out):
     a, b = simd.load(x, 0), simd.load(y, 0)
     simd.store_vector(out, 0, simd.minimum(a, b))
@@ -45,7 +45,7 @@ def _both(x):
     return simd.exp2(x), simd.log2(x)
 
 
-@serial_kernel
+@kernel
 def powers(x, out, logarithms):
     for k in range(0, x.shape[0], 16):
         power, logarithm = _both(simd.load(x, k))
@@ -67,7 +67,7 @@ def test_log2_of_opacities():
     assert np.abs(found - np.log2(x.astype(np.float64))).max() < 1e-6
 
 
-@serial_kernel
+@kernel
 def sums(x, out):
     seven = simd.registers(7)
     for k in range(7):
@@ -85,7 +85,7 @@ def test_sums_over_lanes():
     assert (out[7:] == -1).all()  # nothing beyond what was asked for is written
 
 
-@serial_kernel
+@kernel
 def transpose(x, out, rows):
     a, b, c = simd.load_columns(x, 0, 3, rows)
     simd.store_columns(out, 0, (c, a, b), rows)
@@ -101,7 +101,7 @@ def test_columns_are_read_and_written_up_to_the_last_row(rows):
     assert (out[here:] == -1).all()
 
 
-@serial_kernel
+@kernel
 def of_doubles(x, y, out):
     a, b = simd.load(x, 0), simd.load(y, 0)
     simd.store_vector(out, 0, simd.minimum(a, b))
@@ -128,7 +128,7 @@ def test_doubles_keep_all_their_digits():
     assert (moved[7:] == -1).all()
 
 
-@serial_kernel
+@kernel
 def exponentials(x, out):
     simd.store(out, 0, simd.exp(simd.load(x, 0)))
 
@@ -139,7 +139,7 @@ def test_exp_of_floats_ends_at_the_smallest_number():
     np.testing.assert_allclose(found, np.maximum(np.exp(x.astype(np.float64)), 2.0**-126), rtol=8e-6)
 
 
-@serial_kernel
+@kernel
 def words(x):
     return simd.bytes_of(simd.load(x, 0))
 

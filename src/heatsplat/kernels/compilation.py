@@ -1,4 +1,4 @@
-"""How the kernels are compiled: one decorator, one cache rule, and a line of progress while somebody waits for it."""
+"""How the kernels are compiled: one decorator, one cache rule, and one line for whoever waits for it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import hashlib
 import logging
 import pickle
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +98,8 @@ def _cache_on_disk(compiled: Any, function: Callable) -> None:
 # at once; and two kernels at once would only share the same cores.
 _ONE_AT_A_TIME = threading.Lock()
 
+_start_pool = functools.cache(_launch_threads)  # once, before code that calls it is loaded
+
 
 def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
@@ -107,7 +109,7 @@ def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
         with _ONE_AT_A_TIME:
-            _launch_threads()  # before code that calls them is loaded; does nothing the second time
+            _start_pool()
             return compiled(*arguments)
 
     call.compiled = compiled
@@ -162,20 +164,14 @@ def inline(function: Callable) -> Callable:
 
 
 class _Announcer(event.Listener):
-    def __init__(self, message: str) -> None:
-        self.message, self.said = message, False
+    """Says once what the first step waits for; nothing where the cache has every kernel."""
 
-    def on_start(self, _: event.Event) -> None:
-        if not self.said:
-            log.warning(self.message)
-            self.said = True
+    def on_start(self, compiling: event.Event) -> None:
+        if compiling.data["dispatcher"].py_func.__module__.startswith(__package__):
+            _warn_once("compiling kernels for this processor: up to a minute, once")
 
-    def on_end(self, _: event.Event) -> None:
+    def on_end(self, compiling: event.Event) -> None:
         pass
 
 
-@contextmanager
-def announced(message: str) -> Iterator[None]:
-    """A context that logs ``message`` once if anything has to be compiled inside it (not when the cache has it)."""
-    with event.install_listener("numba:compile", _Announcer(message)):
-        yield
+event.register("numba:compile", _Announcer())

@@ -155,10 +155,7 @@ def power(x, reference):
 
 @inline
 def integrate_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
-    """``integrate`` for the Gaussian ``i``; ``final`` is the sample before ``time``.
-
-    On its own, because Numba takes the body of a parallel loop through its passes twice, and this one is long.
-    """
+    """``integrate`` for the Gaussian ``i``; ``final`` is the sample before ``time``."""
     r = math.exp(float(parameters[i, LOG_RATE]))
     p, g, v, f = 0.0, 0.0, 0.0, 1.0
     nx, ny, nz = 0.0, 0.0, 0.0

@@ -162,7 +162,7 @@ def _times_rotation(a, r):
 
 @inline
 def _covariance(eps2d, u, v):
-    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the eps2d."""
+    """a, b, c and the determinant of the blurred screen covariance, and |U x V|^2, the determinant before the blur."""
     normal = _cross(u, v)
     uu, vv = _dot(u, u), _dot(v, v)
     sharp = _dot(normal, normal)

@@ -10,6 +10,15 @@ from numba.extending import intrinsic
 _i64, _address = ir.IntType(64), ir.IntType(8).as_pointer()
 
 
+def _borrowed(context, builder, kind: types.Type, value):
+    """An array without its owner: tasks need not count references to what their caller keeps (measured: 1.8 times as slow)."""
+    if not isinstance(kind, types.Array):
+        return value
+    array = context.make_array(kind)(context, builder, value)
+    array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
+    return array._getvalue()
+
+
 @intrinsic
 def parallel_for(typing_context, task, count, arguments):
     """Calls ``task(k, *arguments)`` for each k below ``count``, an equal share of neighbours on each thread.
@@ -42,14 +51,19 @@ def parallel_for(typing_context, task, count, arguments):
 
         # Called with the first k as an address, how many there are, and the closure: an inner loop of NumPy, as the pool
         # wants it.
-        kind = ir.FunctionType(ir.VoidType(), [_address.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _address])
-        body = ir.Function(builder.module, kind, builder.module.get_unique_name(f"{builder.function.name}.tasks"))
+        loop_type = ir.FunctionType(
+            ir.VoidType(), [_address.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _address]
+        )
+        body = ir.Function(builder.module, loop_type, builder.module.get_unique_name(f"{builder.function.name}.tasks"))
         body.linkage = "internal"
         body.attributes.add("noinline")
         inner = ir.IRBuilder(body.append_basic_block())
         first = inner.ptrtoint(inner.load(body.args[0]), _i64)
         fields = inner.load(inner.bitcast(body.args[3], closure.type))
-        taken = [inner.extract_value(fields, position) for position in range(len(shared))]
+        taken = [
+            _borrowed(context, inner, kind, inner.extract_value(fields, position))
+            for position, kind in enumerate(kinds[1:])
+        ]
         with cgutils.for_range(inner, inner.load(body.args[1])) as loop:
             context.call_internal_no_propagate(
                 inner, compiled.fndesc, task_signature, [inner.add(first, loop.index), *taken]

@@ -18,6 +18,8 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.errors import TypingError
+from numba.core.typing import signature
+from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import (
     intrinsic,
     lower_builtin,
@@ -126,14 +128,13 @@ def _elementwise(emit, result: LaneType | None = None):
 def _define_operator(function, emit: dict[LaneType, object], result: LaneType | None = None, arity: int = 2) -> None:
     """Teaches ``function`` (of the operator module) to take lanes; ``emit`` maps a lane type to builder calls."""
 
-    def resolve(*arguments):
-        lane_type = _lane_type(*arguments)
-        return (result or lane_type) if lane_type in emit else None
+    @infer_global(function)
+    class Typing(AbstractTemplate):
+        metadata = {"target": "cpu"}  # as special as that is asked first, not after lists, dates and text
 
-    if arity == 1:
-        type_callable(function)(lambda context: lambda a: resolve(a))
-    else:
-        type_callable(function)(lambda context: lambda a, b: resolve(a, b))
+        def generic(self, arguments, _):
+            lane_type = _lane_type(*arguments)
+            return signature(result or lane_type, *arguments) if lane_type in emit else None
 
     def generate(context, builder, signature, values):
         lane_type = _lane_type(*signature.args)

@@ -15,7 +15,6 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from heatsplat.kernels import ssim as kernel
-from heatsplat.kernels.compilation import announced
 from heatsplat.losses.compose import LossInputs
 
 WINDOW = 11  # taps of the Gaussian window
@@ -103,8 +102,7 @@ class Photometric:
             raise ValueError(f"mask must be {list(target.shape[:2])} like the images, got {list(mask.shape)}")
         on_cpu = prediction.device.type == "cpu" and prediction.dtype == target.dtype == torch.float32
         if on_cpu and self.dssim_weight > 0.0:
-            with announced("compiling the kernels of the loss; this takes some seconds and happens once"):
-                difference, dissimilarity = _Fused.apply(prediction, target, mask)
+            difference, dissimilarity = _Fused.apply(prediction, target, mask)
             return {"l1": self.l1_weight * difference, "dssim": self.dssim_weight * dissimilarity}
         if mask is not None:
             prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))

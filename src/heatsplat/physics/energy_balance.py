@@ -33,11 +33,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from heatsplat.kernels import heat_balance as kernels
-from heatsplat.kernels.compilation import announced
 from heatsplat.physics.responses import ResponseTable, driver_means, grid_position, interpolate
 from heatsplat.physics.sunlight import SunlightTable
 
-COMPILING = "compiling the kernel of heat balances: some seconds, once"
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 LEAST_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
@@ -213,18 +211,17 @@ class _March(torch.autograd.Function):
         rows = parameters.detach().cpu().contiguous()
         values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
         up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
-        with announced(COMPILING):
-            kernels.integrate(
-                balance,
-                rows.numpy(),
-                drivers.times_s.numpy(),
-                climate.rows.numpy(),
-                up.numpy(),
-                drivers.reference_k,
-                time_s,
-                values.numpy(),
-                slopes.numpy(),
-            )
+        kernels.integrate(
+            balance,
+            rows.numpy(),
+            drivers.times_s.numpy(),
+            climate.rows.numpy(),
+            up.numpy(),
+            drivers.reference_k,
+            time_s,
+            values.numpy(),
+            slopes.numpy(),
+        )
         ctx.save_for_backward(slopes.to(parameters.device))
         return values.to(parameters.device)
 

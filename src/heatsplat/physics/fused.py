@@ -14,14 +14,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from heatsplat.kernels import relaxation as kernels
-from heatsplat.kernels.compilation import announced
 from heatsplat.kernels.simd import LANES
 from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, harmonic_response, relax
 
 SMALLEST_OMEGA = 1e-15  # below it the kernel's a² + ω² could vanish in float32
 CACHE_LINE = 64  # bytes; rows of gains are read by whole lines
 NUMPY_TYPES = {torch.float32: np.float32, torch.float64: np.float64}
-COMPILING = "compiling the kernels of heat: some seconds, once"
 
 
 def visible_temperature(
@@ -148,7 +146,7 @@ class _VisibleTemperature(torch.autograd.Function):
         ctx.table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), kind)
         ctx.numbers = kind(ambient.item()), kind(seconds), kind(limit)
         values = rate.new_empty(ids.shape[0])
-        with announced(COMPILING), kernels.threads_for(ids.shape[0]):
+        with kernels.threads_for(ids.shape[0]):
             kernels.fill_table(omega.numpy()[:frequencies], seconds, ctx.table)
             kernels.forward(*_kernel_arguments(ctx, tensors), values.numpy())
         return values
@@ -162,7 +160,7 @@ class _VisibleTemperature(torch.autograd.Function):
         v_gains = _gain_gradients[rate.dtype].take(gains.shape)
         v_ambient = rate.new_empty(-(-ids.shape[0] // kernels.BLOCK))
         outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
-        with announced(COMPILING), kernels.threads_for(ids.shape[0]):
+        with kernels.threads_for(ids.shape[0]):
             rows = ids
             if places.shape[0] > 0 and ids.shape[0] < rate.shape[0]:
                 rows = places[ids]

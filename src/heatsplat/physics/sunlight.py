@@ -20,10 +20,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from heatsplat.kernels import heat_balance as kernels
-from heatsplat.kernels.compilation import announced
 from heatsplat.physics.responses import cubics, driver_means, grid_position, interval_of, log_rate_grid, step_weights
 
-COMPILING = "compiling the kernels of sunlight: some seconds, once"
 ANCHOR_S = 12 * 3600.0  # between two tables of what came before
 YOUNGEST_S = 12 * 3600.0  # age of the table that is used, at least (6 hours double its error)
 HEIGHTS, AZIMUTHS = 91, 181  # of the grid of normals: 2 degrees (3 double the error); 3 MB for each table
@@ -130,15 +128,14 @@ class _Recent(torch.autograd.Function):
         on_cpu = normals.detach().cpu().contiguous(), log_rates.detach().cpu().contiguous()
         responses, slopes = (torch.empty(len(log_rates), dtype=log_rates.dtype) for _ in range(2))
         vectors = torch.empty(len(log_rates), 3, dtype=normals.dtype)
-        with announced(COMPILING):
-            kernels.recent_sunlight(
-                on_cpu[0].numpy(),
-                on_cpu[1].numpy(),
-                steps.numpy(),
-                beams.numpy(),
-                share,
-                *(x.numpy() for x in (responses, slopes, vectors)),
-            )
+        kernels.recent_sunlight(
+            on_cpu[0].numpy(),
+            on_cpu[1].numpy(),
+            steps.numpy(),
+            beams.numpy(),
+            share,
+            *(x.numpy() for x in (responses, slopes, vectors)),
+        )
         device = log_rates.device
         ctx.save_for_backward(slopes.to(device), vectors.to(device))
         return responses.to(device)

@@ -16,7 +16,6 @@ from torch.autograd.function import once_differentiable
 from heatsplat.contracts import RenderOutput
 from heatsplat.kernels import binning, compositing, projection
 from heatsplat.kernels.buffers import Buffers
-from heatsplat.kernels.compilation import announced
 from heatsplat.kernels.constants import BLOCKS, CHUNK, RANK, SCREEN, SUMS, TILE
 from heatsplat.kernels.layout import Layout
 from heatsplat.kernels.scheduling import thread_count
@@ -39,18 +38,16 @@ def render(inputs: RenderInputs) -> RenderOutput:
     for name in ("means", "quats", "scales", "opacities"):
         _check(name, getattr(inputs, name))
     frame = _Frame(inputs)
-    with announced("compiling the CPU renderer, once, about 10 s ..."):
-        ids = frame.project()
+    ids = frame.project()
     features = inputs.features(ids) if callable(inputs.features) else inputs.features
     channels = channel_counts(inputs, features, len(ids) if callable(inputs.features) else frame.count)
     background = features.new_zeros(features.shape[1]) if inputs.background is None else inputs.background
     _check("features", features)
     _check("background", background)
-    with announced(f"compiling the CPU renderer for {features.shape[1]} channels, once, about 10 s ..."):
-        image, alpha, depth = _Rasterize.apply(
-            frame, channels, ids, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
-            inputs.viewmat, frame.means2d,
-        )  # fmt: skip
+    image, alpha, depth = _Rasterize.apply(
+        frame, channels, ids, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
+        inputs.viewmat, frame.means2d,
+    )  # fmt: skip
     meta = {"means2d": frame.means2d, "radii": frame.radii, "visible_ids": ids}
     return RenderOutput(image, alpha, depth, meta)
 

@@ -8,10 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.kernels import spherical_harmonics as kernel
-from heatsplat.kernels.compilation import announced
 from heatsplat.thermal.base import Query
-
-_COMPILING = "compiling the kernels of spherical harmonics; this takes some seconds and happens once"
 
 
 def harmonics(constant: Tensor, rest: Tensor | None, means: Tensor, query: Query, degree: int) -> Tensor:
@@ -46,8 +43,7 @@ class _Fused(torch.autograd.Function):
         ids = torch.arange(len(means)) if ids is None else ids
         values = constant.new_empty(len(ids), constant.shape[2])
         arrays = [tensor.detach().contiguous().numpy() for tensor in (constant, rest, means, center, ids)]
-        with announced(_COMPILING):
-            kernel.forward(*arrays, degree, values.numpy())
+        kernel.forward(*arrays, degree, values.numpy())
         ctx.inputs = *arrays[1:], degree
         return values
 
@@ -58,6 +54,5 @@ class _Fused(torch.autograd.Function):
         allocate = torch.empty if len(ids) == len(means) else torch.zeros  # rows out of view get no gradient
         v_constant = allocate(len(means), 1, v_values.shape[1])
         gradients = v_constant, allocate(rest.shape), allocate(means.shape)
-        with announced(_COMPILING):
-            kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
+        kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
         return *gradients, None, None, None
