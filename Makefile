@@ -13,7 +13,7 @@ EXTRAS      := dev$(if $(CUDA),$(comma)gsplat)
 comma       := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow lint format bench stability tensorboard clean
+.PHONY: help install demo test test-slow wheel-test docs lint format bench stability tensorboard clean
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,13 @@ test: $(READY)  ## run the tests, side by side on up to four cores (a file's tes
 
 test-slow: $(READY)  ## run the tests that take minutes
 	@$(RUN) -m pytest -m slow $(ARGS)
+
+wheel-test: $(READY)  ## build the wheel, and train from it in an environment of its own
+	@UV_FIND_LINKS="$(PIP_FIND_LINKS)" TORCH_BUILD="$(TORCH_BUILD)" .ci/wheel
+
+docs: $(READY)  ## build the documentation, with a reference of every module, as a site in build/site
+	@UV_FIND_LINKS="$(PIP_FIND_LINKS)" $(RUN) -m uv pip install -q --python $(RUN) $(TORCH_BUILD) -c constraints/torch.txt -r pyproject.toml --extra docs
+	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build -q && echo "site: build/site/index.html"
 
 lint: $(READY)  ## check style and formatting
 	@$(RUN) -m ruff check . && $(RUN) -m ruff format --check .

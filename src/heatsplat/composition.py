@@ -91,6 +91,7 @@ def _cores_by(jobs: int) -> int | None:
     return _cores_of(max(1, cores() // (cores() if jobs == -1 else jobs)))
 
 
+OmegaConf.register_new_resolver("checkout", lambda path: CHECKOUT and str(CHECKOUT / path), replace=True)
 OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)

@@ -53,7 +53,7 @@ class Trained:
 
 def run(
     output_dir: Path | str,
-    train: str,
+    train: str | None,
     scenes: Sequence[str],
     steps: Sequence[int],
     caps: Sequence[int | None],
@@ -69,7 +69,7 @@ def run(
 
     Args:
         output_dir: of the study; runs that have results there are not run again.
-        train: path of train.py.
+        train: path of train.py; None: the installed heatsplat-train.
         scenes: "method/scene" of synthetic scenes, such as "etgs/heated".
         steps: lengths of a run.
         caps: most Gaussians; None is the method's own cap.

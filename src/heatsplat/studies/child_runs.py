@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -14,15 +15,16 @@ from heatsplat.studies.recorded import OVERRIDES, overrides_of
 
 log = logging.getLogger("heatsplat")
 
+INSTALLED = "from heatsplat.cli import train; train()"  # what heatsplat-train does
 WHERE_IT_RUNS = ("threads", "budget_curves")  # overrides of which a run's results do not tell
 
 
-def trained(place: Path, train: str, overrides: Sequence[str], study: Path) -> RunResults:
+def trained(place: Path, train: str | None, overrides: Sequence[str], study: Path) -> RunResults:
     """The results of the run in ``place``, which is trained unless it has some.
 
     Args:
         place: folder of the run.
-        train: path of train.py.
+        train: path of train.py; None: the installed heatsplat-train.
         overrides: what its command line says beside that folder.
         study: folder of the study, which goes on where it was stopped.
 
@@ -33,14 +35,15 @@ def trained(place: Path, train: str, overrides: Sequence[str], study: Path) -> R
         _refuse_others(place, overrides)
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
-    command = [sys.executable, train, *overrides, f"hydra.run.dir={place}"]
+    program = [train] if train else ["-c", INSTALLED]
+    command = [sys.executable, *program, *overrides, f"hydra.run.dir={place}"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         failed = place / FAILED
         raise SceneError(
             f"a run of the study failed; {failed if failed.exists() else 'its output'} says why. When that is mended, the "
             f"same command with hydra.run.dir={study} goes on with what is left.\nFolder of the run: {place}\n"
-            f"Command: {' '.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
+            f"Command: {shlex.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
         )
     return RunResults.read(place / METRICS_FILE)
 

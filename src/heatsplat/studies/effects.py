@@ -64,7 +64,7 @@ class Row:
 
 def run(
     output_dir: Path | str,
-    train: str,
+    train: str | None,
     presets: Mapping[str, Sequence[str]],
     selections: Sequence[str],
     leave_one_out: bool,
@@ -78,7 +78,7 @@ def run(
 
     Args:
         output_dir: of the study; runs that have results there are not run again.
-        train: path of train.py.
+        train: path of train.py; None: the installed heatsplat-train.
         presets: synthetic scene -> the effects that are truly there.
         selections: some of "auto", "none", "all", "oracle".
         leave_one_out: whether chosen effects are left out in turn.

@@ -116,7 +116,7 @@ def run(
     seeds: Sequence[int] = (0,),
     knobs: Mapping[str, Sequence[Any]] | None = None,
     overrides: Sequence[str] = (),
-    train: str = "src/train.py",
+    train: str | None = None,
     outputs: str = "outputs",
 ) -> list[Recipe]:
     """The recipes found; writes frontier.md, .csv, .png, .svg and .html, and the picture to TensorBoard.
@@ -131,7 +131,7 @@ def run(
         scenes, seeds: on which they train.
         knobs: override -> its values, of all methods.
         overrides: of all these runs.
-        train: path of train.py.
+        train: path of train.py; None: the installed heatsplat-train.
         outputs: where runs lie.
 
     Raises:

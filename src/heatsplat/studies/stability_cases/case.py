@@ -88,7 +88,7 @@ def truths(case: Case, inputs: dict[str, Tensor]) -> tuple[list[Sequence], list[
 
 
 def evaluated(case: Case, form: Forms, inputs: dict[str, Tensor], dtype: torch.dtype, constants: Sequence[str]):
-    """Outputs of a form and their slopes by ``case.by``, both [n][outputs] as lists of numbers; slopes may be None."""
+    """Outputs of a form and their slopes by ``case.by``, both lists of numbers, [n, outputs]; slopes may be None."""
     given = {name: x.clone() if name in constants else x.to(dtype) for name, x in inputs.items()}
     if case.by is not None:
         given[case.by].requires_grad_()
