@@ -7,9 +7,8 @@ stand in ``DEPARTURES``: whoever changes one has to say so here.
 
 import pytest
 from helpers import ALL_METHODS
-from running import compose_run
 
-from heatsplat import cli
+from heatsplat.composition import compose
 
 TERM = "loss.terms.photometric"
 SUPIRGS_HF = "loss.terms.high_frequency"
@@ -42,7 +41,7 @@ ADAPTIVE = {f"density.{key}": value for key, value in GROWTH.items()}
 RECIPE = {f"density.recipe.{key}": value for key, value in GROWTH.items()}
 COLOUR = {  # static emission
     "thermal.lr": (2.5e-3, "feature_lr"),
-    "renderer.blur": (0.3, "compute_cov2D: low-pass filter"),
+    "renderer.eps2d": (0.3, "compute_cov2D: low-pass filter"),
     "renderer.antialiased": (False, "as published"),
     "renderer.far": (1e10, "no far plane"),
 }
@@ -112,7 +111,7 @@ PAPERS = {
         "smoothing.every": (100, "train.py"),
         "smoothing.near": (0.2, "compute_3D_filter"),
         "smoothing.margin": (0.15, "compute_3D_filter"),
-        "renderer.blur": (0.1, "kernel_size"),
+        "renderer.eps2d": (0.1, "kernel_size"),
         "renderer.antialiased": (True, "2D Mip filter"),
     },
     "msmg": GAUSSIANS
@@ -274,13 +273,13 @@ SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
 
 
 @pytest.fixture(scope="module")
-def composed(tmp_path_factory):
+def composed():
     """method -> its configuration, each composed when it is asked for first."""
-    known, folder = {}, tmp_path_factory.mktemp("composed")
+    known = {}
 
     def of(method):
         if method not in known:
-            known[method] = cli.resolved(compose_run(folder, f"method={method}"))
+            known[method] = compose([f"method={method}"])
         return known[method]
 
     return of

@@ -48,7 +48,7 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
         return RenderOutput(torch.zeros(8, 8, 1), torch.zeros(1, 8, 8), None, {})
 
     monkeypatch.setattr(settings, "rasterization", rasterization)
-    own = {"backend": "reference", "antialiased": True, "near": 0.3, "far": 40.0, "blur": 0.17}
+    own = {"backend": "reference", "antialiased": True, "near": 0.3, "far": 40.0, "eps2d": 0.17}
     rows = torch.zeros(3, 3), torch.ones(3, 4), torch.ones(3, 3), torch.zeros(1, 3), torch.ones(3, 1)
     renderer = Renderer(**own)
     renderer(*rows, SCENE.train.frames[0].camera, torch.tensor([0.3]), (1,), absgrad=True, depth=True)
@@ -61,7 +61,7 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
     [
         ({"backend": "opengl"}, "renderer.backend 'opengl' is unknown"),
         ({"background": "black"}, "renderer.background must be 'ambient' or a number"),
-        ({"blur": 0.0}, "renderer.blur must be above 0"),
+        ({"eps2d": 0.0}, "renderer.eps2d must be above 0"),
     ],
 )
 def test_wrong_settings_are_refused(options, message):
