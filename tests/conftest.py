@@ -10,13 +10,14 @@ WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores() // int(WORKERS))))
 
+RUNS = {"benchmarks", "callbacks", "effects", "house", "losses", "studies", "training"}  # folders with tests that train
 FILMED = {}  # settings of a recording -> the scene, which nobody changes
 
 
 @pytest.fixture(scope="module", autouse=True)
 def filmed_once(request):
     """Runs on the same recording share it: filming takes half of a tiny run. Tests of filming itself film."""
-    if "datamodules" in request.path.parts[:-1]:
+    if request.path.parent.name not in RUNS:
         yield
         return
     from heatsplat.datamodules.synthetic import Synthetic

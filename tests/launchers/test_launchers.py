@@ -108,6 +108,7 @@ def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path
     assert started == [0, 1] and [job.status for job in returned] == [JobStatus.FAILED] * 2
 
 
+@pytest.mark.slow  # processes of their own load torch five times over; shares and going on: test_stop_and_go_on.py
 @pytest.mark.skipif(find_spec("joblib") is None, reason="joblib is not installed: pip install -e '.[sweep]'")
 def test_jobs_side_by_side_share_the_cores_and_survive_a_killed_process(tmp_path, alone):
     folder = tmp_path / "sweep"

@@ -10,8 +10,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.runs.stepping import Stepper
 
 FOUND_OUT = {"auto"}  # its parts depend on the scene
-SAME_MODULE = {"bicubic_3dgs", "lanczos_3dgs", "direct_3dgs"}  # as 3dgs, on other images
-METHODS = sorted(set(ALL_METHODS) - FOUND_OUT - SAME_MODULE)
+METHODS = sorted(set(ALL_METHODS) - FOUND_OUT)
 SHORT = (*TINY, "max_steps=4", "density=fixed", "trainer.val_check_interval=4", "trainer.limit_val_batches=1")
 
 

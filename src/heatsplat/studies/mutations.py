@@ -18,10 +18,13 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 log = logging.getLogger("heatsplat")
 
 ROOT = Path(__file__).resolve().parents[3]
 LIBRARIES = ("hypothesis", "mpmath", "pytest", "scipy.spatial", "torch")  # that mutants need and none changes
+FAULTS = ROOT / "tests" / "faults.yaml"  # one-line faults in all parts
 SURVIVED = "**no test noticed**"
 HEAD = """# What the tests would notice
 
@@ -55,7 +58,8 @@ class Mutation:
     @property
     def path(self) -> Path:
         """The file of the module."""
-        return ROOT / "src" / "heatsplat" / Path(*self.module.split(".")).with_suffix(".py")
+        package = ROOT if self.module.startswith("datamodules.") else ROOT / "src" / "heatsplat"
+        return package / Path(*self.module.split(".")).with_suffix(".py")
 
     def source(self) -> str:
         """The mutated source. Raises ValueError when there is not exactly one place to change."""
@@ -199,6 +203,7 @@ MUTATIONS = (
         "        demand_finite(_parameters(module), trainer.global_step)\n        for optimizer", "        for optimizer",
         "tests/callbacks/test_finite_guard.py -k checkpoint",
     ),
+    *(Mutation(**fault) for fault in yaml.safe_load(FAULTS.read_text(encoding="utf-8"))),
 )  # fmt: skip
 
 
