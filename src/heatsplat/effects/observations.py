@@ -7,7 +7,7 @@ size at which all evidence takes a few seconds, and held in float64.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ class Tracks:
         return Tracks(**{name: value if value is None else value[keep] for name, value in self.__dict__.items()})
 
 
-@dataclass
+@dataclass(frozen=True)
 class Observations:
     """What a scene's training views show, for the evidence of all effects.
 
@@ -73,7 +73,6 @@ class Observations:
         still: whether all frames were taken from one place; tracks are then pixels.
         tracks: of scene points, or None where there are none (``why``).
         why: why there are no tracks.
-        found: what evidence works out once for several effects, by name.
     """
 
     scene: SceneData
@@ -84,7 +83,6 @@ class Observations:
     still: bool
     tracks: Tracks | None
     why: str = ""
-    found: dict[str, object] = field(default_factory=dict)
 
     @property
     def unit_k(self) -> float | None:

@@ -23,17 +23,39 @@ log = logging.getLogger("heatsplat")
 
 HEAD = """# Effects: what a scene may call for, and how that is told
 
-This page is generated: `python src/study.py study=evidence`. An effect is simulated where its evidence exceeds its
-threshold; evidence is a statistic on the training images that stays below it under the null hypothesis. Effects that
-look alike one by one are told apart by one joint fit of all of them to tracks of scene points (`effects/evidence/joint.py`):
-each has to lower a Bayesian information criterion in the presence of the others. Where metadata is missing an effect is
-off, and the reason says so.
+This page is generated: `python src/study.py study=evidence`.
 
-`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing;
-`effects.<name>=on|off|auto` overrules either, and what is set by hand (`effects.parts.attenuation.moments=8`) wins over what the
-evidence would start from. The papers' systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the effects
-that they simulate, whatever the scene. That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera; where a
-paper has a network, the catalogue has a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
+An effect is simulated where its evidence exceeds its threshold. Evidence is a statistic on the training images that stays
+below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint fit of all of
+them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion in the
+presence of the others. Where metadata is missing an effect is off, and the reason says so.
+
+`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing.
+`effects.<name>=on|off|auto` overrules any of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what
+the evidence would start from. The papers' systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the
+effects that they simulate, whatever the scene. That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera;
+where a paper has a network, the catalogue has a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its
+source.
+
+## Add an effect
+
+1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it there and puts it in the order in
+   which heat meets effects: by `stage`, then by `place`.
+2. Give it its entry in `conf/effects/shared`: a line in `wishes.yaml`, and the settings of its part in `parts.yaml`, unless
+   another effect has that part already.
+
+Nothing else changes. The file says:
+
+- what it is: `summary`, `source`, `adds`, and `needs`, the metadata without which it is off;
+- its `evidence`, a function of a `Look` at the scene (`look.obs`: images and tracks; `look.joint`: the joint fit and what it
+  selected), its `null` hypothesis and its `threshold`, with a comment where the number comes from;
+- its `term` in the joint fit, if tracks can show it: `Own` numbers of each point, `Shared` numbers of all points, or a `Path`
+  that lets a share of the heat arrive (`effects/joint/terms.py`), with the rules that it has to meet beside its threshold;
+- its `part`: the slot of the recipe, the settings, and what is set when it is off while another effect needs the part;
+- what it `stands_on`, and which effects it `displaces`.
+
+`effects/physical/tone.py` is a short one to start from, `tests/effects/test_new_effect.py` adds one. The part itself is a class
+in `thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` asks for a case of each effect: off, nothing of it is left.
 """
 COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
 

@@ -17,9 +17,8 @@ from collections.abc import Collection
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 
-BESIDE_WEATHER = (
-    0.2  # share of the changes, of any effect, where a weather record, whose answers are rough, explains them
-)
+# Share of the changes that any effect must exceed where a weather record, whose answers are rough, explains them.
+BESIDE_WEATHER = 0.2
 MAX_STEPS = 12
 
 
