@@ -28,9 +28,8 @@ class Progress(pl.Callback):
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if not self.enabled:
             return
-        total = trainer.max_steps if trainer.max_steps > 0 else None
         self._bar = tqdm(
-            total=total,
+            total=module.schedule.end,
             initial=trainer.global_step,
             desc=module.scene.name,
             unit="step",
@@ -51,6 +50,7 @@ class Progress(pl.Callback):
         if now < self._next:
             return
         self._next = now + self._period
+        self._bar.total = module.schedule.end  # which may move
         self._bar.set_postfix_str(f"loss {outputs['loss'].item():.4f}, {len(module.splats):,} Gaussians", refresh=False)
         self._bar.update(trainer.global_step - self._bar.n)
 
