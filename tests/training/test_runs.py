@@ -141,3 +141,27 @@ def test_no_validation_measures_opacities_that_were_just_reset(tmp_path):
     )
     steps = [int(line.split(",")[0]) for line in (tmp_path / "curve.csv").read_text().splitlines()[1:]]
     assert trainer.global_step == 80 and steps == [14, 28, 42, 56, 70, 80]
+
+
+def test_a_run_whose_end_moved_ends_there_and_resumes_bit_for_bit(tmp_path, monkeypatch):
+    from heatsplat.training.module import SplatTraining
+
+    after_step = SplatTraining.on_train_batch_end
+
+    def moving(self, *rest):
+        if self.global_step == 20:
+            self.schedule.end_at(20, 33.4)
+        after_step(self, *rest)
+
+    monkeypatch.setattr(SplatTraining, "on_train_batch_end", moving)
+    overrides = (*SHORT, "method=3dgs", "test=false", "callbacks.checkpoint.every_n_train_steps=24")
+    whole, trainer = run(tmp_path / "whole", *overrides)
+    half = tmp_path / "whole" / "checkpoints" / "step_000024.ckpt"
+    resumed, again = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
+    assert trainer.global_step == again.global_step == 33
+    whole, resumed = state_of(whole, trainer), state_of(resumed, again)
+    assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
+    rates = [{group["name"]: group["lr"] for group in one.optimizers[0].param_groups} for one in (trainer, again)]
+    assert rates[0] == rates[1] and rates[0]["means"] == pytest.approx(
+        0.01 * 1.6e-4 * again.lightning_module.scene.extent, rel=0.2
+    )
