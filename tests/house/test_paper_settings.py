@@ -7,9 +7,8 @@ stand in ``DEPARTURES``: whoever changes one has to say so here.
 
 import pytest
 from helpers import ALL_METHODS
-from running import compose_run
 
-from heatsplat import cli
+from heatsplat.composition import compose
 
 TERM = "loss.terms.photometric"
 SUPIRGS_HF = "loss.terms.high_frequency"
@@ -273,13 +272,13 @@ SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
 
 
 @pytest.fixture(scope="module")
-def composed(tmp_path_factory):
+def composed():
     """method -> its configuration, each composed when it is asked for first."""
-    known, folder = {}, tmp_path_factory.mktemp("composed")
+    known = {}
 
     def of(method):
         if method not in known:
-            known[method] = cli.resolved(compose_run(folder, f"method={method}"))
+            known[method] = compose([f"method={method}"])
         return known[method]
 
     return of
