@@ -103,9 +103,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         _ = self.scene
 
     def train_dataloader(self) -> DataLoader:
-        """One view per step, from the current step of the trainer to its last."""
-        start, steps = (self.trainer.global_step, self.trainer.max_steps) if self.trainer else (0, None)
-        sampler = StepSampler(len(self.scene.train), self.seed, start_step=start, steps=steps)
+        """One view per step, from the current step of the trainer on, without end."""
+        sampler = StepSampler(len(self.scene.train), self.seed, self.trainer.global_step if self.trainer else 0)
         return DataLoader(self.scene.train, sampler=sampler, batch_size=None, num_workers=0)
 
     def val_dataloader(self) -> DataLoader:

@@ -13,6 +13,7 @@ from heatsplat.io.results import RunResults
 from heatsplat.sensors.base import SensorChain
 from heatsplat.splats import Splats
 from heatsplat.training.rng import generator_for
+from heatsplat.training.schedule import Schedule
 
 RANGE = ThermalRange(10.0, 50.0)
 HEIGHT, WIDTH = 40, 56
@@ -95,6 +96,7 @@ class FakeModule(pl.LightningModule):
         self.modality = "thermal" if scene.train[0].thermal is not None else "rgb"
         self.channels = scene.train[0].image(self.modality).shape[-1]
         self.results, self.density_change = RunResults(), None
+        self.schedule = Schedule(8)
         self.value = torch.nn.Parameter(torch.tensor(0.9))
         self.poison = poison or {}
         self.calls = 0

@@ -118,7 +118,7 @@ def scores(tmp_path_factory):
         "method=ravigs",
         "data.scene=glass",
         "max_steps=600",
-        "density.recipe.cap_max=2000",
+        "density.cap_max=2000",
         "trainer.val_check_interval=600",
         "callbacks.attributes=null",
         "test=false",

@@ -33,19 +33,19 @@ def refine(policy: Adaptive, cloud: Cloud, step: int):
     return policy.refine(cloud, step, extent=1.0, generator=torch.Generator().manual_seed(0))
 
 
-def test_small_are_cloned_large_are_split():
+def test_small_are_duplicated_large_are_split():
     policy = Adaptive(start=0, stop=100, every=10)
     cloud = make_cloud(policy, [0.005, 0.05, 0.05], [0.5, 0.5, 0.5])
     pull(cloud, [1e-3, 1e-3, 1e-5])
     change = refine(policy, cloud, 9)
     assert (change.added, change.removed, len(cloud)) == (2, 0, 5)
     scales = cloud.splats.scales[:, 0].tolist()
-    assert scales.count(pytest.approx(0.005)) == 2  # the clone and its origin
+    assert scales.count(pytest.approx(0.005)) == 2  # the duplicate and its origin
     assert scales.count(pytest.approx(0.05 / 1.6)) == 2  # two halves, their parent gone
     assert scales.count(pytest.approx(0.05)) == 1  # the one that did not pull
 
 
-def test_transparent_are_removed_and_too_large_after_the_first_reset():
+def test_transparent_are_pruned_and_too_large_after_the_first_reset():
     policy = Adaptive(start=0, stop=1000, every=10, reset_every=100)
     cloud = make_cloud(policy, [0.01, 0.01, 0.5], [0.5, 0.001, 0.5])
     assert refine(policy, cloud, 9).removed == 1
@@ -81,6 +81,13 @@ def test_opacity_reset_happens_on_time_and_not_after_stop():
     assert refine(policy, cloud, 299) is None
 
 
+def test_opacities_settle_ten_refinements_after_a_reset():
+    policy = Adaptive(start=0, stop=250, every=5, reset_every=100)
+    settled = [step + 1 for step in range(400) if not policy.settled(step)]
+    assert settled == [*range(100, 150), *range(200, 250)]
+    assert Adaptive(reset_every=None).settled(2999) and Fixed().settled(2999)
+
+
 def test_without_resets_opacities_and_large_gaussians_stay():
     policy = Adaptive(start=0, stop=1000, every=10, reset_every=None)
     cloud = make_cloud(policy, [0.01, 5.0], [0.9, 0.9])
@@ -103,7 +110,7 @@ def test_nothing_before_start_between_refinements_or_after_stop():
 def test_an_empty_cloud_is_an_error_that_says_why():
     policy = Adaptive(start=0, stop=100, every=10)
     cloud = make_cloud(policy, [0.01] * 2, [0.001] * 2)
-    with pytest.raises(RuntimeError, match="remove all 2 Gaussians at step 9"):
+    with pytest.raises(RuntimeError, match="prune all 2 Gaussians at step 9"):
         refine(policy, cloud, 9)
     assert len(cloud) == 2
 

@@ -1,4 +1,4 @@
-"""Co-support pruning: every modality has to see a Gaussian; the recipe beneath works as ever; both bands pull."""
+"""Co-support pruning: every modality has to see a Gaussian; all else is adaptive; both bands pull."""
 
 import pytest
 import torch
@@ -6,14 +6,13 @@ import torch
 from heatsplat.contracts import Camera
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.co_support import CoSupport
-from heatsplat.density.fixed import Fixed
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.settings import Renderer
 from heatsplat.splats import Splats
 
 
-def recipe(**options):
-    return Adaptive(**{"start": 0, "stop": 100, "every": 10, "reset_every": 1000} | options)
+def control(kind=CoSupport, **options):
+    return kind(**{"start": 0, "stop": 100, "every": 10, "reset_every": 1000} | options)
 
 
 def make_cloud(policy, opacities):
@@ -44,7 +43,7 @@ BANDS = [[0.5, 0.5], [0.004, 0.5], [0.5, 0.004], [0.006, 0.006], [0.001, 0.001]]
 
 
 def test_a_gaussian_stays_that_every_modality_sees():
-    policy = CoSupport(recipe(prune_scale=100.0), prune_opacity=0.005)
+    policy = control(prune_scale=100.0)
     cloud = make_cloud(policy, BANDS)
     change = refine(policy, cloud)
     assert (change.added, change.removed, len(cloud)) == (0, 3, 2)
@@ -53,16 +52,16 @@ def test_a_gaussian_stays_that_every_modality_sees():
     assert moments == pytest.approx([0.0, 0.3])  # rows and moments go together
 
 
-def test_the_recipe_alone_asks_for_one_modality():
-    policy = recipe()
+def test_adaptive_asks_for_one_modality():
+    policy = control(Adaptive)
     cloud = make_cloud(policy, BANDS)
     assert refine(policy, cloud).removed == 1
     assert cloud.splats["emissivity"].flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
-def test_it_is_the_recipe_where_all_are_seen():
+def test_it_is_adaptive_where_all_are_seen():
     results = []
-    for policy in (recipe(), CoSupport(recipe())):
+    for policy in (control(Adaptive), control()):
         cloud = make_cloud(policy, [[0.5, 0.3], [0.4, 0.2], [0.9, 0.9]])
         cloud.state["gradient"], cloud.state["seen"] = torch.tensor([1e-3, 0.0, 1e-3]), torch.ones(3)
         changes = [refine(policy, cloud, step) for step in (5, 9)]
@@ -72,16 +71,13 @@ def test_it_is_the_recipe_where_all_are_seen():
 
 
 def test_nothing_happens_between_refinements():
-    policy = CoSupport(recipe())
+    policy = control()
     cloud = make_cloud(policy, BANDS)
     assert refine(policy, cloud, 5) is None and len(cloud) == 5
-    still = CoSupport(Fixed())
-    assert still.initial_state(5, torch.device("cpu")) == {}
-    assert refine(still, make_cloud(still, BANDS), 9) is None
 
 
 def test_a_reset_prunes_none_that_it_lowered():
-    policy = CoSupport(recipe(reset_every=10, reset_opacity=0.01))
+    policy = control(reset_every=10, reset_opacity=0.01)
     cloud = make_cloud(policy, [[0.5, 0.5], [0.9, 0.02]])
     change = refine(policy, cloud, 9)
     assert change.opacity_reset and len(cloud) == 2
@@ -89,10 +85,8 @@ def test_a_reset_prunes_none_that_it_lowered():
 
 
 def test_an_empty_cloud_is_an_error_that_says_why():
-    policy = CoSupport(recipe())
-    with pytest.raises(
-        RuntimeError, match="would remove all 2 Gaussians at step 9: each has an opacity below 0.005 in"
-    ):
+    policy = control()
+    with pytest.raises(RuntimeError, match="would prune all 2 Gaussians at step 9: each has an opacity below 0.005"):
         refine(policy, make_cloud(policy, [[0.001, 0.5], [0.5, 0.001]]))
 
 
@@ -117,7 +111,7 @@ def pulls(weights):
     output = renderer(*geometry.values(), opacities, lambda ids: features[ids], camera, None, (1, 3))
     heat, color = output.features.split((1, 3), dim=-1)
     (weights[0] * heat.square().sum() + weights[1] * color.square().sum()).backward()
-    policy = CoSupport(Adaptive())
+    policy = CoSupport()
     state = policy.initial_state(count, torch.device("cpu"))
     policy.observe(state, output, camera, step=0)
     found = {name: tensor.grad for name, tensor in geometry.items()}

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from heatsplat.density.adaptive import Adaptive
-from heatsplat.density.base import DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.density.proximity import Proximity, proximity_graph
 from heatsplat.splats import Splats
@@ -14,7 +13,7 @@ from heatsplat.splats import Splats
 ROOT_PI = math.sqrt(math.pi)
 
 
-def make_cloud(means, opacity=0.5, rest=False, recipe=None):
+def make_cloud(means, opacity=0.5, rest=False):
     means = torch.as_tensor(means, dtype=torch.float32)
     count = len(means)
     generator = torch.Generator().manual_seed(0)
@@ -31,12 +30,13 @@ def make_cloud(means, opacity=0.5, rest=False, recipe=None):
     optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names])
     sum(splats[name].sum() for name in splats.names).backward()
     optimizer.step()  # so that there are moments to be carried
-    return Cloud(splats, optimizer, (recipe or DensityControl()).initial_state(count, torch.device("cpu")))
+    return Cloud(splats, optimizer, Adaptive().initial_state(count, torch.device("cpu")))
 
 
-def policy(recipe=None, **options):
-    defaults = {"radiance": {"sh0": ROOT_PI, "sh_rest": 0.0}, "start": 0, "stop": 1000, "every": 10, "growth": 1.0}
-    return Proximity(recipe or DensityControl(), **(defaults | options))
+def policy(**options):
+    """Insertions every 10 steps, and of adaptive density control nothing unless asked for."""
+    inserted = {"insert_stop": 1000, "insert_every": 10, "insert_growth": 1.0}
+    return Proximity(**{"radiance": {"sh0": ROOT_PI, "sh_rest": 0.0}, "start": 0, "stop": 0, **inserted} | options)
 
 
 def refine(control, cloud, step=9, extent=1.0):
@@ -106,10 +106,9 @@ def test_offsets_of_zero_scale_the_coefficients_as_printed():
 
 
 def test_moments_and_statistics_of_the_new_start_at_zero():
-    recipe = Adaptive(start=500)
-    cloud = make_cloud(CLUSTER, recipe=recipe)
+    cloud = make_cloud(CLUSTER)
     cloud.state["gradient"] += 1.0
-    refine(policy(recipe), cloud)
+    refine(policy(), cloud)
     assert cloud.state["gradient"].tolist() == [1.0] * 10 + [0.0] * 3
     moments = cloud.optimizer.state[cloud.splats["means"]]["exp_avg"]
     assert moments[:10].abs().min() > 0 and moments[10:].abs().max() == 0
@@ -155,7 +154,7 @@ def test_growth_and_cap_hold_and_the_loneliest_come_first():
     means = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
     means[7] += 20.0
     grown = make_cloud(means)
-    assert refine(policy(growth=0.03, quantile=0.5), grown).added == 6
+    assert refine(policy(insert_growth=0.03, quantile=0.5), grown).added == 6
     assert torch.equal(grown.splats["quats"][200], grown.splats["quats"][7])
     capped = make_cloud(means)
     assert refine(policy(cap_max=202), capped).added == 2
@@ -169,25 +168,25 @@ def test_transparent_gaussians_are_no_sources():
 
 
 def test_insertions_keep_to_their_schedule_and_see_what_came_before():
-    control, cloud = policy(start=20, stop=40), make_cloud(CLUSTER)
+    control, cloud = policy(start=20, insert_stop=40), make_cloud(CLUSTER)
     assert [refine(control, cloud, step) is not None for step in (9, 19, 28)] == [False, False, False]
     assert refine(control, cloud, 29).added == 3
     assert refine(control, cloud, 39).added > 0  # the graph of the larger cloud
     assert refine(control, cloud, 49) is None
 
 
-def test_the_recipe_goes_on_below():
-    recipe = Adaptive(start=0, stop=100, every=10, absgrad=True)
-    control, cloud = policy(recipe), make_cloud(CLUSTER, recipe=recipe)
+def test_duplicating_and_splitting_go_on():
+    adaptive = {"start": 0, "stop": 100, "every": 10, "absgrad": True}
+    control, cloud = policy(**adaptive), make_cloud(CLUSTER)
     assert control.absgrad
     cloud.state["gradient"] += 1.0
     cloud.state["seen"] += 1.0
-    alone = make_cloud(CLUSTER, recipe=recipe)
+    alone = make_cloud(CLUSTER)
     alone.state["gradient"] += 1.0
     alone.state["seen"] += 1.0
-    by_recipe = refine(recipe, alone).added
-    assert by_recipe == 10
-    assert refine(control, cloud).added > by_recipe
+    by_adaptive = refine(Adaptive(**adaptive), alone).added
+    assert by_adaptive == 10
+    assert refine(control, cloud).added > by_adaptive
     assert cloud.state["gradient"].abs().max() == 0 and len(cloud.state["gradient"]) == len(cloud)
 
 
@@ -201,7 +200,7 @@ def test_unknown_radiance_is_an_error_that_lists_what_there_is():
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"neighbours": 0}, "neighbours, every and cap_max must be at least 1, got 0"),
+        ({"neighbours": 0}, "neighbours and insert_every must be at least 1, got 0"),
         ({"edge_share": 1.0}, r"edge_share in \(0, 1\), got 0.9, 1.0"),
         ({"radiance": {}}, "density.radiance names no tensor"),
     ],

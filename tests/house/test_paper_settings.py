@@ -30,7 +30,7 @@ GROWTH = {
     "stop": (15000, "densify_until_iter"),
     "every": (100, "densification_interval"),
     "grad_threshold": (2e-4, "densify_grad_threshold"),
-    "clone_scale": (0.01, "percent_dense"),
+    "duplicate_scale": (0.01, "percent_dense"),
     "prune_opacity": (0.005, "min_opacity of densify_and_prune"),
     "prune_scale": (0.1, "big_points_ws of densify_and_prune"),
     "reset_every": (3000, "opacity_reset_interval"),
@@ -38,7 +38,6 @@ GROWTH = {
     "absgrad": (False, "as published; AbsGS came later"),
 }
 ADAPTIVE = {f"density.{key}": value for key, value in GROWTH.items()}
-RECIPE = {f"density.recipe.{key}": value for key, value in GROWTH.items()}
 COLOUR = {  # static emission
     "thermal.lr": (2.5e-3, "feature_lr"),
     "renderer.eps2d": (0.3, "compute_cov2D: low-pass filter"),
@@ -150,7 +149,7 @@ PAPERS = {
         "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
     },
     "ravigs": GAUSSIANS
-    | RECIPE
+    | ADAPTIVE
     | {
         "density.prune_opacity": (0.005, "Eq. 11: tau"),
         "thermal.dual_opacity": (True, "section 3.1"),
@@ -235,7 +234,7 @@ PAPERS = {
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
     "ti3dgs": GAUSSIANS
-    | RECIPE
+    | ADAPTIVE
     | {
         "thermal.position_frequencies": (10, "Eq. 9: L"),
         "thermal.time_frequencies": (10, "Eq. 9: L"),

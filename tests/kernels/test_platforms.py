@@ -34,7 +34,7 @@ def step():
     emit = lambda ids: visible_temperature(time, ambient, initial, rate, omega, gains, None, ids)[:, None]
     image = rasterization(means, quats, scales, opacities, emit, torch.eye(4), K, 70, 57, backend="cpu", depth=False)
     target = torch.rand(57, 70, 1, generator=generator)
-    sum(Photometric()(LossInputs(image.features, target, None, None, None, 0, 1)).values()).backward()
+    sum(Photometric()(LossInputs(image.features, target, None, None, None)).values()).backward()
     return [image.features.detach(), *(leaf.grad for leaf in leaves)]
 
 numbers = [tensor.numpy() for tensor in step()]

@@ -61,7 +61,7 @@ def configured(*overrides):
 def stored(folder, name, step, recipe):
     (folder / "checkpoints").mkdir(exist_ok=True)
     path = folder / "checkpoints" / name
-    torch.save({"global_step": step, "heatsplat": {"recipe": recipe}}, path)
+    torch.save({"global_step": step, "heatsplat": {"recipe": recipe, "schedule": {"end": 8.0}}}, path)
     os.utime(path, (step, step))
 
 

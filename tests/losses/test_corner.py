@@ -28,7 +28,7 @@ def square(level=0.2, contrast=0.5, dtype=torch.float32):
 
 
 def inputs(prediction, target, mask=None, step=0, max_steps=1):
-    return LossInputs(prediction, target, mask, view=None, splats=None, step=step, max_steps=max_steps)
+    return LossInputs(prediction, target, mask, view=None, splats=None, step=step, progress=min(step / max_steps, 1.0))
 
 
 def weights(target, **options):

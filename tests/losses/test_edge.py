@@ -17,7 +17,7 @@ def noise(height=12, width=17, channels=1, seed=0, dtype=torch.float32):
 
 
 def inputs(prediction, target, mask=None):
-    return LossInputs(prediction, target, mask, view=None, splats=None, step=0, max_steps=1)
+    return LossInputs(prediction, target, mask, view=None, splats=None)
 
 
 def test_the_operator_is_that_of_scipy():

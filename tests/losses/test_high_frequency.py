@@ -38,7 +38,7 @@ def make_scene(count=2, mask=None):
 
 def inputs(prediction, target=None, mask=None, step=99, index=0):
     target = noise() if target is None else target
-    return LossInputs(prediction, target, mask, View(frame(index), target, mask=mask), None, step, 100)
+    return LossInputs(prediction, target, mask, View(frame(index), target, mask=mask), None, step, step / 100)
 
 
 class Oracle:

@@ -18,7 +18,7 @@ def noise(height, width, seed=0):
 
 
 def inputs(prediction, target, mask=None, step=50):
-    return LossInputs(prediction, target, mask, View(FRAME, target), splats=None, step=step, max_steps=100)
+    return LossInputs(prediction, target, mask, View(FRAME, target), splats=None, step=step, progress=step / 100)
 
 
 @pytest.mark.parametrize("kernel", ["bicubic", "area"])

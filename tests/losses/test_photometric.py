@@ -19,7 +19,7 @@ def images(height, width, channels, seed=0, dtype=torch.float64):
 
 
 def inputs(prediction, target, mask=None):
-    return LossInputs(prediction, target, mask, view=None, splats=None, step=0, max_steps=1)
+    return LossInputs(prediction, target, mask, view=None, splats=None)
 
 
 def loss_and_gradient(photometric, prediction, target, mask=None):

@@ -20,7 +20,9 @@ def image(channels, seed):
 
 def inputs(mask=None, splats=None, **changes):
     images = {"prediction": image(1, 0), "target": image(1, 1), "rgb": (image(3, 2), image(3, 3))} | changes
-    return LossInputs(images["prediction"], images["target"], mask, None, splats or {}, 0, 1, {"rgb": images["rgb"]})
+    return LossInputs(
+        images["prediction"], images["target"], mask, None, splats or {}, companions={"rgb": images["rgb"]}
+    )
 
 
 def pairs():
@@ -90,7 +92,7 @@ def test_the_smoothed_image_learns_and_the_guide_does_not():
 
 
 def test_photometric_of_a_companion():
-    own = Photometric(0.2)(LossInputs(*inputs().pair("rgb"), None, None, None, 0, 1))
+    own = Photometric(0.2)(LossInputs(*inputs().pair("rgb"), None, None, None))
     assert Photometric(0.2, modality="rgb")(inputs()) == own
     with pytest.raises(ValueError, match="asks for depth images, which the model does not explain"):
         Photometric(modality="depth")(inputs())

@@ -27,7 +27,7 @@ def shrunk(image):
 
 
 def inputs(prediction, target, mask=None):
-    return LossInputs(prediction, target, mask, View(FRAME, target, mask=mask), splats=None, step=0, max_steps=1)
+    return LossInputs(prediction, target, mask, View(FRAME, target, mask=mask), splats=None)
 
 
 class Given:

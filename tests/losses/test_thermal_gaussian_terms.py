@@ -18,7 +18,9 @@ def image(channels, seed):
 
 def inputs(mask=None, step=0, splats=None, **changes):
     images = {"prediction": image(1, 0), "target": image(1, 1), "rgb": (image(3, 2), image(3, 3))} | changes
-    return LossInputs(images["prediction"], images["target"], mask, None, splats, step, 10, {"rgb": images["rgb"]})
+    return LossInputs(
+        images["prediction"], images["target"], mask, None, splats, step, step / 10, {"rgb": images["rgb"]}
+    )
 
 
 def neighbours(y, x):

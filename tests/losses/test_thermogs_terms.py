@@ -10,7 +10,7 @@ from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, TABLE, UNKNOWN, re
 
 
 def inputs(prediction, target, mask=None):
-    return LossInputs(prediction, target, mask, None, None, 0, 10)
+    return LossInputs(prediction, target, mask, None, None)
 
 
 def ramp(slope: float, columns: int = 9) -> torch.Tensor:

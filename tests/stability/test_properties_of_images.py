@@ -38,7 +38,7 @@ def image(seed: int, level: float, contrast: float, channels: int = 1) -> torch.
 
 
 def given_to_losses(prediction, target, mask=None) -> LossInputs:
-    return LossInputs(prediction, target, mask, None, None, 0, 10, {})
+    return LossInputs(prediction, target, mask, None, None)
 
 
 def total(value) -> torch.Tensor:

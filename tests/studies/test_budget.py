@@ -33,6 +33,7 @@ from heatsplat.runs.run import begin
 from heatsplat.studies import budget_grid
 from heatsplat.studies.budget_grid import Trained, mean_gaussians, means, picture, tables
 from heatsplat.training.module import SplatTraining
+from heatsplat.training.schedule import Schedule
 
 FREE = math.inf
 # With many Gaussians a run is better in the end and worse at first, and each of its steps costs more.
@@ -266,25 +267,22 @@ class Clock(CostMeter):
         return {"seconds": {"train": self.now}}
 
 
-def simulate(clock: BudgetClock, step_s, meter: Clock | None = None, module=None, until: int = 10**6):
+def a_module(steps: int = 1000):
+    """What the clock asks of a training module."""
+    density = SimpleNamespace(cap_max=9000)
+    return SimpleNamespace(schedule=Schedule(steps), density=density, splats=range(4000), results=RunResults())
+
+
+def simulate(clock: BudgetClock, step_s, meter: Clock | None = None, module=None, first: int = 0, until: int = 10**6):
     """Runs a trainer's loop without training; ``step_s(step)`` is what a step takes. Returns (trainer, module)."""
     meter = meter or Clock()
-    module = module or SimpleNamespace(density=SimpleNamespace(cap_max=9000), splats=range(4000), results=RunResults())
-    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
-    ceiling = 20 * clock.plan["steps"]
-    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.01 ** min(step / ceiling, 1.0))
-    loop = SimpleNamespace(max_steps=ceiling)
-    trainer = SimpleNamespace(
-        callbacks=[meter, clock], fit_loop=SimpleNamespace(epoch_loop=loop), should_stop=False, max_steps=ceiling,
-        global_step=clock._from[0], lr_scheduler_configs=[SimpleNamespace(scheduler=scheduler)], rates=[],
-    )  # fmt: skip
+    module = module or a_module()
+    trainer = SimpleNamespace(callbacks=[meter, clock], global_step=first, rates=[])
     clock.on_train_start(trainer, module)
-    while not trainer.should_stop and trainer.global_step < until:
+    while trainer.global_step < min(module.schedule.end, until):
         meter.now += step_s(trainer.global_step)
         trainer.global_step += 1
-        optimizer.step()
-        scheduler.step(trainer.global_step)
-        trainer.rates.append(optimizer.param_groups[0]["lr"])
+        trainer.rates.append(0.01 ** module.schedule.progress(trainer.global_step))
         clock.on_train_batch_end(trainer, module)
     clock.on_train_end(trainer, module)
     return trainer, module
@@ -295,7 +293,6 @@ def a_clock(seconds: float = 9.0, steps: int = 1000) -> BudgetClock:
     return BudgetClock(replace(found, steps=steps).as_dict(), found.twice())
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
 @pytest.mark.parametrize("factor", [0.2, 0.7, 1.0, 1.3, 1.8])
 def test_a_misjudged_pace_still_ends_in_time_with_its_schedule_done(factor):
     clock = a_clock()
@@ -309,24 +306,20 @@ def test_a_misjudged_pace_still_ends_in_time_with_its_schedule_done(factor):
     assert max(falls) < 1.05  # no jump
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
 def test_a_machine_that_becomes_ten_times_slower_late_is_noticed_at_once():
     _, module = simulate(a_clock(), lambda step: (0.9 if step < 750 else 9.0) * 9.0 / 1000)
     found = module.results.run["budget"]
     assert abs(found["off_percent"]) < 2 and found["schedule_done"] > 0.97 and 750 < found["steps"] < 800
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
 def test_a_well_judged_pace_changes_nothing():
     trainer, _ = simulate(a_clock(), lambda step: 9.0 / 1000)
     assert trainer.global_step == 1000
     assert trainer.rates == pytest.approx([0.01 ** (step / 1000) for step in range(1, 1001)], rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
 def test_growing_is_held_back_while_it_takes_too_much_of_the_time_and_no_longer():
-    module = SimpleNamespace(density=SimpleNamespace(cap_max=9000), splats=range(4000), results=RunResults())
-    caps = []
+    module, caps = a_module(), []
 
     def step_s(step: int) -> float:
         caps.append(module.density.cap_max)
@@ -338,23 +331,21 @@ def test_growing_is_held_back_while_it_takes_too_much_of_the_time_and_no_longer(
     assert 100 < module.results.run["budget"]["growth_held_at_step"] < 200
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
 def test_a_pace_that_leaves_no_time_stops_the_run_and_says_so(caplog):
     clock = a_clock()
     _, module = simulate(clock, lambda step: 9.0 / 1000 if step < 100 else 20.0)
     assert module.results.run["budget"]["schedule_done"] < 0.2 and "of its schedule was done" in caplog.text
 
 
-@pytest.mark.filterwarnings("ignore:The epoch parameter")
-def test_a_resumed_run_keeps_its_clock():
+def test_a_resumed_run_keeps_its_schedule():
     whole, _ = simulate(a_clock(), lambda step: 6.0 / 1000)
     first, meter = a_clock(), Clock()
     stopped, module = simulate(first, lambda step: 6.0 / 1000, meter, until=700)
     assert "budget" not in module.results.run  # it is not over
-    second = a_clock()
+    second, again = a_clock(), a_module()
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
-    second._from = (700, first.progress(700))
-    resumed, module = simulate(second, lambda step: 6.0 / 1000, meter)
+    again.schedule.load_state_dict(json.loads(json.dumps(module.schedule.state_dict())))
+    resumed, module = simulate(second, lambda step: 6.0 / 1000, meter, again, first=700)
     assert resumed.global_step == pytest.approx(whole.global_step, rel=0.01)
     assert abs(module.results.run["budget"]["off_percent"]) < 2
     assert resumed.rates[0] == pytest.approx(stopped.rates[-1], rel=0.02)
@@ -366,23 +357,19 @@ def test_a_budget_needs_the_clock_of_the_costs():
         a_clock().on_train_start(trainer, None)
 
 
-def left_by(folder: Path, recipe: dict, step: int, end: float | None) -> dict:
-    """The configuration of a run in a folder with one checkpoint, of a run that its clock ends at ``end``."""
+def left_by(folder: Path, recipe: dict, step: int, end: float) -> dict:
+    """The configuration of a run in a folder with one checkpoint, of a run whose schedule ends at ``end``."""
     (folder / "checkpoints").mkdir(parents=True)
-    clock = {} if end is None else {"callbacks": {"BudgetClock": {"from": [0, 0.0], "end": end, "held": None}}}
-    torch.save({"global_step": step, "heatsplat": {"recipe": recipe}} | clock, folder / "checkpoints" / "last.ckpt")
+    stored = {"recipe": recipe, "schedule": {"end": end}}
+    torch.save({"global_step": step, "heatsplat": stored}, folder / "checkpoints" / "last.ckpt")
     return resumed(recipe, folder)
 
 
-def test_a_run_that_was_stretched_or_shrunk_goes_on_until_its_clock_ends_it(tmp_path):
+def test_a_run_that_was_stretched_or_shrunk_goes_on_until_its_schedule_ends(tmp_path):
     plain = compose(["method=3dgs", *running.TINY, "max_steps=1000"])
-    plain["trainer"]["max_steps"] = 20_000  # as a budget leaves room
     cases = ((1500, 2000.0, True), (2000, 2000.3, False), (600, 600.2, False), (600, 1000.0, True))
     for i, (step, end, goes_on) in enumerate(cases):
         assert (left_by(tmp_path / str(i), plain, step, end)["ckpt"] is not None) == goes_on, (step, end)
-    plain["trainer"]["max_steps"] = 500  # without a budget the trainer ends it
-    assert left_by(tmp_path / "over", plain, 500, None)["ckpt"] is None
-    assert left_by(tmp_path / "stopped", plain, 499, None)["ckpt"].endswith("last.ckpt")
 
 
 # The study -------------------------------------------------------------------------------------------------------------
@@ -427,7 +414,7 @@ def test_the_grid_trains_every_combination_and_leaves_the_curves_of_other_scenes
     longer = replace(POINTS[4], steps=9000)
     write_points([replace(POINTS[0], scene="cooling"), POINTS[3], longer], tmp_path / "curves.csv")
     settings = {"train": "train.py", "steps": [250, 500], "caps": [8000, None], "decays": [1.0, 0.25], "seeds": [0]}
-    settings |= {"budgets": [], "density": {}, "overrides": ["data.size=demo"], "curves": str(tmp_path / "curves.csv")}
+    settings |= {"budgets": [], "overrides": ["data.size=demo"], "curves": str(tmp_path / "curves.csv")}
     budget_grid.run(tmp_path / "study", scenes=["etgs/heated"], **settings)
     assert len(asked) == 8 and len({tuple(overrides) for overrides in asked}) == 8
     assert sum("optim.decay=0.25" in one and "density.cap_max=8000" in one for one in asked) == 2
@@ -464,7 +451,6 @@ def test_planned_runs_read_the_curves_just_written_on_the_threads_asked_for(tmp_
         "decays": [1.0],
         "seeds": [0],
         "budgets": [30.0],
-        "density": {},
     }
     curves = "curves.csv" if named else None
     budget_grid.run("study", scenes=["etgs/heated"], overrides=["data.size=demo"], curves=curves, threads=1, **settings)
@@ -492,15 +478,13 @@ def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
     assert {point.decay for point in points} <= set(study.decays)
 
 
-def test_options_of_growth_are_where_the_study_sets_them(tmp_path):
-    study = running.compose_run(tmp_path, "study=budget", config_name="study").study
+def test_the_study_sets_options_that_every_growing_method_has(tmp_path):
     for method in sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml")):
         density = running.compose_run(tmp_path, f"method={method}").density
-        place = "density.recipe" if "recipe" in density else "density"
-        assert study.density.get(method, "density") == place, method
+        assert {"cap_max", "reset_every"} <= set(density), method
 
 
-def test_caps_go_to_the_recipe_that_a_density_control_extends(tmp_path, monkeypatch):
+def test_caps_go_to_density_control(tmp_path, monkeypatch):
     asked = []
 
     def trained(place, train, overrides, study):
@@ -511,9 +495,9 @@ def test_caps_go_to_the_recipe_that_a_density_control_extends(tmp_path, monkeypa
 
     monkeypatch.setattr(budget_grid, "trained", trained)
     settings = {"train": "train.py", "steps": [250], "caps": [8000], "decays": [1.0], "seeds": [0], "budgets": []}
-    settings |= {"density": {"ti3dgs": "density.recipe"}, "overrides": [], "curves": None}
+    settings |= {"overrides": [], "curves": None}
     budget_grid.run(tmp_path / "study", scenes=["ti3dgs/haze"], **settings)
-    assert asked[0][-2:] == ["density.recipe.reset_every=null", "density.recipe.cap_max=8000"]
+    assert asked[0][-2:] == ["density.reset_every=null", "density.cap_max=8000"]
 
 
 def test_curves_that_are_none_are_told_before_anything_is_trained(tmp_path, monkeypatch):
@@ -525,7 +509,6 @@ def test_curves_that_are_none_are_told_before_anything_is_trained(tmp_path, monk
         "decays": [1.0],
         "seeds": [0],
         "budgets": [],
-        "density": {},
         "overrides": [],
     }
     with pytest.raises(SceneError, match="notes.txt holds no curves"):
@@ -619,7 +602,7 @@ def test_a_stretched_run_that_died_goes_on_from_its_newest_checkpoint(tmp_path, 
     before = hours.now
     plain = prepared(tmp_path)
     stopped = torch.load(plain["ckpt"], weights_only=True)
-    assert planned < stopped["global_step"] < hours.dies_at < stopped["callbacks"]["BudgetClock"]["end"]
+    assert planned < stopped["global_step"] < hours.dies_at < stopped["heatsplat"]["schedule"]["end"]
     assert plain["budget"]["steps"] == plain["max_steps"] and hours.now == before  # not planned anew
     hours.dies_at = None
     again, _ = running.run(tmp_path, *BLIND, f"ckpt={plain['ckpt']}")

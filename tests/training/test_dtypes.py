@@ -19,9 +19,7 @@ def test_the_first_step_in_float64_is_that_in_float32_but_for_rounding(method, t
     plain = compose([*SHORT, f"method={method}"])
     scene, slopes, losses = build(plain["data"]).scene, {}, {}
     for dtype in ("float32", "float64"):
-        stepper = Stepper(
-            build(plain["module"] | {"dtype": dtype}), scene, step=0, max_steps=plain["max_steps"], device="cpu"
-        )
+        stepper = Stepper(build(plain["module"] | {"dtype": dtype}), scene, step=0, device="cpu")
         module = stepper.module
         assert {str(parameter.dtype) for parameter in module.parameters()} == {f"torch.{dtype}"}
         losses[dtype] = module.training_step(scene.train[0], 0)["loss"]

@@ -9,6 +9,7 @@ import torch
 
 from heatsplat.splats import Splats
 from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.schedule import Schedule
 
 
 def splats(count=1001):
@@ -17,9 +18,9 @@ def splats(count=1001):
     return Splats({name: torch.randn(count, width, generator=generator) for name, width in widths.items()})
 
 
-def build(cloud, settings=None, max_steps=100, extent=2.0):
+def build(cloud, settings=None, extent=2.0):
     settings = settings or Optimisation()
-    return settings.build(settings.geometry_groups(cloud, extent), max_steps)
+    return settings.build(settings.geometry_groups(cloud, extent), Schedule(100).round_progress)
 
 
 def steps(cloud, optimizer, scheduler, first, last):
@@ -69,8 +70,10 @@ def test_weight_decay_is_the_gradient_of_the_penalty():
     """PerGaussian.l2 becomes weight_decay = 2 l2, instead of a loss term l2 * sum(x²) and its backward pass."""
     start, l2 = torch.randn(50, 3, generator=torch.Generator().manual_seed(1)), 0.3
     inside, outside = (torch.nn.Parameter(start.clone()) for _ in range(2))
-    one, _ = Optimisation().build([{"params": [inside], "name": "x", "lr": 1e-2, "weight_decay": 2 * l2}], 10)
-    two, _ = Optimisation().build([{"params": [outside], "name": "x", "lr": 1e-2}], 10)
+    one, _ = Optimisation().build(
+        [{"params": [inside], "name": "x", "lr": 1e-2, "weight_decay": 2 * l2}], lambda step: 0.0
+    )
+    two, _ = Optimisation().build([{"params": [outside], "name": "x", "lr": 1e-2}], lambda step: 0.0)
     for _ in range(20):
         inside.grad = inside.detach().cos()
         one.step()

@@ -12,7 +12,6 @@ from heatsplat.contracts import SceneError
 from heatsplat.runs.stepping import Stepper
 from heatsplat.training.init import ABSENT
 from heatsplat.training.session import load_checkpoint
-from heatsplat.training.stages import Stages
 
 SHORT = (
     *TINY,
@@ -40,7 +39,7 @@ def scene(tmp_path_factory):
 
 def stepper(scene, folder, *overrides):
     plain = compose([*SHORT, *overrides])
-    return Stepper(build(plain["module"]), scene, step=0, max_steps=plain["max_steps"], device="cpu")
+    return Stepper(build(plain["module"]), scene, step=0, device="cpu")
 
 
 # One cloud ------------------------------------------------------------------------------------------------------------
@@ -120,17 +119,6 @@ def test_a_run_of_two_rounds_resumes_bit_for_bit_where_the_second_begins(rounds,
     resumed, _ = run(tmp_path, *ROUNDS, "test=false", f"ckpt={half}")
     wanted = module.state_dict()
     assert [name for name, value in resumed.state_dict().items() if not torch.equal(value, wanted[name])] == []
-
-
-def test_rounds_of_any_number_and_without():
-    three = Stages({}, [10, 40])
-    assert [three.round_step(step) for step in (0, 9, 10, 39, 40, 99)] == [0, 9, 0, 29, 0, 59]
-    assert [three.progress(step, 100) for step in (0, 5, 10, 25, 40, 70, 100, 120)] == [0, 0.5, 0, 0.5, 0, 0.5, 1, 1]
-    for step in (0, 3, 50, 100, 130):
-        assert Stages({}).round_step(step) == step and Stages({}).progress(step, 100) == min(step / 100, 1.0)
-    for wrong in ([0], [5, 5], [7, 3]):
-        with pytest.raises(ValueError, match="stages.restarts must be increasing steps from 1 on"):
-            Stages({}, wrong)
 
 
 # A cloud for each image -----------------------------------------------------------------------------------------------

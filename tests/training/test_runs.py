@@ -31,9 +31,9 @@ def state_of(module, trainer) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("method", ["3dgs", "etgs"])
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(method, tmp_path):
-    overrides = (*SHORT, f"method={method}", "test=false", "callbacks.checkpoint.every_n_train_steps=20")
+    overrides = (*SHORT, f"method={method}", "test=false", "callbacks.checkpoint.every_n_train_steps=16")
     whole = state_of(*run(tmp_path / "whole", *overrides))
-    half = tmp_path / "whole" / "checkpoints" / "step_000020.ckpt"
+    half = tmp_path / "whole" / "checkpoints" / "step_000016.ckpt"  # between refinements, whose statistics it holds
     resumed = state_of(*run(tmp_path / "resumed", *overrides, f"ckpt={half}"))
     assert whole.keys() == resumed.keys()
     different = [name for name in whole if not torch.equal(whole[name], resumed[name])]
@@ -57,14 +57,13 @@ def test_a_run_leaves_metrics_beside_their_cost(tmp_path):
 def test_interruption_leaves_a_checkpoint_that_resumes(tmp_path, monkeypatch):
     import heatsplat.training.session as session
 
-    steps = []
+    steps, listen = [], session.StopOnInterrupt.on_train_batch_end
 
-    def interrupt_at_seven(self, trainer, *_):
+    def interrupt_at_seven(self, trainer, *rest):
         steps.append(trainer.global_step)
         if trainer.global_step == 7:
             signal.raise_signal(signal.SIGINT)
-        if self.interrupted:
-            trainer.should_stop = True
+        listen(self, trainer, *rest)
 
     monkeypatch.setattr(session.StopOnInterrupt, "on_train_batch_end", interrupt_at_seven)
     with pytest.raises(SystemExit) as stopped:
@@ -122,3 +121,47 @@ def test_penalties_inside_the_optimiser_are_logged_beside_the_loss_terms(tmp_pat
     gains = module.splats["source_gains"].detach()
     assert logged.step == 40
     assert logged.value == pytest.approx(1e-5 * gains.square().sum().item() / len(gains), rel=1e-4)
+
+
+def test_density_control_draws_anew_at_every_step(tmp_path, monkeypatch):
+    from heatsplat.density.adaptive import Adaptive
+    from heatsplat.training.rng import generator_for
+
+    seeds = []
+    monkeypatch.setattr(Adaptive, "refine", lambda self, cloud, step, extent, draw: seeds.append(draw.initial_seed()))
+    run(tmp_path, *SHORT, "method=3dgs", "test=false", "max_steps=3", "seed=5", "trainer.limit_val_batches=0")
+    assert seeds == [generator_for(5, step, "density").initial_seed() for step in range(3)] and len(set(seeds)) == 3
+
+
+def test_no_validation_measures_opacities_that_were_just_reset(tmp_path):
+    """Opacities fall after step 30 and need 10 refinements, of which there is one each step."""
+    resets = ("density.start=0", "density.every=1", "density.stop=50", "density.reset_every=30")
+    _, trainer = run(
+        tmp_path, *SHORT, *resets, "method=3dgs", "test=false", "trainer.val_check_interval=16", "max_steps=80"
+    )
+    steps = [int(line.split(",")[0]) for line in (tmp_path / "curve.csv").read_text().splitlines()[1:]]
+    assert trainer.global_step == 80 and steps == [14, 28, 42, 56, 70, 80]
+
+
+def test_a_run_whose_end_moved_ends_there_and_resumes_bit_for_bit(tmp_path, monkeypatch):
+    from heatsplat.training.module import SplatTraining
+
+    after_step = SplatTraining.on_train_batch_end
+
+    def moving(self, *rest):
+        if self.global_step == 20:
+            self.schedule.end_at(20, 33.4)
+        after_step(self, *rest)
+
+    monkeypatch.setattr(SplatTraining, "on_train_batch_end", moving)
+    overrides = (*SHORT, "method=3dgs", "test=false", "callbacks.checkpoint.every_n_train_steps=24")
+    whole, trainer = run(tmp_path / "whole", *overrides)
+    half = tmp_path / "whole" / "checkpoints" / "step_000024.ckpt"
+    resumed, again = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
+    assert trainer.global_step == again.global_step == 33
+    whole, resumed = state_of(whole, trainer), state_of(resumed, again)
+    assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
+    rates = [{group["name"]: group["lr"] for group in one.optimizers[0].param_groups} for one in (trainer, again)]
+    assert rates[0] == rates[1] and rates[0]["means"] == pytest.approx(
+        0.01 * 1.6e-4 * again.lightning_module.scene.extent, rel=0.2
+    )

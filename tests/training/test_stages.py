@@ -1,4 +1,4 @@
-"""Stages: which parameters rest at which steps, and that resting means that nothing of them changes."""
+"""Stages: which parameters are frozen at which steps, and that nothing of them changes then."""
 
 import logging
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from running import TINY, run
 
-from heatsplat.training.stages import Rest, Stages
+from heatsplat.training.stages import Freeze, Stages
 
 RAVIGS = (
     *TINY,
@@ -14,30 +14,30 @@ RAVIGS = (
     "callbacks.attributes=null",
     "test=false",
     "max_steps=40",
-    "density.recipe.start=5",
-    "density.recipe.every=10",
-    "density.recipe.stop=30",
+    "density.start=5",
+    "density.every=10",
+    "density.stop=30",
     "trainer.val_check_interval=40",
     "threads=1",
 )
 
 
-def resting(rest, steps):
-    return [step for step in range(steps) if rest.at(step)]
+def frozen(freeze, steps):
+    return [step for step in range(steps) if freeze.at(step)]
 
 
 def test_a_stretch_has_a_first_step_and_ends_before_its_last():
-    assert resting(Rest(["a"]), 4) == [0, 1, 2, 3]
-    assert resting(Rest(["a"], start=2, stop=5), 9) == [2, 3, 4]
-    assert resting(Rest(["a"], stop=0), 9) == []
+    assert frozen(Freeze(["a"]), 4) == [0, 1, 2, 3]
+    assert frozen(Freeze(["a"], start=2, stop=5), 9) == [2, 3, 4]
+    assert frozen(Freeze(["a"], stop=0), 9) == []
 
 
-def test_cycles_rest_at_their_end_by_turns():
-    one, two = (Rest(["a"], start=3, cycle=5, share=0.4, turn=turn, turns=2) for turn in (0, 1))
-    assert resting(one, 25) == [6, 7, 16, 17]
-    assert resting(two, 25) == [11, 12, 21, 22]
-    assert resting(Rest(["a"], cycle=5, share=0.0), 20) == []
-    assert resting(Rest(["a"], stop=7, cycle=5, share=0.4), 20) == [3, 4]
+def test_cycles_freeze_at_their_end_by_turns():
+    one, two = (Freeze(["a"], start=3, cycle=5, share=0.4, turn=turn, turns=2) for turn in (0, 1))
+    assert frozen(one, 25) == [6, 7, 16, 17]
+    assert frozen(two, 25) == [11, 12, 21, 22]
+    assert frozen(Freeze(["a"], cycle=5, share=0.0), 20) == []
+    assert frozen(Freeze(["a"], stop=7, cycle=5, share=0.4), 20) == [3, 4]
 
 
 def optimizer_of(weight_decay=0.0):
@@ -84,9 +84,9 @@ def moved(before, after):
     return [name for name in before if not torch.equal(before[name]["value"], after[name]["value"])]
 
 
-def test_what_rests_keeps_value_and_moments_and_pays_no_penalty():
+def test_what_is_frozen_keeps_value_and_moments_and_pays_no_penalty():
     optimizer = optimizer_of(weight_decay=0.1)
-    stages = Stages({"color": Rest(["sh*"], start=3, stop=6), "gain": None})
+    stages = Stages({"color": Freeze(["sh*"], start=3, stop=6), "gain": None})
     take(stages, optimizer, range(3))
     before = snapshot(optimizer)
     take(stages, optimizer, range(3, 6))
@@ -100,9 +100,9 @@ def test_what_rests_keeps_value_and_moments_and_pays_no_penalty():
 
 
 @pytest.mark.parametrize("warm", [0, 3])
-def test_a_column_rests_alone(warm):
+def test_a_column_is_frozen_alone(warm):
     optimizer = optimizer_of(weight_decay=0.1)
-    stages = Stages({"opacity": Rest(["opacity_logits[1]"], start=warm)})
+    stages = Stages({"opacity": Freeze(["opacity_logits[1]"], start=warm)})
     take(stages, optimizer, range(warm))
     before = snapshot(optimizer)["opacity_logits"]
     take(stages, optimizer, range(warm, warm + 3))
@@ -117,31 +117,33 @@ def test_a_column_rests_alone(warm):
 def test_a_shared_column_is_left_alone():
     optimizer = optimizer_of()
     before = snapshot(optimizer)
-    take(Stages({"opacity": Rest(["single[0]", "single[1]", "opacity_logits[7]"])}), optimizer, range(2))
+    take(Stages({"opacity": Freeze(["single[0]", "single[1]", "opacity_logits[7]"])}), optimizer, range(2))
     assert "single" in moved(before, snapshot(optimizer)) and "opacity_logits" in moved(before, snapshot(optimizer))
 
 
 def test_a_failure_within_a_step_leaves_parameters_trainable():
     optimizer = optimizer_of()
-    with pytest.raises(RuntimeError, match="boom"), Stages({"all": Rest(["*"])}).on_step(0, optimizer):
+    with pytest.raises(RuntimeError, match="boom"), Stages({"all": Freeze(["*"])}).on_step(0, optimizer):
         raise RuntimeError("boom")
     assert all(group["params"][0].requires_grad for group in optimizer.param_groups)
 
 
 def test_names_that_fit_nothing_are_told(caplog):
     with caplog.at_level(logging.WARNING):
-        Stages({"typo": Rest(["shh*", "opacity_logits[4]"]), "fine": Rest(["nothing", "sh0"])}).check(optimizer_of())
-    assert "stage 'typo' holds nothing still: none of shh*, opacity_logits[4] is a parameter group" in caplog.text
+        Stages({"typo": Freeze(["shh*", "opacity_logits[4]"]), "fine": Freeze(["nothing", "sh0"])}).check(
+            optimizer_of()
+        )
+    assert "stage 'typo' freezes nothing: none of shh*, opacity_logits[4] is a parameter group" in caplog.text
     assert "fine" not in caplog.text
 
 
 def test_errors():
     with pytest.raises(ValueError, match="groups must be a list of names of parameter groups, got 'sh0'"):
-        Rest("sh0")
+        Freeze("sh0")
     with pytest.raises(ValueError, match="cycle must be at least 1 step, or null, got 0"):
-        Rest(["sh0"], cycle=0)
+        Freeze(["sh0"], cycle=0)
     with pytest.raises(ValueError, match=r"share lies in \[0, 1\] and turn in 0 to turns - 1, got 0.5, 2 of 2"):
-        Rest(["sh0"], share=0.5, turn=2, turns=2)
+        Freeze(["sh0"], share=0.5, turn=2, turns=2)
 
 
 # Whole runs -----------------------------------------------------------------------------------------
@@ -156,14 +158,14 @@ def state_of(module, trainer):
 
 
 def test_a_resumed_run_with_stages_equals_an_uninterrupted_one_bit_for_bit(tmp_path):
-    """The checkpoint lies in the middle of a rest: of the colour, from step 19 to 23."""
-    rests = (
-        "stages.rests.rgb.start=10",
-        "stages.rests.rgb.cycle=13",
-        "stages.rests.rgb.share=0.3",
-        "stages.rests.constants.stop=25",
+    """The checkpoint lies in the middle of a freeze: of the colour, from step 19 to 23."""
+    freezes = (
+        "stages.freezes.rgb.start=10",
+        "stages.freezes.rgb.cycle=13",
+        "stages.freezes.rgb.share=0.3",
+        "stages.freezes.constants.stop=25",
     )
-    overrides = (*RAVIGS, *rests, "callbacks.checkpoint.every_n_train_steps=20")
+    overrides = (*RAVIGS, *freezes, "callbacks.checkpoint.every_n_train_steps=20")
     whole = state_of(*run(tmp_path / "whole", *overrides))
     half = tmp_path / "whole" / "checkpoints" / "step_000020.ckpt"
     resumed = state_of(*run(tmp_path / "resumed", *overrides, f"ckpt={half}"))
@@ -174,7 +176,7 @@ def test_a_resumed_run_with_stages_equals_an_uninterrupted_one_bit_for_bit(tmp_p
 
 
 def test_the_schedule_of_ravigs_holds_each_band_still_by_turns(tmp_path, monkeypatch):
-    """Of the 40 steps the first 4 train all; then cycles of 5 whose last rests colour and heat by turns."""
+    """Of the 40 steps the first 4 train all; then cycles of 5 whose last freezes colour and heat by turns."""
     from heatsplat.training.module import SplatTraining
 
     names = ("sh0", "emissivity", "temperature", "reflectance", "means")
@@ -192,10 +194,10 @@ def test_the_schedule_of_ravigs_holds_each_band_still_by_turns(tmp_path, monkeyp
         changed.append({name for name in before if not torch.equal(before[name], after[name])})
 
     monkeypatch.setattr(SplatTraining, "optimizer_step", watched)
-    run(tmp_path, *RAVIGS, "density.recipe.start=1000")
+    run(tmp_path, *RAVIGS, "density.start=1000")
     color, heat = {"sh0", "opacity of colour"}, {"emissivity", "temperature", "reflectance", "opacity of heat"}
     assert len(changed) == 40
     for step, moving in enumerate(changed):
         cycle, place = divmod(step - 4, 5)
-        rest = set() if step < 4 or place < 4 else color if cycle % 2 == 0 else heat
-        assert moving == (color | heat | {"means"}) - rest, step
+        still = set() if step < 4 or place < 4 else color if cycle % 2 == 0 else heat
+        assert moving == (color | heat | {"means"}) - still, step

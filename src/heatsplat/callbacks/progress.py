@@ -28,9 +28,8 @@ class Progress(pl.Callback):
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if not self.enabled:
             return
-        total = trainer.max_steps if trainer.max_steps > 0 else None
         self._bar = tqdm(
-            total=total,
+            total=module.schedule.end,
             initial=trainer.global_step,
             desc=module.scene.name,
             unit="step",
@@ -52,7 +51,7 @@ class Progress(pl.Callback):
             return
         self._next = now + self._period
         self._bar.set_postfix_str(f"loss {outputs['loss'].item():.4f}, {len(module.splats):,} Gaussians", refresh=False)
-        self._bar.update(trainer.global_step - self._bar.n)
+        self._draw(trainer.global_step, module)
 
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._bar is None or trainer.sanity_checking:
@@ -71,11 +70,15 @@ class Progress(pl.Callback):
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._bar is not None:
-            self._bar.update(trainer.global_step - self._bar.n)
+            self._draw(trainer.global_step, module)
         self._close()
 
     def on_exception(self, trainer: pl.Trainer, module: pl.LightningModule, exception: BaseException) -> None:
         self._close()
+
+    def _draw(self, step: int, module: pl.LightningModule) -> None:
+        self._bar.total = module.schedule.end  # which may have moved
+        self._bar.update(step - self._bar.n)
 
     def _close(self) -> None:
         if self._bar is not None:

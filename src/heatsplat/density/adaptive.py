@@ -11,10 +11,11 @@ from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 
 SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian (Kerbl et al. 2023)
+RECOVERY = 10  # refinements after which opacities have come back from a reset
 
 
 class Adaptive(DensityControl):
-    """Clones small and splits large Gaussians whose screen position still pulls, prunes those that are transparent.
+    """Duplicates small and splits large Gaussians whose screen position still pulls, prunes those that are transparent.
 
     The statistic is the norm of the loss gradient with respect to the screen position in normalised device coordinates
     (two units per image side), averaged over the views since the last refinement that saw the Gaussian.
@@ -23,7 +24,7 @@ class Adaptive(DensityControl):
         start, stop: first and last step at which Gaussians are added or removed.
         every: steps between refinements.
         grad_threshold: growth above this mean gradient (per NDC unit).
-        clone_scale: Gaussians with a largest semi-axis up to this (times extent) are cloned, larger ones split.
+        duplicate_scale: Gaussians with a largest semi-axis up to this (times extent) are duplicated, larger ones split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed.
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
         reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
@@ -38,7 +39,7 @@ class Adaptive(DensityControl):
         stop: int = 15_000,
         every: int = 100,
         grad_threshold: float = 2e-4,
-        clone_scale: float = 0.01,
+        duplicate_scale: float = 0.01,
         prune_opacity: float = 0.005,
         prune_scale: float = 0.1,
         reset_every: int | None = 3000,
@@ -51,7 +52,7 @@ class Adaptive(DensityControl):
                 f"density.every, reset_every and cap_max must be at least 1, got {every}, {reset_every}, {cap_max}"
             )
         self.start, self.stop, self.every = start, stop, every
-        self.grad_threshold, self.clone_scale = grad_threshold, clone_scale
+        self.grad_threshold, self.duplicate_scale = grad_threshold, duplicate_scale
         self.prune_opacity, self.prune_scale = prune_opacity, prune_scale
         self.reset_every, self.reset_opacity = reset_every, reset_opacity
         self.cap_max, self.absgrad = cap_max, absgrad
@@ -86,25 +87,35 @@ class Adaptive(DensityControl):
             cloud.lower_opacities(self.reset_opacity)
         return DensityChange(added, removed, reset) if due or reset else None
 
+    def settled(self, step: int) -> bool:
+        if self.reset_every is None:
+            return True
+        last = min(step + 1, self.stop - 1) // self.reset_every * self.reset_every
+        return last <= 0 or step + 1 - last >= RECOVERY * self.every
+
+    def _visible(self, opacities: Tensor) -> Tensor:
+        """Which Gaussians [N] of opacities [M, N] need not be pruned as transparent."""
+        return (opacities > self.prune_opacity).any(dim=0)
+
     def _grow(self, cloud: Cloud, extent: float, generator: torch.Generator) -> int:
         pull = cloud.state["gradient"] / cloud.state["seen"].clamp(min=1)
         grow = pull > self.grad_threshold
         room = max(0, self.cap_max - len(cloud))
-        if int(grow.sum()) > room:  # one more Gaussian each, whether it is cloned or split
+        if int(grow.sum()) > room:  # one more Gaussian each, whether it is duplicated or split
             strongest = pull.argsort(descending=True, stable=True)[:room]
             grow = torch.zeros_like(grow)
             grow[strongest] = True
-        large = cloud.splats.scales.amax(dim=1) > self.clone_scale * extent
-        clones, splits = (grow & ~large).nonzero().squeeze(1), (grow & large).nonzero().squeeze(1)
-        if len(clones):
-            cloud.append(cloud.rows(clones))
+        large = cloud.splats.scales.amax(dim=1) > self.duplicate_scale * extent
+        duplicates, splits = (grow & ~large).nonzero().squeeze(1), (grow & large).nonzero().squeeze(1)
+        if len(duplicates):
+            cloud.append(cloud.rows(duplicates))
         if len(splits):
             halves = self._halves(cloud, splits, generator)
             keep = torch.ones(len(cloud), dtype=torch.bool, device=pull.device)
             keep[splits] = False
             cloud.keep(keep)
             cloud.append(halves)
-        return len(clones) + len(splits)
+        return len(duplicates) + len(splits)
 
     @staticmethod
     def _halves(cloud: Cloud, ids: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
@@ -117,14 +128,14 @@ class Adaptive(DensityControl):
         return rows
 
     def _prune(self, cloud: Cloud, step: int, extent: float) -> int:
-        keep = (cloud.splats.opacities > self.prune_opacity).any(dim=0)
+        keep = self._visible(cloud.splats.opacities)
         if self.reset_every is not None and step + 1 > self.reset_every:
             keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
         keep &= torch.isfinite(cloud.splats.means).all(dim=1)
         removed = int((~keep).sum())
         if removed == len(cloud):
             raise RuntimeError(
-                f"density control would remove all {removed} Gaussians at step {step}: every opacity is below "
+                f"density control would prune all {removed} Gaussians at step {step}: each has an opacity below "
                 f"{self.prune_opacity}. Lower the learning rates or density.prune_opacity, or start from more points."
             )
         if removed:

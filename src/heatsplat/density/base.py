@@ -21,12 +21,17 @@ class DensityChange:
 
 
 class DensityControl:
-    """Knobs of a density policy; its state is a dict of [N, ...] tensors kept outside, in the Cloud.
+    """Decides which Gaussians are duplicated, split and pruned: gsplat calls it a strategy.
 
-    The default does nothing at all, which is the policy ``fixed``.
+    Its state is a dict of [N, ...] tensors kept outside, in the Cloud. The default does nothing at all, which is ``fixed``.
+
+    Attributes:
+        absgrad: whether ``observe`` wants absolute per-pixel gradients.
+        cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
     """
 
     absgrad: bool = False
+    cap_max: int | None = None
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """Per-Gaussian statistics before the first step, each [count, ...]."""
@@ -46,3 +51,7 @@ class DensityControl:
             generator: for random draws at this step.
         """
         return None
+
+    def settled(self, step: int) -> bool:
+        """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of opacities."""
+        return True

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.adaptive import Adaptive
+from heatsplat.density.base import DensityChange
 from heatsplat.density.ops import Cloud
 
 EVEN = 1e-4  # scores that differ by less than this share are equal: an even cloud has no gaps but those of rounding
 
 
-class Proximity(DensityControl):
-    """Thermal attenuation-aware density control (TADC; TI-3DGS, section III-C 2, Eq. 13-14) on top of another recipe.
+class Proximity(Adaptive):
+    """Adaptive density control with thermal attenuation-aware insertions (TADC; TI-3DGS, section III-C 2, Eq. 13-14).
 
-    The recipe works as ever. In addition, every so often, the proximity graph of all centres is built anew: each
-    Gaussian points to its K nearest others, and its score is the mean length of these edges. Where the score is above
-    the threshold, a Gaussian is put on every edge: a copy of its source whose radiance is weaker by e^{-μ Δd}, Δd being
+    Duplicating, splitting and pruning are as ever. In addition, every so often, the proximity graph of all centres is built
+    anew: each Gaussian points to its K nearest others, and its score is the mean length of these edges. Where the score is
+    above the threshold, a Gaussian is put on every edge: a copy of its source whose radiance is weaker by e^{-μ Δd}, Δd being
     its distance to the source. An edge that two sources share is used once, by the one with the higher score.
 
     Radiance is whatever the raw tensors named in ``radiance`` hold, up to an offset: the tensor plus its offset is
@@ -28,7 +29,6 @@ class Proximity(DensityControl):
     offsets of 0 scale the coefficients, as the paper prints.
 
     Args:
-        recipe: density control that this one extends; its statistics and refinements are left as they are.
         radiance: name of a raw tensor -> offset. Names that the Gaussians do not have are skipped (harmonics of higher
             degree are optional), but not all of them.
         neighbours: K.
@@ -38,10 +38,11 @@ class Proximity(DensityControl):
         distance: Δd in extents (paper: a number it does not give), never beyond the end of the edge; or None.
         attenuation: μ per extent.
         min_opacity: sources must be at least this opaque, in some modality.
-        start, stop: first and last step at which Gaussians are inserted.
-        every: steps between insertions.
-        growth: one insertion adds at most this share of the Gaussians there are.
-        cap_max: never more Gaussians than this; the highest scores come first.
+        insert_stop: last step at which Gaussians are inserted; the first is ``start``.
+        insert_every: steps between insertions.
+        insert_growth: one insertion adds at most this share of the Gaussians there are, and never more than fit under
+            ``cap_max``; the highest scores come first.
+        adaptive: the options of ``Adaptive``.
 
     Raises:
         ValueError: an option is out of its range.
@@ -49,7 +50,6 @@ class Proximity(DensityControl):
 
     def __init__(
         self,
-        recipe: DensityControl,
         radiance: Mapping[str, float],
         neighbours: int = 3,
         quantile: float = 0.9,
@@ -58,15 +58,15 @@ class Proximity(DensityControl):
         distance: float | None = None,
         attenuation: float = 0.1,
         min_opacity: float = 0.05,
-        start: int = 500,
-        stop: int = 7500,
-        every: int = 500,
-        growth: float = 0.05,
-        cap_max: int = 100_000,
+        insert_stop: int = 7500,
+        insert_every: int = 500,
+        insert_growth: float = 0.05,
+        **adaptive: Any,
     ) -> None:
-        if neighbours < 1 or every < 1 or cap_max < 1:
+        super().__init__(**adaptive)
+        if neighbours < 1 or insert_every < 1:
             raise ValueError(
-                f"density.neighbours, every and cap_max must be at least 1, got {neighbours}, {every}, {cap_max}"
+                f"density.neighbours and insert_every must be at least 1, got {neighbours}, {insert_every}"
             )
         if not 0 <= quantile <= 1 or not 0 < edge_share < 1:
             raise ValueError(f"density.quantile lies in [0, 1] and edge_share in (0, 1), got {quantile}, {edge_share}")
@@ -74,24 +74,16 @@ class Proximity(DensityControl):
             raise ValueError(
                 "density.radiance names no tensor; give those that hold radiance, such as {sh0: 1.7724539}"
             )
-        self.recipe, self.radiance = recipe, dict(radiance)
+        self.radiance = dict(radiance)
         self.neighbours, self.quantile, self.threshold = neighbours, quantile, threshold
         self.edge_share, self.distance, self.attenuation = edge_share, distance, attenuation
-        self.min_opacity, self.growth, self.cap_max = min_opacity, growth, cap_max
-        self.start, self.stop, self.every = start, stop, every
-        self.absgrad = recipe.absgrad
-
-    def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        """The recipe's statistics; proximity keeps none."""
-        return self.recipe.initial_state(count, device)
-
-    def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
-        self.recipe.observe(state, output, camera, step)
+        self.min_opacity, self.insert_growth = min_opacity, insert_growth
+        self.insert_stop, self.insert_every = insert_stop, insert_every
 
     @torch.no_grad()
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
-        change = self.recipe.refine(cloud, step, extent, generator)
-        if not self.start <= step < self.stop or (step + 1) % self.every != 0:
+        change = super().refine(cloud, step, extent, generator)
+        if not self.start <= step < self.insert_stop or (step + 1) % self.insert_every != 0:
             return change
         added = self._insert(cloud, extent)
         if added == 0:
@@ -106,7 +98,7 @@ class Proximity(DensityControl):
                 f"density.radiance names {', '.join(self.radiance)}, but the Gaussians have "
                 f"{', '.join(cloud.splats.names)}; name the tensors that hold the radiance of this thermal model"
             )
-        room = min(int(self.growth * len(cloud)), self.cap_max - len(cloud))
+        room = min(int(self.insert_growth * len(cloud)), self.cap_max - len(cloud))
         if room < 1:
             return 0
         sources, lengths, ends = self._edges(cloud, extent, room)

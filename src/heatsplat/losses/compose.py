@@ -23,7 +23,7 @@ class LossInputs:
         view: the view that the images belong to.
         splats: the Gaussians.
         step: training step, from 0.
-        max_steps: length of the run in steps.
+        progress: share of the run that is done, in [0, 1] (``Schedule.progress``).
         companions: prediction and target of the further images that the model explains, by modality.
     """
 
@@ -32,8 +32,8 @@ class LossInputs:
     mask: Tensor | None
     view: View
     splats: Splats
-    step: int
-    max_steps: int
+    step: int = 0
+    progress: float = 0.0
     companions: Mapping[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def pair(self, modality: str | None) -> tuple[Tensor, Tensor]:
@@ -50,11 +50,6 @@ class LossInputs:
                 f"a loss term asks for {modality} images, which the model does not explain (it has: {there})"
             )
         return self.companions[modality]
-
-    @property
-    def progress(self) -> float:
-        """Fraction of the run that is done, in [0, 1]."""
-        return min(self.step / max(self.max_steps, 1), 1.0)
 
 
 class LossTerm(Protocol):

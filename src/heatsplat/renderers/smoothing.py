@@ -17,8 +17,8 @@ class Smoothing(nn.Module):
     def prepare(self, scene: SceneData, means: Tensor) -> None:
         """Takes what it needs from the scene and from the centres [N, 3] of the Gaussians before the first step."""
 
-    def follow(self, means: Tensor, step: int, max_steps: int, changed: bool) -> None:
-        """Told after every training step: the centres [N, 3], and whether Gaussians came, went or were reset in it."""
+    def follow(self, means: Tensor, step: int, end: int, changed: bool) -> None:
+        """Told after every training step of ``end``: centres [N, 3], and whether Gaussians came, went or were reset in it."""
 
     def forward(self, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
         """Semi-axes [N, 3] and opacities [M, N] that are rendered."""
@@ -64,8 +64,8 @@ class SamplingFilter(Smoothing):
         except ValueError as error:
             raise SceneError(f"smoothing.near={self.near:g} does not fit scene '{scene.name}': {error}") from error
 
-    def follow(self, means: Tensor, step: int, max_steps: int, changed: bool) -> None:
-        due = (step + 1) % self.every == 0 and step + 1 < max_steps - self.every
+    def follow(self, means: Tensor, step: int, end: int, changed: bool) -> None:
+        due = (step + 1) % self.every == 0 and step + 1 < end - self.every
         if changed or due:
             self.widths = self._widths(means)
 

@@ -36,7 +36,6 @@ CALIBRATION_SECONDS = 4.0  # and at most this long
 CALIBRATION_ROUNDS = (3, 200)  # fewest and most timed steps of each size; fewer than three have no middle
 CALIBRATION_VIEWS = 20  # that take turns in them
 WARM_UP = 2  # steps before them: kernels compile and memory is found
-HEADROOM = 20  # a run has room for so many times its planned steps: where the pace was misjudged, it may need them
 DENSER = 4  # the second size of the calibration, in Gaussians of the start
 
 
@@ -91,10 +90,7 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
         budget_s: seconds that the whole run may take.
         device: where it trains.
     """
-    steppers = [
-        Stepper(make(), _denser(scene, factor), step=max_steps // 2, max_steps=max_steps, device=device)
-        for factor in (1, DENSER)
-    ]
+    steppers = [Stepper(make(), _denser(scene, factor), step=max_steps // 2, device=device) for factor in (1, DENSER)]
     times: list[list[float]] = [[] for _ in steppers]
     views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_VIEWS))]
     for turn in range(WARM_UP):
@@ -300,21 +296,19 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     """The configuration of a run that makes the most of ``budget`` seconds; the same without a budget.
 
     "budget" then holds the plan, made from the curves in the file ``budget_curves`` (None: those of the package); where it
-    holds one already, of an earlier run, that is kept. The trainer has room for more steps than planned, which
-    ``BudgetClock`` may use.
+    holds one already, of an earlier run, that is kept. A ``BudgetClock`` keeps it.
     """
     asked = config["budget"]
     if asked is None:
         return config
     made = Plan.from_dict(asked) if isinstance(asked, Mapping) else _measured(config, scene)
     decay = [] if made.decay is None else [f"optim.decay={made.decay}"]
-    caps = [f"{group}.cap_max={made.cap}" for group in _growing(config, "cap_max")]
-    resets = [
-        f"{group}.reset_every=null" for group in _growing(config, "reset_every")
-    ]  # as in the runs behind the curves
-    resets = [text for text in resets if text.partition("=")[0] not in keys_of(config["overrides"])]
-    planned = [f"max_steps={made.steps}", f"trainer.max_steps={HEADROOM * made.steps}", *caps, *decay, *resets]
-    overrides = config["overrides"]
+    overrides, density = config["overrides"], config["density"]
+    growth = {"cap_max": made.cap}
+    if "density.reset_every" not in keys_of(overrides):
+        growth["reset_every"] = "null"  # as in the runs behind the curves
+    growing = [f"density.{key}={value}" for key, value in growth.items() if density.get(key) is not None]
+    planned = [f"max_steps={made.steps}", *growing, *decay]
     config = _followed(config, compose(overrides), compose([*overrides, *planned]))
     clock = {"_target_": "heatsplat.callbacks.budget.BudgetClock", "plan": made.as_dict(), "twice": made.twice()}
     return config | {
@@ -330,18 +324,11 @@ def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
     module, seconds = filled(config)["module"], config["budget"]
     device = device_of(config["trainer"]["accelerator"])
     pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
-    density = config["density"]
-    cap_max = density.get("cap_max", density.get("recipe", {}).get("cap_max"))
+    cap_max = config["density"].get("cap_max")
     made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(config["overrides"]))
     for line in made.lines():
         log.info("%s", line)
     return made
-
-
-def _growing(config: Mapping[str, Any], setting: str) -> list[str]:
-    """Where density control has a setting that is not null: "density", "density.recipe" or both."""
-    groups = {"density": config["density"], "density.recipe": config["density"].get("recipe", {})}
-    return [name for name, settings in groups.items() if settings.get(setting) is not None]
 
 
 def _followed(config: Any, before: Any, after: Any) -> Any:

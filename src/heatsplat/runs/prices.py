@@ -55,8 +55,7 @@ def prices(
     if not without:
         return {}
     models = {
-        name: Stepper(make(), scene, step=max_steps - 1, max_steps=max_steps, device=device)
-        for name, make in {"": whole, **without}.items()
+        name: Stepper(make(), scene, step=max_steps - 1, device=device) for name, make in {"": whole, **without}.items()
     }
     sizes = {name: _size(model.module) for name, model in models.items()}
     views = [scene.train[i] for i in range(min(len(scene.train), ROUNDS[1]))]

@@ -58,8 +58,7 @@ def checkpoints_in(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 
 def planned_end(checkpoint: Mapping[str, Any]) -> int:
     """The last step that the run of a checkpoint was heading for."""
-    clock = checkpoint.get("callbacks", {}).get("BudgetClock")  # it moves the end
-    return round(clock["end"]) if clock else _recipe(checkpoint)["trainer"]["max_steps"]
+    return round(checkpoint[CHECKPOINT_KEY]["schedule"]["end"])
 
 
 def differences(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:

@@ -17,16 +17,15 @@ class Stepper:
     Args:
         module: a training module as the configuration builds it.
         scene: on which it trains.
-        step: the step at which it believes to be, of ``max_steps``.
-        max_steps: of the run.
+        step: the step at which it believes to be.
         device: "cpu" or "cuda".
     """
 
-    def __init__(self, module: Any, scene: SceneData, *, step: int, max_steps: int, device: torch.device | str) -> None:
+    def __init__(self, module: Any, scene: SceneData, *, step: int, device: torch.device | str) -> None:
         self.module = module
         module.attach(scene)
         module.loss.prepare(scene, module.modality)
-        module.trainer = SimpleNamespace(max_steps=max_steps, global_step=step, world_size=1, precision="32-true")
+        module.trainer = SimpleNamespace(global_step=step, world_size=1, precision="32-true")
         module.to(device).on_fit_start()
         self.optimizer = module.configure_optimizers()["optimizer"]
 

@@ -11,7 +11,7 @@ import csv
 import itertools
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,7 +60,6 @@ def run(
     decays: Sequence[float],
     seeds: Sequence[int],
     budgets: Sequence[float],
-    density: Mapping[str, str],
     overrides: Sequence[str],
     curves: str | None,
     threads: int | None = None,
@@ -77,7 +76,6 @@ def run(
         seeds: of every run of the grid.
         budgets: seconds for which a planned run is set beside the grid. These runs are planned from ``curves`` with the new
             points in it, as later ones will be; without it from the new points alone.
-        density: method -> where it has the options of the adaptive recipe; "density" for those that are not named.
         overrides: of every run. Opacities are never reset, as budget= trains.
         curves: curves file into which the points go: those of the same method, scene, steps, cap and decay are replaced,
             others stay. None: only the study's folder has the points.
@@ -95,9 +93,8 @@ def run(
     _known(curves)  # a file that is none is told before the runs, not after them
     for (method, scene), length, cap, decay, seed in itertools.product(pairs, steps, caps, decays, seeds):
         place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}_{decay:g}" / str(seed)
-        growth = density.get(method, "density")
-        wanted = [f"max_steps={length}", f"optim.decay={decay:g}", f"{growth}.reset_every=null"]
-        wanted += [f"{growth}.cap_max={cap}"] if cap else []
+        wanted = [f"max_steps={length}", f"optim.decay={decay:g}", "density.reset_every=null"]
+        wanted += [f"density.cap_max={cap}"] if cap else []
         results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
         grid.append(Trained(method, scene, length, cap, decay, seed, results, mean))

@@ -226,7 +226,7 @@ def _loss_row(width: int, height: int, channels: int, threads: int, rounds: int)
     photometric = Photometric()
 
     def fused(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        return sum(photometric(LossInputs(image, target, None, None, None, 0, 1)).values())
+        return sum(photometric(LossInputs(image, target, None, None, None)).values())
 
     def timed(loss: Callable) -> Callable[[], tuple[float]]:
         def once() -> tuple[float]:

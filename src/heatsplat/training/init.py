@@ -53,9 +53,17 @@ class Initialisation:
         self.source, self.count, self.opacity, self.scale = source, count, opacity, scale
         self.separate = separate
 
-    def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
-        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
-        means = self._means(scene, generator_for(seed, 0, "init"))
+    def __call__(
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: int | None = None
+    ) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties).
+
+        There are at most ``cap_max`` of them (``DensityControl``): of more points, a seeded draw.
+        """
+        times = len(thermal.opacity_channels) if self.separate else 1
+        means = self._means(
+            scene, generator_for(seed, 0, "init"), None if cap_max is None else max(cap_max // times, 1)
+        )
         count, distances = len(means), neighbour_distances(means)
         if count == 1:
             distances = torch.full((1, 1), LONE_SIZE * scene.extent)
@@ -71,10 +79,13 @@ class Initialisation:
             geometry = _separate(geometry)
         return with_heat(geometry, scene, thermal, seed)
 
-    def _means(self, scene: SceneData, generator: torch.Generator) -> Tensor:
+    def _means(self, scene: SceneData, generator: torch.Generator, most: int | None) -> Tensor:
         points = scene.points.float()
+        wanted = (self.count or 100_000) if self.source == "random" else min(self.count or len(points), len(points))
+        count = wanted if most is None else min(wanted, most)
+        if count < wanted:
+            log.info("init: %s of %s Gaussians, as many as density.cap_max allows", f"{count:,}", f"{wanted:,}")
         if self.source == "random":
-            count = self.count or 100_000
             low, high = torch.quantile(points, torch.tensor([0.01, 0.99]), dim=0)
             return low + (high - low) * torch.rand(count, 3, generator=generator)
         if len(points) < NEIGHBOURS + 1:
@@ -82,8 +93,8 @@ class Initialisation:
                 f"scene '{scene.name}' has {len(points)} points, at least {NEIGHBOURS + 1} are needed to start from; "
                 "use init=random."
             )
-        if self.count is not None and len(points) > self.count:
-            points = points[torch.randperm(len(points), generator=generator)[: self.count].sort().values]
+        if count < len(points):
+            points = points[torch.randperm(len(points), generator=generator)[:count].sort().values]
         return points
 
 
@@ -103,8 +114,10 @@ class Pretrained:
             raise SceneError("init.path is not set; give a point cloud .ply or a checkpoint .ckpt of the same scene")
         self.path = Path(path).expanduser()
 
-    def __call__(self, scene: SceneData, thermal: ThermalModel, seed: int) -> tuple[Splats, dict[str, PerGaussian]]:
-        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties)."""
+    def __call__(
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: int | None = None
+    ) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats for a scene, and what the thermal model declared about its tensors; more than ``cap_max`` are all kept."""
         if not self.path.is_file():
             raise SceneError(
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"

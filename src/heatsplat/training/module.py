@@ -11,7 +11,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, RenderOutput, SceneData, SceneError, View
+from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
@@ -24,6 +24,7 @@ from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.rng import generator_for
+from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
 
 CHECKPOINT_KEY = "heatsplat"
@@ -33,9 +34,10 @@ class SplatTraining(pl.LightningModule):
     """Trains splats with a thermal model on the views of a scene.
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, ``density_change`` (what density control did in the last
-    step, None for nothing), and ``recipe``, the resolved configuration as plain containers: it travels in the checkpoint, so
-    that a checkpoint and its data are enough to evaluate or render.
+    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, ``schedule`` (how far the run is, and when it ends),
+    ``density_change`` (what density control did in the last step, None for nothing), and ``recipe``, the resolved
+    configuration as plain containers: it travels in the checkpoint, so that a checkpoint and its data are enough to evaluate
+    or render.
 
     Args:
         thermal: what splats emit.
@@ -44,10 +46,11 @@ class SplatTraining(pl.LightningModule):
         density: how many Gaussians there are.
         loss: what is minimised.
         init: how splats start.
-        optim: learning rates and schedule.
-        stages: which parameters stand still at which steps, and where training begins anew; None: all train throughout.
+        optim: learning rates and their decay.
+        stages: which parameters are frozen at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
+        max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
         dtype: "float32" or "float64", of splats, heat, sensor, loss and optimiser; what the renderer makes of it is said
@@ -70,6 +73,7 @@ class SplatTraining(pl.LightningModule):
         stages: Stages | None = None,
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
+        max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
         dtype: str = "float32",
@@ -79,6 +83,7 @@ class SplatTraining(pl.LightningModule):
         self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
         self.stages = stages or Stages({})
+        self.schedule = Schedule(max_steps, self.stages.restarts)
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
         self.seed, self.output_dir = seed, Path(output_dir)
@@ -94,7 +99,7 @@ class SplatTraining(pl.LightningModule):
         self._declared: dict[str, PerGaussian] = {}
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
-        self._rendered: tuple[RenderOutput, View] | None = None
+        self._rendered: tuple[RenderOutput, Camera] | None = None
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -104,6 +109,7 @@ class SplatTraining(pl.LightningModule):
             self.attach(self.trainer.datamodule.scene)
         if stage == "fit":
             self.results.data |= self.loss.prepare(self.scene, self.modality)
+            self.trainer.val_check_interval = self._between_resets(self.trainer.val_check_interval)
 
     def attach(self, scene: SceneData) -> None:
         """Builds all that depends on the scene. Refuses a scene that lacks what the thermal model needs."""
@@ -112,7 +118,7 @@ class SplatTraining(pl.LightningModule):
         self.thermal.prepare(scene)
         self.sensor.prepare(scene)
         self.composite.prepare(scene, self.modality)
-        self.splats, self._declared = self.init(scene, self.thermal, self.seed)
+        self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
@@ -154,11 +160,27 @@ class SplatTraining(pl.LightningModule):
             for name, part in self.sensor.parts.items()
             for inner, parameter in part.named_parameters()
         ]
-        optimizer, scheduler = self.optim.build(groups, self.trainer.max_steps, self.stages.progress)
+        optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
+    def _between_resets(self, interval: int | float) -> int | float:
+        """Steps between validations, none of which measures opacities that were just reset."""
+        if not isinstance(interval, int):
+            return interval
+        return self.schedule.interval(interval, lambda step: self.density.settled(self.schedule.round_step(step - 1)))
+
     # One step ----------------------------------------------------------------------------------------
+
+    def on_train_start(self) -> None:
+        self._stop_at_the_end()
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        self._stop_at_the_end()
+
+    def _stop_at_the_end(self) -> None:
+        if self.global_step >= self.schedule.end:
+            self.trainer.should_stop = True
 
     def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
@@ -189,7 +211,7 @@ class SplatTraining(pl.LightningModule):
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
         view = view.to(self.device, self.dtype)
-        self.thermal.on_step(self.stages.round_step(step))
+        self.thermal.on_step(self.schedule.round_step(step))
         frame = self._fine(view.frame)
         output = self.render(frame, absgrad=self.density.absgrad)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
@@ -201,7 +223,7 @@ class SplatTraining(pl.LightningModule):
             view,
             self.splats,
             step,
-            self.trainer.max_steps,
+            self.schedule.progress(step),
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
@@ -217,26 +239,26 @@ class SplatTraining(pl.LightningModule):
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
-        self.density.observe(self._density_state, output, camera, self.stages.round_step(self.global_step))
+        self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
         inner = getattr(optimizer, "optimizer", optimizer)
-        if step in self.stages.restarts:
+        if step in self.schedule.restarts:
             inner.state.clear()
             for statistic in self._density_state.values():
                 statistic.zero_()
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure)
         cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
-        here = self.stages.round_step(step)
+        here = self.schedule.round_step(step)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
-        self.smoothing.follow(self.splats.means.detach(), step, self.trainer.max_steps, change is not None)
+        self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
@@ -306,6 +328,7 @@ class SplatTraining(pl.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {
             "recipe": self.recipe,
+            "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
 
@@ -319,6 +342,7 @@ class SplatTraining(pl.LightningModule):
             if stored is not None and stored.shape != buffer.shape:
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
+        self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

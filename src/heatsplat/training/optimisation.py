@@ -1,4 +1,4 @@
-"""Learning rates of the geometry and the schedule of a run; one Adam with one named group per tensor."""
+"""Learning rates of the geometry and their decay; one Adam with one named group per tensor."""
 
 from __future__ import annotations
 
@@ -8,10 +8,6 @@ from typing import Any
 import torch
 
 from heatsplat.splats import Splats
-
-
-def _progress(step: float, max_steps: int) -> float:
-    return min(step / max(max_steps, 1), 1.0)
 
 
 class Optimisation:
@@ -59,17 +55,15 @@ class Optimisation:
             for name, lr in rates.items()
         ]
 
-    def build(self, groups: list[dict[str, Any]], max_steps: int, progress: Callable[[float, int], float] = _progress):
+    def build(self, groups: list[dict[str, Any]], progress: Callable[[float], float]):
         """The optimiser over all groups, and the scheduler to call after every step.
 
         Args:
             groups: each with "name", "params", "lr" and, where the rate changes, "lr_end": the factor on it at the last
                 step, log-linear in between.
-            max_steps: length of the run.
-            progress: function of a step and the length of the run to the share of the schedule that is done, where it
-                is not the share of the run, as in a run of several rounds.
+            progress: function of a step to the share of the decay that is done (``Schedule.round_progress``).
         """
         optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
         ends = [group.get("lr_end", 1.0) ** self.decay for group in optimizer.param_groups]
-        factors = [lambda step, end=end: end ** progress(step, max_steps) for end in ends]
+        factors = [lambda step, end=end: end ** progress(step) for end in ends]
         return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import torch
@@ -11,27 +12,24 @@ from heatsplat.training.rng import generator_for
 
 
 class StepSampler(Sampler[int]):
-    """View positions for the steps ``start_step`` .. ``steps`` - 1; every pass over the views is a fresh permutation.
+    """View positions for the steps from ``start_step`` on, without end; every pass over the views is a fresh permutation.
 
     One epoch of the trainer is the whole run: a DataLoader that restarts with every pass over 50 views would restart in
-    the middle of a resumed run as well, and show it other views than an uninterrupted run. The length is that of the
-    whole run wherever it starts, because the trainer compares it with its own batch counter, which a checkpoint
-    restores.
+    the middle of a resumed run as well, and show it other views than an uninterrupted run. The end of
+    the run is known to its ``Schedule`` alone.
 
     Args:
         count: number of training views.
         seed: the run's seed.
         start_step: first step to draw for (``trainer.global_step``).
-        steps: step at which the run ends (``trainer.max_steps``); None or negative means one pass over the views.
     """
 
-    def __init__(self, count: int, seed: int, start_step: int = 0, steps: int | None = None) -> None:
+    def __init__(self, count: int, seed: int, start_step: int = 0) -> None:
         if count < 1:
             raise ValueError(f"StepSampler needs at least one view, got {count}")
         self.count = count
         self.seed = seed
         self.start_step = start_step
-        self.steps = count if steps is None or steps < 0 else steps
         self._epoch = -1
         self._permutation: list[int] = []
 
@@ -45,7 +43,4 @@ class StepSampler(Sampler[int]):
         return self._permutation[place]
 
     def __iter__(self) -> Iterator[int]:
-        return (self.view_at(step) for step in range(self.start_step, self.steps))
-
-    def __len__(self) -> int:
-        return self.steps
+        return (self.view_at(step) for step in itertools.count(self.start_step))

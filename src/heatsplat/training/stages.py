@@ -1,4 +1,4 @@
-"""Stages of a run: which parameters stand still at which steps, and where training begins anew.
+"""Stages of a run: which parameters are frozen at which steps, and where training begins anew.
 
 A pure function of the step, so resuming is free.
 """
@@ -19,17 +19,17 @@ log = logging.getLogger(__name__)
 COLUMN = re.compile(r"(.+)\[(\d+)\]")
 
 
-class Rest:
-    """Steps at which some parameters stand still: one stretch of the run, or the end of every cycle in it.
+class Freeze:
+    """Steps at which some parameters are frozen: one stretch of the run, or the end of every cycle in it.
 
     Args:
         groups: names of the optimiser's groups, wildcards allowed ("thermal.*"). "opacity_logits[1]" is the second
             column of a tensor that has several; a tensor of one column is shared, and such a name leaves it alone.
         start: first step.
         stop: the step before which it ends; None is the end of the run.
-        cycle: steps of a cycle, counted from ``start``; None rests from ``start`` to ``stop``.
-        share: part of a cycle, at its end, in which they rest.
-        turn, turns: they rest in every ``turns``-th cycle, the first of which is number ``turn``.
+        cycle: steps of a cycle, counted from ``start``; None freezes from ``start`` to ``stop``.
+        share: part of a cycle, at its end, in which they are frozen.
+        turn, turns: they are frozen in every ``turns``-th cycle, the first of which is number ``turn``.
 
     Raises:
         ValueError: an option is out of its range.
@@ -55,7 +55,7 @@ class Rest:
         self.cycle, self.share, self.turn, self.turns = cycle, share, turn, turns
 
     def at(self, step: int) -> bool:
-        """Whether the parameters stand still at ``step``."""
+        """Whether the parameters are frozen at ``step``."""
         if step < self.start or (self.stop is not None and step >= self.stop):
             return False
         if self.cycle is None:
@@ -65,62 +65,46 @@ class Rest:
 
 
 class Stages:
-    """Holds parameters still while a step runs. They, their moments and their penalties are left as they were.
+    """Freezes parameters while a step runs. They, their moments and their penalties are left as they were.
 
     A run may be several rounds: a restart leaves the Gaussians as they are and begins training anew, with a fresh
     optimiser, and with learning rates, density control and the schedules of the thermal model at their start. Steps of
-    ``rests`` and of losses are those of the run.
+    ``freezes`` and of losses are those of the run.
 
     Args:
-        rests: name -> when which parameters stand still, or None for a stage that is absent.
+        freezes: name -> when which parameters are frozen, or None for a stage that is absent.
         restarts: first steps of all rounds but the first.
-
-    Raises:
-        ValueError: restarts do not increase from 1 on.
     """
 
-    def __init__(self, rests: Mapping[str, Rest | None], restarts: Sequence[int] = ()) -> None:
-        self.rests = {name: rest for name, rest in rests.items() if rest is not None}
+    def __init__(self, freezes: Mapping[str, Freeze | None], restarts: Sequence[int] = ()) -> None:
+        self.freezes = {name: freeze for name, freeze in freezes.items() if freeze is not None}
         self.restarts = tuple(restarts)
-        if any(after <= before for before, after in zip((0, *self.restarts), self.restarts, strict=False)):
-            raise ValueError(f"stages.restarts must be increasing steps from 1 on, got {list(restarts)}")
-
-    def round_step(self, step: int) -> int:
-        """The step counted from the first of its round."""
-        return step - max((first for first in self.restarts if first <= step), default=0)
-
-    def progress(self, step: float, max_steps: int) -> float:
-        """Share of its round that is done at a step of a run of ``max_steps``, in [0, 1]."""
-        firsts = [0, *self.restarts, max(max_steps, 1)]
-        number = max(number for number, first in enumerate(firsts[:-1]) if first <= step or number == 0)
-        first, after = firsts[number : number + 2]
-        return min(max(step - first, 0) / max(after - first, 1), 1.0)
 
     def check(self, optimizer: torch.optim.Optimizer) -> None:
-        """Warns of stages that hold nothing still, as none of their names is a group of this run."""
-        for name, rest in self.rests.items():
-            if not any(_found(rest.groups, optimizer)):
+        """Warns of stages that freeze nothing, as none of their names is a group of this run."""
+        for name, freeze in self.freezes.items():
+            if not any(_found(freeze.groups, optimizer)):
                 there = ", ".join(group["name"] for group in optimizer.param_groups)
                 log.warning(
-                    "stage '%s' holds nothing still: none of %s is a parameter group of this run (%s)",
+                    "stage '%s' freezes nothing: none of %s is a parameter group of this run (%s)",
                     name,
-                    ", ".join(rest.groups),
+                    ", ".join(freeze.groups),
                     there,
                 )
 
     @contextmanager
     def on_step(self, step: int, optimizer: torch.optim.Optimizer) -> Iterator[None]:
-        """Runs a training step, from the render to the optimiser's update, with the resting parameters held still.
+        """Runs a training step, from the render to the optimiser's update, with its parameters frozen.
 
         Whole tensors get no gradient, so that nothing is computed for them and the optimiser passes them by. Columns of
         a tensor are put back, with their moments, after the update.
         """
-        names = [name for rest in self.rests.values() if rest.at(step) for name in rest.groups]
-        still = list(_found(names, optimizer))
-        whole = [parameter for parameter, column in still if column is None]
+        names = [name for freeze in self.freezes.values() if freeze.at(step) for name in freeze.groups]
+        frozen = list(_found(names, optimizer))
+        whole = [parameter for parameter, column in frozen if column is None]
         held = [
             (parameter, column, _columns(parameter, column, optimizer))
-            for parameter, column in still
+            for parameter, column in frozen
             if column is not None
         ]
         for parameter in whole:

@@ -50,7 +50,7 @@ def _ssim_ours(index: Tensor, change: Tensor) -> Tensor:
 def _ssim_fused(index: Tensor, change: Tensor) -> Tensor:
     loss, found = Photometric(1.0), []
     for prediction, target in zip(*_changed(index, change), strict=True):
-        inputs = LossInputs(prediction, target, None, None, None, 0, 1, {})
+        inputs = LossInputs(prediction, target, None, None, None)
         found.append(1 - loss(inputs)["dssim"])
     return torch.stack(found)
 

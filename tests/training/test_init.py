@@ -1,0 +1,48 @@
+"""Splats before the first step: how many, where, and how large."""
+
+import logging
+
+import pytest
+import torch
+from running import TINY
+
+from heatsplat.composition import build, compose
+from heatsplat.training.init import Initialisation, neighbour_distances
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """(scene, thermal model) of the tiny synthetic scene."""
+    plain = compose([*TINY, "method=3dgs"])
+    return build(plain["data"]).scene, build(plain["module"]["thermal"])
+
+
+def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
+    scene, thermal = parts
+    splats, _ = Initialisation(scale=0.5)(scene, thermal, seed=0)
+    size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
+    assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
+    assert torch.allclose(splats.opacities.detach(), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize("source", ["sfm", "random"])
+def test_no_more_start_than_density_control_allows(parts, source, caplog):
+    scene, thermal = parts
+    start = Initialisation(source, count=None if source == "sfm" else 300)
+    whole, _ = start(scene, thermal, seed=0)
+    with caplog.at_level(logging.INFO):
+        same, _ = start(scene, thermal, seed=0, cap_max=len(whole))
+        assert not caplog.records
+        first, second = (start(scene, thermal, seed=0, cap_max=100)[0] for _ in range(2))
+    assert f"init: 100 of {len(whole)} Gaussians, as many as density.cap_max allows" in caplog.text
+    assert all(torch.equal(whole[name], same[name]) for name in whole.names)
+    assert len(first) == 100 and torch.equal(first["means"], second["means"])
+    if source == "sfm":
+        assert (first["means"].detach()[:, None] == scene.points.float()).all(-1).any(1).all()
+
+
+def test_clouds_of_their_own_share_the_cap(parts):
+    scene, _ = parts
+    plain = compose([*TINY, "method=msmg"])
+    splats, _ = Initialisation(separate=True)(scene, build(plain["module"]["thermal"]), seed=0, cap_max=101)
+    assert len(splats) == 100
