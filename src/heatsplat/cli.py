@@ -5,8 +5,11 @@ Only Hydra is imported before the configuration is composed, so that --help, --c
 
 from __future__ import annotations
 
+import difflib
 import functools
 import logging
+import os
+import re
 import signal
 import sys
 import traceback
@@ -17,10 +20,12 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from heatsplat.composition import CONF, build, plain, run_of
+from heatsplat.composition import CONF, build, composed, plain, run_of
 
 log = logging.getLogger("heatsplat")
 
@@ -60,6 +65,72 @@ def stoppable() -> Iterator[None]:
             signal.signal(number, listener)
 
 
+EXAMPLES = {
+    "train": (
+        "method=etgs",
+        "method=auto data.scene=heated budget=2min",
+        "method=3dgs data=colmap data.root=/data/my_scene",
+    ),
+    "evaluate": ("ckpt=outputs/.../checkpoints/last.ckpt",),
+    "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
+    "study": ("study=frontier study.runs=outputs",),
+}
+
+
+def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
+    """The command of a job: without arguments it says how it is used, and what cannot be composed is told in a sentence."""
+    name = job.__name__
+    main = hydra.main(version_base="1.3", config_path=CONF, config_name=name)(job)
+
+    @functools.wraps(main)
+    def command() -> Any:
+        if len(sys.argv) == 1:
+            script = sys.argv[0] if sys.argv[0].endswith(".py") else f"heatsplat-{name}"
+            script = f"python {script}" if script.endswith(".py") else script
+            lines = [
+                (job.__doc__ or "").partition("\n")[0],
+                "",
+                *(f"  {script} {example}" for example in EXAMPLES[name]),
+            ]
+            print("\n".join([*lines, "", f"{script} --help lists what can be set."]))
+            sys.exit(2)
+        all_of_it = "HYDRA_FULL_ERROR" in os.environ
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print otherwise
+        try:
+            return main()
+        except (CompactHydraException, OmegaConfBaseException) as error:
+            if all_of_it:
+                raise
+            sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
+
+    return command
+
+
+def _meant(error: Exception, name: str) -> str:
+    """ "Did you mean ...?" for a group's option or a key that there is not; empty where nothing is like it."""
+    if (wrong := getattr(error, "missing_cfg_file", None)) and error.options:
+        group, _, wrong = wrong.rpartition("/")
+        near, form = difflib.get_close_matches(wrong, error.options, 3, 0.5), f"{group}={{}}"
+    elif unknown := re.search(r"Could not override '([^']+)'", str(error)):
+        wrong, form = unknown[1], "{}"
+        given = [text for text in sys.argv[1:] if not text.startswith(("-", wrong))]
+        try:
+            settings = OmegaConf.to_container(composed(given, name))
+        except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
+            return ""
+        near = difflib.get_close_matches(wrong, [*_keys(settings), *os.listdir(CONF)], 3)
+    else:
+        return ""
+    return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _keys(settings: dict[str, Any], path: str = "") -> Iterator[str]:
+    for key, value in settings.items():
+        yield f"{path}{key}"
+        if isinstance(value, dict):
+            yield from _keys(value, f"{path}{key}.")
+
+
 def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], Any]:
     """Runs ``work(config, output_dir)`` so that a failure leaves a FAILED file and a readable message.
 
@@ -70,23 +141,35 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
 
     @functools.wraps(work)
     def job(config: DictConfig) -> Any:
-        from heatsplat.io.results import FAILED  # here, for it brings torch
+        from heatsplat.io.results import FAILED, METRICS_FILE  # here, for they bring torch
+        from heatsplat.runs.folder import OccupiedError, locked
 
         hydra_config = HydraConfig.get()
         output_dir = Path(hydra_config.runtime.output_dir)
-        (output_dir / FAILED).unlink(missing_ok=True)
         try:
-            with stoppable():
+            with locked(output_dir), stoppable():
+                (output_dir / FAILED).unlink(missing_ok=True)
+                if not (output_dir / METRICS_FILE).exists():
+                    _write_down(config, hydra_config, output_dir / ".hydra")
                 return work(plain(config, hydra_config.overrides.task), output_dir)
         except Exception as error:
-            (output_dir / FAILED).write_text(traceback.format_exc())
             cause = _expected(error)
+            if not isinstance(cause, OccupiedError):
+                (output_dir / FAILED).write_text(traceback.format_exc())
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
             log.error("%s: %s", type(cause).__name__, cause)
             sys.exit(1)
 
     return job
+
+
+def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> None:
+    """Writes what was composed, as Hydra would before it is known whether the folder holds another run."""
+    folder.mkdir(exist_ok=True)
+    OmegaConf.save(config, folder / "config.yaml")
+    OmegaConf.save(OmegaConf.create({"hydra": hydra_config}), folder / "hydra.yaml")
+    OmegaConf.save(hydra_config.overrides.task, folder / "overrides.yaml")
 
 
 def _expected(error: BaseException) -> BaseException | None:
@@ -100,18 +183,18 @@ def _expected(error: BaseException) -> BaseException | None:
     return None
 
 
-@hydra.main(version_base="1.3", config_path=CONF, config_name="train")
+@_command
 @_job
 def train(config: dict[str, Any], output_dir: Path) -> float | None:
     """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
     from heatsplat.contracts import SceneError
-    from heatsplat.runs.run import train
+    from heatsplat.runs.run import complete
 
     if (chosen := HydraConfig.get().runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)
-    return train(config, output_dir).test.get("psnr")
+    return complete(config, output_dir).test.get("psnr")
 
 
 def check_first(ckpt: str) -> None:
@@ -125,7 +208,7 @@ def check_first(ckpt: str) -> None:
         raise SceneError(f"the run that comes before this one has no results: {reason_of(folder)} (in {folder})")
 
 
-@hydra.main(version_base="1.3", config_path=CONF, config_name="evaluate")
+@_command
 @_job
 def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     """Measures the test views of a checkpoint. Returns the test PSNR."""
@@ -139,7 +222,7 @@ def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     return trained.module.results.test.get("psnr")
 
 
-@hydra.main(version_base="1.3", config_path=CONF, config_name="render")
+@_command
 @_job
 def render(config: dict[str, Any], output_dir: Path) -> None:
     """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
@@ -165,12 +248,16 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 
 
-@hydra.main(version_base="1.3", config_path=CONF, config_name="study")
+@_command
 @_job
 def study(config: dict[str, Any], output_dir: Path) -> None:
     """Runs a study; its tables and pictures lie in the run's folder."""
+    from heatsplat.contracts import SceneError
     from heatsplat.training.session import prepare_machine
 
+    if config["study"] is None:
+        there = sorted(path.stem for path in Path(CONF, "study").glob("*.yaml"))
+        raise SceneError(f"which study? Give study=..., one of {', '.join(there)}")
     prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)

@@ -25,7 +25,7 @@ ALLOWED = {
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "composition": {"training", "heatsplat"},
-    "runs": {"contracts", "composition", "effects", "geometry", "io", "shots", "training"},
+    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "training"},
     "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}
     | {"effects", "sensors", "thermal", "training", "runs"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},

@@ -105,3 +105,25 @@ def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path):
 def test_help_lists_the_choices(tmp_path):
     output = command("train", "method=etgs", "--help", cwd=tmp_path)
     assert "etgs" in output and "colmap" in output
+
+
+def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp_path):
+    for script in ("train", "study"):
+        assert f"src/{script}.py {'method' if script == 'train' else 'study'}=" in command(script, cwd=tmp_path, code=2)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"), [("method=etsg", "method=etgs"), ("max_stepz=10", "max_steps"), ("metod=etgs", "method")]
+)
+def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
+    output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
+    assert f"Did you mean {meant}" in output and "Traceback" not in output
+
+
+def test_results_stay_those_of_their_settings(finished):
+    before = {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
+    told = command("train", "method=etgs", *TINY, "optim.means=1e-3", f"hydra.run.dir={finished}", cwd=finished, code=1)
+    assert "other settings (optim.means)" in told
+    assert len(before) == 3 and before == {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
+    assert not (finished / "FAILED").exists()

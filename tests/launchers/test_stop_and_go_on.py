@@ -6,7 +6,7 @@ import signal
 import pytest
 import torch
 from hydra.core.utils import JobStatus
-from running import TINY, compose_run
+from running import TINY, compose_run, run
 
 from heatsplat import cli, composition
 from heatsplat.runs.resume import resumed
@@ -93,3 +93,12 @@ def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):
     (job.folder / "FAILED").write_text("what the job said itself")
     _died(job, DiedError("later"))
     assert (job.folder / "FAILED").read_text() == "what the job said itself"
+
+
+def test_under_slurm_a_stray_checkpoint_of_the_working_directory_is_not_gone_on_from(tmp_path, monkeypatch):
+    for name, value in {"SLURM_NTASKS": "1", "SLURM_JOB_NAME": "job", "SLURM_JOB_ID": "1", "SLURM_NODELIST": "a"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hpc_ckpt_1.ckpt").write_bytes(b"of another run")
+    _, trainer = run(tmp_path / "run", *TINY, "method=3dgs", "max_steps=2", "data.downscale=4", "test=false")
+    assert trainer.global_step == 2

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator, Mapping
 from typing import Any
+
+import torch
 
 from heatsplat.composition import keys_of
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
+from heatsplat.renderers import gsplat
 from heatsplat.runs.budget import seconds_of
+
+RATES = (
+    "means",
+    "log_scales",
+    "quats",
+    "opacity_logits",
+)  # learning rates in the group "optim"; elsewhere they are lr, lr_*
+MAX_THREADS_PER_CORE = 4  # more only wait for each other
 
 
 def checked(config: dict[str, Any]) -> dict[str, Any]:
     """The configuration with ``budget`` in seconds.
 
     Raises:
-        SceneError: settings contradict each other or lie out of range.
+        SceneError: settings contradict each other, lie out of range, or need what this machine lacks.
+        ImportError: the renderer is not installed.
     """
+    _check_ranges(config)
+    _check_machine(config)
     if config["budget"] is not None:
         config = config | {"budget": seconds_of(config["budget"])}
         if "max_steps" in keys_of(config["overrides"]):
@@ -29,3 +45,42 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
                 "Set its parts by effects.states.*, effects.parts.* and effects.sensor.*, or choose a method that has its own."
             )
     return config
+
+
+def _check_ranges(config: Mapping[str, Any]) -> None:
+    most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
+    threads = config["threads"]
+    if threads is not None and not 1 <= threads <= most:
+        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+    if not config["max_steps"] >= 1:
+        raise SceneError(f"max_steps must be 1 or more, got {config['max_steps']}")
+    for key, rate in _rates(config):
+        if isinstance(rate, int | float) and not rate >= 0:
+            raise SceneError(f"{key} is a learning rate and must be 0 or more, got {rate}")
+
+
+def _rates(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Learning rates with their dotted keys."""
+    yield from ((f"optim.{name}", config["optim"].get(name)) for name in RATES)
+    for group in ("thermal", "sensor"):
+        yield from _rates_in(config[group], group)
+
+
+def _rates_in(settings: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _rates_in(value, f"{path}.{name}")
+        elif str(name) == "lr" or str(name).startswith("lr_"):
+            yield f"{path}.{name}", value
+
+
+def _check_machine(config: Mapping[str, Any]) -> None:
+    accelerator, cuda = config["trainer"]["accelerator"], torch.cuda.is_available()
+    if accelerator in ("cuda", "gpu") and not cuda:
+        raise SceneError(
+            f"trainer.accelerator={accelerator}: PyTorch sees no CUDA device here; leave it out for the CPU"
+        )
+    if config["renderer"]["backend"] == "gsplat":
+        gsplat.load()
+        if not cuda or accelerator == "cpu":
+            raise SceneError("renderer=gsplat renders on CUDA only; leave it out for the CPU")

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
 from heatsplat.training.module import CHECKPOINT_KEY
 from heatsplat.training.session import load_checkpoint
@@ -32,9 +32,9 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         SceneError: the checkpoint that was given is none, or of a run with another budget or other effects.
     """
     if config["ckpt"] is not None:
-        return _continued(config, _recipe(load_checkpoint(config["ckpt"])))
+        return _continued(config, recipe_of(load_checkpoint(config["ckpt"])))
     for path, checkpoint in checkpoints_in(output_dir):
-        stored = _recipe(checkpoint)
+        stored = recipe_of(checkpoint)
         changed = differences(config, stored)
         if changed:
             log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
@@ -44,6 +44,23 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return config | {"ckpt": str(path)}
     return config
+
+
+def on_scene(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
+    """The configuration with "scene", the name and the image size of what is trained on.
+
+    Raises:
+        SceneError: the run goes on from a checkpoint of another scene or image size, with both.
+    """
+    camera = scene.train.frames[0].camera
+    here = {"name": scene.name, "width": camera.width, "height": camera.height}
+    before = config.get("scene", here)
+    if before != here:
+        told = [f"{one['name']} in {one['width']} x {one['height']} pixels" for one in (before, here)]
+        raise SceneError(
+            f"{config['ckpt']} was trained on {told[0]}, and this is {told[1]}: give the data it was trained on"
+        )
+    return config | {"scene": here}
 
 
 def checkpoints_in(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -74,7 +91,14 @@ def differences(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[st
 
 def completed(config: dict[str, Any], composed: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with what it was ``composed`` as, under that key, where it has become something else."""
-    return config | {"composed": {key: value for key, value in composed.items() if config[key] != value}}
+    return config | {
+        "composed": {key: value for key, value in composed.items() if config[key] != value and key != "ckpt"}
+    }
+
+
+def recipe_of(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of the run that wrote a checkpoint; empty where none of ours did."""
+    return checkpoint.get(CHECKPOINT_KEY, {}).get("recipe", {})
 
 
 def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
@@ -83,10 +107,6 @@ def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
             yield from _differing(f"{key}.{name}", one.get(name), other.get(name))
     elif one != other:
         yield key
-
-
-def _recipe(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    return checkpoint.get(CHECKPOINT_KEY, {}).get("recipe", {})
 
 
 def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,6 +118,8 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
         if plan["asked_s"] != asked:
             raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
         config = config | {"budget": plan}
+    if "scene" in stored:
+        config = config | {"scene": stored["scene"]}
     if "verdicts" in stored and assembly.chooses(config):
         changed = assembly.changed(config, stored)
         if changed:

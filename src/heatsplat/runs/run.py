@@ -19,10 +19,11 @@ from torch import Tensor
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.geometry.coverage import Sighting, covered, surface_depth
-from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
-from heatsplat.runs.resume import completed, resumed
+from heatsplat.runs.folder import locked, results_in
+from heatsplat.runs.resume import completed, on_scene, resumed
 from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
@@ -59,15 +60,22 @@ def train(config: dict[str, Any], output_dir: Path | str | None = None) -> RunRe
 
     Raises:
         SceneError: the configuration or the scene cannot be trained, with the remedy.
+        OccupiedError: the folder holds results of other settings, or another process trains in it.
     """
     if output_dir is None:
         data = config["data"]
         scene = scene_name("data", data.get("root"), data.get("scene"))
         output_dir = Path("outputs") / f"{config['name']}_{scene}" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
-    output_dir = Path(output_dir)
-    if (output_dir / METRICS_FILE).exists():
+    with locked(Path(output_dir)):
+        return complete(config, Path(output_dir))
+
+
+def complete(config: dict[str, Any], output_dir: Path) -> RunResults:
+    """As ``train``, in a folder that is kept from other processes."""
+    results = results_in(output_dir, config)
+    if results is not None:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
-        return RunResults.read(output_dir / METRICS_FILE)
+        return results
     run = begin(config, output_dir)
     return fit(run.module, run.data, run.trainer, ckpt=run.config["ckpt"], test=run.config["test"])
 
@@ -78,6 +86,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
     config = composed = checked(config)
     config = resumed(config, output_dir)
     data = build(config["data"])
+    config = on_scene(config, data.scene)
     config = decided(config, data.scene)
     config = budgeted(config, data.scene)
     config = filled(config)

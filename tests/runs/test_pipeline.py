@@ -1,0 +1,103 @@
+"""The steps that make a run's configuration ready, and the Python interface around them."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from running import TINY
+
+import heatsplat
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import METRICS_FILE
+from heatsplat.runs.checks import checked
+from heatsplat.runs.folder import OccupiedError, locked
+from heatsplat.runs.resume import differences
+from heatsplat.training.session import load_checkpoint
+
+QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "trainer.limit_test_batches=1")
+QUICK = (*QUICK, "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", "callbacks.statistics=null")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Folder of a finished run, its configuration and its results."""
+    folder, config = tmp_path_factory.mktemp("trained"), heatsplat.compose(QUICK)
+    return folder, config, heatsplat.train(config, folder)
+
+
+def test_a_notebook_composes_trains_loads_and_looks_at_temperatures(trained):
+    folder, config, results = trained
+    assert (folder / METRICS_FILE).exists() and results.test["psnr"] > 5
+    assert heatsplat.train(config, folder).test == results.test  # which are there
+    scene = heatsplat.load(folder / "checkpoints" / "last.ckpt")
+    frame = scene.scene.test.frames[0]
+    celsius, bounds = scene.render(frame), scene.scene.thermal_range
+    assert celsius.shape == (frame.camera.height, frame.camera.width)
+    assert bounds.min_c <= celsius.min() and celsius.max() <= bounds.max_c
+    assert torch.equal(scene.render(frame.camera, 0.0), celsius)  # static splats know no time
+
+
+def test_a_step_changes_no_configuration_that_it_is_given(trained):
+    _, config, _ = trained
+    assert config == heatsplat.compose(QUICK) and "scene" not in config
+
+
+def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
+    folder, config, _ = trained
+    with pytest.raises(OccupiedError, match=r"other settings \(seed\)"):
+        heatsplat.train(config | {"seed": 7}, folder)
+
+
+@pytest.mark.parametrize("changed", ["data.downscale=2", "data.scene=cooling"])
+def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed, tmp_path):
+    folder, _, _ = trained
+    config = heatsplat.compose([*QUICK, f"ckpt={folder}/checkpoints/last.ckpt", changed])
+    with pytest.raises(SceneError, match=r"was trained on static in \d+ x \d+ pixels, and this is (static|cooling) in"):
+        heatsplat.train(config, tmp_path)
+
+
+def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
+    folder, config, _ = trained
+    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")["heatsplat"]["recipe"]
+    assert differences(config | {"threads": 1, "test": False, "ckpt": "any"}, stored) == []
+    assert differences(config | {"optim": config["optim"] | {"means": 1.0}}, stored) == ["optim.means"]
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("max_steps=-1", "max_steps must be 1 or more, got -1"),
+        ("max_steps=0", "max_steps must be"),
+        ("threads=0", "threads must be 1 to"),
+        ("threads=5000", "threads must be 1 to .*, got 5000"),
+        ("optim.means=-1e-3", "optim.means is a learning rate and must be 0 or more, got -0.001"),
+        ("thermal.lr_initial=-1", "thermal.lr_initial is a learning rate"),
+    ],
+)
+def test_values_out_of_range_are_refused_by_name(override, told):
+    with pytest.raises(SceneError, match=told):
+        checked(heatsplat.compose(["method=etgs", override]))
+
+
+def test_what_the_machine_lacks_is_told_before_data_are_read(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SceneError, match="trainer.accelerator=cuda: PyTorch sees no CUDA device"):
+        checked(heatsplat.compose(["method=etgs", "trainer.accelerator=cuda"]))
+    with pytest.raises((SceneError, ImportError), match="gsplat"):
+        checked(heatsplat.compose(["method=etgs", "renderer=gsplat"]))
+
+
+def test_a_folder_is_one_process_s_until_that_ends_however_it_does(tmp_path):
+    hold = "import sys, time; from heatsplat.runs.folder import locked\nfrom pathlib import Path\n"
+    hold += "with locked(Path(sys.argv[1])): print('in', flush=True); time.sleep(600)"
+    other = subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout.readline() == "in\n"
+        with pytest.raises(OccupiedError, match=f"under way .process {other.pid} on "), locked(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.wait()
+    with locked(tmp_path):
+        pass
