@@ -12,6 +12,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -168,9 +169,19 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 @hydra.main(version_base="1.3", config_path=CONF, config_name="study")
 @_job
 def study(config: dict[str, Any], output_dir: Path) -> None:
-    """Runs a study; its tables and pictures lie in the run's folder."""
+    """Runs a study; its tables and pictures lie in the run's folder.
+
+    Raises:
+        SceneError: it is one of the benchmarks, which are not installed.
+    """
+    from heatsplat.contracts import SceneError
     from heatsplat.training.session import prepare_machine
 
+    if config["study"]["_target_"].startswith("benchmarks.") and find_spec("benchmarks") is None:
+        name = HydraConfig.get().runtime.choices.study
+        raise SceneError(
+            f"study={name} is a benchmark of the source checkout: run python src/study.py study={name} in a clone of it"
+        )
     prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)

@@ -7,10 +7,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.edge import TINY, sobel_magnitude
 from heatsplat.losses.photometric import C1, C2, SIGMA, WINDOW, Photometric, ssim_map
-from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 from heatsplat.training.rng import generator_for
 
 COUNT = 6  # pairs of images

@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.physics.ellipsoids import THOMSEN_POWER, projected_area_ratio, radiating_area_ratio
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.heat_flow import fourth_powers
 from heatsplat.physics.responses import step_weights
-from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 
 COUNT = 200
 REFERENCE_K = 288.0

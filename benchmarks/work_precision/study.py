@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.work_precision import report
+from benchmarks.work_precision.problems import Problem, problems
+from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, march
 from heatsplat.kernels.scheduling import thread_count, use_threads
-from heatsplat.studies.work_precision_parts import report
-from heatsplat.studies.work_precision_parts.problems import Problem, problems
-from heatsplat.studies.work_precision_parts.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, march
 
 log = logging.getLogger("heatsplat")
 

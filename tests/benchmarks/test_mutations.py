@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from heatsplat.studies.mutations import MUTATIONS, SURVIVED, Mutation
+from benchmarks.mutations import MUTATIONS, SURVIVED, Mutation
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,7 +26,7 @@ def test_a_place_that_is_gone_is_named():
 
 
 PROBE = """
-from heatsplat.studies import mutations
+from benchmarks import mutations
 harmless = mutations.Mutation("harmless", "physics.units", "return celsius + KELVIN_AT_0_C",
                               "return KELVIN_AT_0_C + celsius", "tests/physics/test_units.py")
 fatal = mutations.Mutation("fatal", "physics.units", "return celsius + KELVIN_AT_0_C", "return celsius",

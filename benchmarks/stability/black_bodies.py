@@ -7,8 +7,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import Case, log_uniform
 from heatsplat.physics.planck import FIRST_RADIATION, SECOND_RADIATION, Band
-from heatsplat.studies.stability_cases.case import Case, log_uniform
 
 COUNT, SEEN = 60, 8
 WIDTH = 2.0  # of a drawn band: its longest wavelength over its shortest

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import log_uniform, uniform
+from benchmarks.stability.closed_form import CASES
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import harmonic_response, temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
 from heatsplat.physics.units import STEFAN_BOLTZMANN
-from heatsplat.studies.stability_cases.case import log_uniform, uniform
-from heatsplat.studies.stability_cases.closed_form import CASES
 
 DIGITS = 50
 AMBIENT_K = 290.0

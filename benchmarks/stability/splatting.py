@@ -7,11 +7,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.geometry.projection import project_gaussians
 from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices, slerp
 from heatsplat.renderers import rasterization
 from heatsplat.renderers.base import EPS2D, FOV_MARGIN
-from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 
 COUNT = 150
 FOCAL, SIDE = 500.0, 400  # of the camera of needles

@@ -8,12 +8,12 @@ import torch
 from omegaconf import OmegaConf
 from running import compose_run
 
+from benchmarks.renderer import peers
+from benchmarks.renderer.floors import Machine, Work
+from benchmarks.renderer.scenes import Case, build
 from heatsplat import cli
 from heatsplat.kernels.scheduling import thread_count, use_threads
 from heatsplat.renderers import rasterization
-from heatsplat.studies.renderer_parts import peers
-from heatsplat.studies.renderer_parts.floors import Machine, Work
-from heatsplat.studies.renderer_parts.scenes import Case, build
 
 ARRAYS = ("means", "quats", "scales", "opacities", "features")
 

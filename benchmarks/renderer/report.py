@@ -11,7 +11,7 @@ from typing import Any
 import matplotlib.figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from heatsplat.studies.renderer_parts.floors import Machine
+from benchmarks.renderer.floors import Machine
 
 log = logging.getLogger("heatsplat")
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from heatsplat.studies.work_precision_parts.problems import Problem
+from benchmarks.work_precision.problems import Problem
 
 
 class OverLimit(Exception):

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
+from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.sensors.agc import EPSILON, GainControl
-from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 from heatsplat.thermal.atmospheric_field import octaves
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.imaging_field import ImagingField

@@ -9,11 +9,11 @@ import yaml
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 
+from benchmarks import effects as study
 from heatsplat.effects import assembly
 from heatsplat.effects.assembly import falls_with
 from heatsplat.io.results import RunResults
 from heatsplat.studies import child_runs
-from heatsplat.studies import effects as study
 
 PRESETS = {"static": [], "heated": ["relaxation", "harmonic_source"]}
 SETTINGS = {

@@ -7,9 +7,9 @@ from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 
+from benchmarks.evidence import judged, run, written
 from heatsplat.contracts import SceneError
 from heatsplat.effects.catalogue import CATALOGUE
-from heatsplat.studies.evidence import judged, run, written
 
 SCENES = ("static", "cooling", "drifting")
 

@@ -9,9 +9,9 @@ import torch
 from omegaconf import OmegaConf
 from running import compose_run
 
+from benchmarks.work_precision import problems, report, solvers
+from benchmarks.work_precision import study as work_precision
 from heatsplat import cli
-from heatsplat.studies import work_precision
-from heatsplat.studies.work_precision_parts import problems, report, solvers
 
 TINY = {
     "gaussians": 48, "frames": 4, "frequencies": 24, "sample": 4, "types": ["float32", "float64"], "steps": {},

@@ -41,7 +41,7 @@ WARM_UP = 5  # steps in which kernels are compiled and memory is found
 
 
 def still_scene(scene: dict[str, Any]) -> SceneData:
-    """Views of the benchmark's Gaussians (``studies.renderer.build``), all from about the same place.
+    """Views of the benchmark's Gaussians (``scenes.build``), all from about the same place.
 
     Targets are smooth noise: what they show costs no time.
     """
@@ -136,7 +136,7 @@ def time_steps(module: Callable[[], Any], trainer: Callable[..., Any], scene: di
     Args:
         module: makes the training module, with learning rates of zero.
         trainer: makes the trainer; takes ``max_steps``.
-        scene: Gaussians and camera, as ``studies.renderer.build`` gives them.
+        scene: Gaussians and camera, as ``scenes.build`` gives them.
         steps: how many are timed, besides those that warm up.
     """
     module = copy.deepcopy(module)()  # its parts would otherwise be shared with the next one

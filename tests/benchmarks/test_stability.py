@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from heatsplat.studies.stability import COLUMNS, FAMILIES, cases, cell, holds, measurements, numbers_of, written
+from benchmarks.stability.study import COLUMNS, FAMILIES, cases, cell, holds, measurements, numbers_of, written
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
 

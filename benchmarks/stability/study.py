@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from heatsplat.studies.stability_cases.case import TYPES, Case, measured
+from benchmarks.stability.case import TYPES, Case, measured
 
 log = logging.getLogger("heatsplat")
 
@@ -36,7 +36,7 @@ ABSENT, INFINITE = "", "∞"
 Row = dict[tuple[str, str], float | None]
 HEAD = """# Hard cases stay stable
 
-This page is generated: `make stability` measures every number, and a test (`tests/stability`) fails when one of them no
+This page is generated: `make stability` measures every number, and a test (`tests/benchmarks/test_stability.py`) fails when one of them no
 longer holds. Errors are the worst of seeded draws over the stated range, compared with 120 digits, in float32 and float64,
 for values and for the gradients that autograd returns ("slope"). ∞ stands for a result that is NaN or infinite. Empty
 cells do not exist: a form without a gradient, or a kernel with one type. Numbers are rounded up to one digit and hold
@@ -70,7 +70,7 @@ def run(output_dir: Path | str, document: str | None = None, families: Sequence[
 
 def cases(family: str) -> tuple[Case, ...]:
     """The cases of a family."""
-    return import_module(f"heatsplat.studies.stability_cases.{family}").CASES
+    return import_module(f"benchmarks.stability.{family}").CASES
 
 
 def measurements(families: Sequence[str] | None = None) -> list[tuple[str, Case, dict[str, Row]]]:

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.renderer import peers as other
+from benchmarks.renderer.floors import Machine, Work, step_floors
+from benchmarks.renderer.memory import megabytes_above_parameters
+from benchmarks.renderer.report import write
+from benchmarks.renderer.scenes import Case, build
+from benchmarks.renderer.steps import time_steps
 from heatsplat.kernels.peak import memory_rate, vector_rate
 from heatsplat.kernels.scheduling import use_threads
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.photometric import Photometric
-from heatsplat.studies.renderer_parts import peers as other
-from heatsplat.studies.renderer_parts.floors import Machine, Work, step_floors
-from heatsplat.studies.renderer_parts.memory import megabytes_above_parameters
-from heatsplat.studies.renderer_parts.report import write
-from heatsplat.studies.renderer_parts.scenes import Case, build
-from heatsplat.studies.renderer_parts.steps import time_steps
 
 log = logging.getLogger("heatsplat")
 

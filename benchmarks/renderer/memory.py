@@ -6,9 +6,9 @@ import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.renderer.peers import backend
+from benchmarks.renderer.scenes import Case, build
 from heatsplat.kernels.scheduling import use_threads
-from heatsplat.studies.renderer_parts.peers import backend
-from heatsplat.studies.renderer_parts.scenes import Case, build
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

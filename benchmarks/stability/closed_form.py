@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.physics.frequencies import frequency_grid
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import harmonic_response, phases, relax, temperature
-from heatsplat.studies.stability_cases.case import Case, log_uniform, uniform
 
 COUNT = 300
 RATES, FREQUENCIES, TIMES = (1e-12, 1e4), (1e-5, 3e2), (1e-3, 1e5)
