@@ -36,7 +36,7 @@ ABSENT, INFINITE = "", "∞"
 Row = dict[tuple[str, str], float | None]
 HEAD = """# Hard cases stay stable
 
-This page is generated: `make stability` measures every number, and a test (`tests/benchmarks/test_stability.py`) fails when one of them no
+This page is generated: `make stability` measures every number, and a test (`tests/benchmarks`) fails when one of them no
 longer holds. Errors are the worst of seeded draws over the stated range, compared with 120 digits, in float32 and float64,
 for values and for the gradients that autograd returns ("slope"). ∞ stands for a result that is NaN or infinite. Empty
 cells do not exist: a form without a gradient, or a kernel with one type. Numbers are rounded up to one digit and hold
