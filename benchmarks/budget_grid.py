@@ -7,7 +7,6 @@ planned runs with the grid holds seconds, so it may not.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import statistics
@@ -20,6 +19,7 @@ from matplotlib.figure import Figure
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
+from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
 from heatsplat.studies.child_runs import trained
 
@@ -130,9 +130,7 @@ def _of(method: str, scene: str, seed: int) -> list[str]:
 def mean_gaussians(curve: Path, start: int) -> float:
     """Gaussians in the mean over the steps of a run, straight between its validations."""
     before, total, last = (0.0, float(start)), 0.0, 0.0
-    with open(curve, newline="", encoding="utf-8") as file:
-        rows = [(float(row["step"]), float(row["gaussians"])) for row in csv.DictReader(file)]
-    for step, count in rows:
+    for step, count in ((row["step"], row["gaussians"]) for row in read_csv(curve)):
         total += 0.5 * (before[1] + count) * (step - before[0])
         before, last = (step, count), step
     return total / last
@@ -160,26 +158,19 @@ def means(grid: Iterable[Trained]) -> list[Point]:
 
 def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, RunResults]]) -> str:
     """The grid, and each planned run beside the best run of the grid that was no slower."""
-    lines = ["# Accuracy against steps and Gaussians, and planned runs", ""]
-    lines += ["| method | scene | steps | Gaussians at most | decay | seed | train (s) | Gaussians | PSNR (dB) |"]
-    lines += ["|---|---|---:|---:|---:|---:|---:|---:|---:|"]
-    for one in grid:
-        cost = one.results.cost
-        lines.append(
-            f"| {one.method} | {one.scene} | {one.steps:,} | {_cap(one.cap)} | {one.decay:g} | {one.seed} "
-            f"| {cost['train_seconds']:.1f} | {cost['gaussians']:,.0f} | {one.results.test['psnr']:.2f} |"
+    rows = [
+        (
+            one.method, one.scene, f"{one.steps:,}", _cap(one.cap), f"{one.decay:g}", one.seed,
+            number(one.results.cost["train_seconds"], 1), number(one.results.cost["gaussians"], 0),
+            number(one.results.test["psnr"], 2),
         )
+        for one in grid
+    ]  # fmt: skip
+    head = ("method", "scene", "steps", "Gaussians at most", "decay", "seed", "train (s)", "Gaussians", "PSNR (dB)")
+    lines = ["# Accuracy against steps and Gaussians, and planned runs", "", *markdown_table(head, rows, "llrrrrrrr")]
     if not planned:
         return "\n".join([*lines, ""])
-    lines += ["", "## Planned runs beside the grid", ""]
-    lines += [
-        "The best of the grid is the highest PSNR among its runs (all seeds) that took at most 1.1 times the budget.",
-        "",
-    ]
-    lines += [
-        "| method | scene | budget (s) | spent (s) | off | steps | PSNR (dB) | best of the grid | its PSNR | its seconds |"
-    ]
-    lines += ["|---|---|---:|---:|---:|---:|---:|---|---:|---:|"]
+    rows = []
     for method, scene, budget, results in planned:
         found = results.run["budget"]
         rivals = [
@@ -187,17 +178,28 @@ def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, Run
             if (one.method, one.scene) == (method, scene) and one.results.cost["train_seconds"] <= 1.1 * budget
         ]  # fmt: skip
         best = max(rivals, key=lambda one: one.results.test["psnr"], default=None)
-        rival = "none | – | –"
+        rival = ("none", NONE, NONE)
         if best is not None:
             rival = (
-                f"{best.steps:,} steps, {_cap(best.cap)}, decay {best.decay:g} | {best.results.test['psnr']:.2f} "
-                f"| {best.results.cost['train_seconds']:.1f}"
-            )
-        spent = found["train_s"] + found["calibration_s"]
-        lines.append(
-            f"| {method} | {scene} | {budget:g} | {spent:.1f} | {found['off_percent']:+.1f} % "
-            f"| {found['steps']:,} | {results.test['psnr']:.2f} | {rival} |"
-        )
+                f"{best.steps:,} steps, {_cap(best.cap)}, decay {best.decay:g}", number(best.results.test["psnr"], 2),
+                number(best.results.cost["train_seconds"], 1),
+            )  # fmt: skip
+        spent = number(found["train_s"] + found["calibration_s"], 1)
+        rows.append((
+            method, scene, f"{budget:g}", spent, f"{found['off_percent']:+.1f} %", f"{found['steps']:,}",
+            number(results.test["psnr"], 2), *rival,
+        ))  # fmt: skip
+    head = (
+        "method", "scene", "budget (s)", "spent (s)", "off", "steps", "PSNR (dB)", "best of the grid", "its PSNR", "its seconds",
+    )  # fmt: skip
+    lines += [
+        "",
+        "## Planned runs beside the grid",
+        "",
+        "The best of the grid is the highest PSNR among its runs (all seeds) that took at most 1.1 times the budget.",
+        "",
+        *markdown_table(head, rows, "llrrrrrlrr"),
+    ]
     return "\n".join([*lines, ""])
 
 

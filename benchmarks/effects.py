@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from heatsplat.effects import assembly
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import trained
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
@@ -149,38 +150,39 @@ def _mean(job: Job, results: Sequence[RunResults]) -> Row:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: selections side by side, then what leaving each effect out costs."""
-    lines = ["# What choosing effects is worth", "", NOTE, ""]
-    lines += ["| scene | selection | effects | PSNR (dB) | clean (dB) | MAE (°C) | parameters | ms per step |"]
-    lines += ["|---|---|---|---:|---:|---:|---:|---:|"]
-    for row in rows:
-        if row.job.left_out is None:
-            effects = ", ".join(row.effects) or "none"
-            lines.append(
-                f"| {row.job.preset} | {row.job.selection} | {effects} | {row.psnr:.2f} | {_number(row.clean_psnr, 2)} "
-                f"| {_number(row.mae_c)} "
-                f"| {row.parameters:,.0f} | {row.ms_per_step:.1f} |"
-            )
+    chosen = [
+        (
+            row.job.preset, row.job.selection, ", ".join(row.effects) or "none", number(row.psnr, 2), number(row.clean_psnr, 2),
+            number(row.mae_c, 3), number(row.parameters, 0), number(row.ms_per_step, 1),
+        )
+        for row in rows
+        if row.job.left_out is None
+    ]  # fmt: skip
+    head = ("scene", "selection", "effects", "PSNR (dB)", "clean (dB)", "MAE (°C)", "parameters", "ms per step")
+    lines = ["# What choosing effects is worth", "", NOTE, "", *markdown_table(head, chosen, align="lllrrrrr")]
     whole = {row.job.preset: row for row in rows if row.job.selection == "auto" and row.job.left_out is None}
-    left = [row for row in rows if row.job.left_out]
-    if left:
-        lines += ["", "## Left out of what auto chose", ""]
-        lines += ["What the run loses (PSNR down, MAE up) and saves without the effect and what stands on it.", ""]
-        lines += [
-            "| scene | without | PSNR lost (dB) | clean | MAE gained (°C) | parameters saved | ms per step saved |"
-        ]
-        lines += ["|---|---|---:|---:|---:|---:|---:|"]
-    for row in left:
+    left = []
+    for row in (row for row in rows if row.job.left_out):
         auto = whole[row.job.preset]
         worse, cleaner = _difference(row.mae_c, auto.mae_c), _difference(auto.clean_psnr, row.clean_psnr)
-        lines.append(
-            f"| {row.job.preset} | {row.job.left_out} | {auto.psnr - row.psnr:.2f} | {_number(cleaner, 2)} | {_number(worse)} "
-            f"| {auto.parameters - row.parameters:,.0f} | {auto.ms_per_step - row.ms_per_step:.2f} |"
+        left.append((
+            row.job.preset, row.job.left_out, number(auto.psnr - row.psnr, 2), number(cleaner, 2), number(worse, 3),
+            number(auto.parameters - row.parameters, 0), number(auto.ms_per_step - row.ms_per_step, 2),
+        ))  # fmt: skip
+    if left:
+        head = (
+            "scene",
+            "without",
+            "PSNR lost (dB)",
+            "clean",
+            "MAE gained (°C)",
+            "parameters saved",
+            "ms per step saved",
         )
+        lines += ["", "## Left out of what auto chose", ""]
+        lines += ["What the run loses (PSNR down, MAE up) and saves without the effect and what stands on it.", ""]
+        lines += markdown_table(head, left, align="llrrrrr")
     return "\n".join([*lines, ""])
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def _difference(more: float | None, less: float | None) -> float | None:

@@ -17,6 +17,7 @@ import torch
 from heatsplat.contracts import SceneError
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.io.tables import markdown_table
 from heatsplat.training.machine import cores
 
 log = logging.getLogger("heatsplat")
@@ -133,13 +134,14 @@ def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcom
 
 def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -> str:
     """The page; recordings of the seeds in ``unseen`` have tables of their own."""
-    lines = [HEAD, "## The catalogue\n", "| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    for effect in CATALOGUE:
-        needs = ", ".join(sorted(effect.needs)) or "images"
-        lines.append(
-            f"| {effect.name} | {effect.stage} | {effect.summary} | {effect.source} | {needs} | {effect.null} | "
-            f"{effect.threshold:g} | {effect.adds} |"
+    rows = [
+        (
+            effect.name, effect.stage, effect.summary, effect.source, ", ".join(sorted(effect.needs)) or "images",
+            effect.null, f"{effect.threshold:g}", effect.adds,
         )
+        for effect in CATALOGUE
+    ]  # fmt: skip
+    lines = [HEAD, "## The catalogue\n", *markdown_table(COLUMNS, rows)]
     for size in dict.fromkeys(outcome.size for outcome in outcomes):
         for which, wanted in ((size, False), (f"{size}, on recordings that no threshold was set on", True)):
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
@@ -157,23 +159,23 @@ def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"\n## Verdicts against truth, {which}\n",
         f"{right} of {cases} verdicts are right ({100 * right / cases:.1f} %); {clean} of {len(outcomes)} scenes have not a "
         f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
-        "| effect | present: found | present: missed | absent: left out | absent: taken in |",
-        "|---|---|---|---|---|",
     ]
+    by_effect, by_scene = [], []
     for effect in CATALOGUE:
         with_it = [effect.name in outcome.found for outcome in outcomes if effect.name in outcome.present]
         without = [effect.name in outcome.found for outcome in outcomes if effect.name not in outcome.present]
         counts = (sum(with_it), len(with_it) - sum(with_it), len(without) - sum(without), sum(without))
-        lines.append(f"| {effect.name} | " + " | ".join(map(str, counts)) + " |")
-    lines += ["\n| scene | shows | right | missed | taken in |", "|---|---|---|---|---|"]
+        by_effect.append((effect.name, *counts))
     for scene in dict.fromkeys(outcome.scene for outcome in outcomes):
         these = [outcome for outcome in outcomes if outcome.scene == scene]
         missed = [name for outcome in these for name in sorted(outcome.present - outcome.found)]
         taken = [name for outcome in these for name in sorted(outcome.found - outcome.present)]
         shows = ", ".join(sorted(these[0].present)) or "nothing"
         good = sum(outcome.wrong == 0 for outcome in these)
-        lines.append(f"| {scene} | {shows} | {good} of {len(these)} | {_counted(missed)} | {_counted(taken)} |")
-    return lines
+        by_scene.append((scene, shows, f"{good} of {len(these)}", _counted(missed), _counted(taken)))
+    agreement = ("effect", "present: found", "present: missed", "absent: left out", "absent: taken in")
+    lines += [*markdown_table(agreement, by_effect), ""]
+    return lines + markdown_table(("scene", "shows", "right", "missed", "taken in"), by_scene)
 
 
 def _counted(names: Sequence[str]) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import logging
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +10,7 @@ import matplotlib.figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from benchmarks.renderer.floors import Machine
+from heatsplat.io.tables import markdown_table, write_csv
 
 log = logging.getLogger("heatsplat")
 
@@ -22,18 +21,11 @@ def write(tables: dict[str, list[Row]], output_dir: Path, machines: dict[int, Ma
     """``renderer.md`` with all tables, a CSV file of each, and ``renderer.png``."""
     for name, rows in tables.items():
         if rows:
-            _write_csv(rows, output_dir / f"{name}.csv")
+            write_csv(output_dir / f"{name}.csv", rows)
     text = _markdown(tables, machines)
     (output_dir / "renderer.md").write_text(text, encoding="utf-8")
     log.info("%s", text)
     _picture(tables["renderer"], output_dir / "renderer.png")
-
-
-def _write_csv(rows: list[Row], path: Path) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str:
@@ -43,7 +35,7 @@ def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str
         for count, machine in machines.items()
     )
     lines = ["# The CPU renderer", "", f"Minima in ms, with gradients; floors by {rates}.", ""]
-    lines += _table(
+    lines += markdown_table(
         ("case", "threads", "forward", "floor", "reached", "backward", "floor", "reached", "load"),
         (
             (
@@ -54,6 +46,7 @@ def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str
             for row in tables["renderer"]
         ),
     )  # fmt: skip
+    lines.append("")
     for name, title in (
         ("modalities", "Several opacities in one pass"),
         ("peers", "Peers, three channels"),
@@ -63,9 +56,10 @@ def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str
         rows = tables.get(name)
         if rows:
             columns = list(dict.fromkeys(key for row in rows for key in row))
-            lines += [f"## {title}", "", *_table(columns, ([_any(row.get(key)) for key in columns] for row in rows))]
+            cells = [[_any(row.get(key)) for key in columns] for row in rows]
+            lines += [f"## {title}", "", *markdown_table(columns, cells), ""]
     if tables.get("training"):
-        lines += ["## A training step, part by part", "", *_training_table(tables["training"])]
+        lines += ["## A training step, part by part", "", *_training_table(tables["training"]), ""]
     return "\n".join(lines)
 
 
@@ -83,13 +77,7 @@ def _training_table(rows: list[Row]) -> list[str]:
         body.append([part, *cells])
     body.append(["ratio", *(f"{row['ratio']:.2f}" for row in rows)])
     body.append(["load", *(f"{row['load']:.1f}" for row in rows)])
-    return _table(columns, body)
-
-
-def _table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[str]:
-    columns = list(columns)
-    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
-    return [*lines, *("| " + " | ".join(str(cell) for cell in row) + " |" for row in rows), ""]
+    return markdown_table(columns, body)
 
 
 def _ms(value: float) -> str:

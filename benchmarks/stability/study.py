@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.stability.case import TYPES, Case, measured
+from heatsplat.io.tables import markdown_table
 
 log = logging.getLogger("heatsplat")
 
@@ -85,21 +86,18 @@ def measurements(families: Sequence[str] | None = None) -> list[tuple[str, Case,
 
 def written(rows: list[tuple[str, Case, dict[str, Row]]], committed: str = "") -> str:
     """The document; numbers of ``committed``, an earlier one, stay where they still hold."""
-    before, lines, family = numbers_of(committed), [HEAD.rstrip()], None
-    for name, case, forms in rows:
-        if name != family:
-            family = name
-            lines += [
-                f"\n## {FAMILIES[family]}\n",
-                "| hard case | form | float32 | float64 | slope, float32 | slope, float64 |",
-                "|---|---|---|---|---|---|",
-            ]
+    before, tables = numbers_of(committed), {}
+    for family, case, forms in rows:
         for form, errors in forms.items():
             old = before.get((case.name, form), [None] * len(COLUMNS))
             cells = [cell(errors[column], text) for column, text in zip(COLUMNS, old, strict=True)]
             about = f"**{case.name}.** {case.ranges}. Error over {case.error}." if form == "printed" else ""
             what = f"printed: {case.printed}" if form == "printed" else f"ours (at most {case.promise:g} ε)"
-            lines.append(f"| {about} | {what} | " + " | ".join(cells) + " |")
+            tables.setdefault(family, []).append((about, what, *cells))
+    head = ("hard case", "form", "float32", "float64", "slope, float32", "slope, float64")
+    lines = [HEAD.rstrip()]
+    for family, cells in tables.items():
+        lines += [f"\n## {FAMILIES[family]}\n", *markdown_table(head, cells)]
     return "\n".join(lines) + "\n"
 
 

@@ -14,6 +14,7 @@ from matplotlib.ticker import LogLocator
 
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import markdown_table
 from heatsplat.physics.responses import RATES
 
 LEVELS_K = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-6)
@@ -230,7 +231,7 @@ def markdown(rows: Sequence[Any], titles: dict[str, str]) -> list[str]:
         own = [row for row in rows if row.problem == name]
         done = [row for row in own if not row.given_up]
         lines += [f"## {title}", ""]
-        lines += _table(
+        lines += markdown_table(
             ["ours", "type", "µs", "worst K", "rms K", "once for a record"],
             [
                 [
@@ -262,7 +263,7 @@ def markdown(rows: Sequence[Any], titles: dict[str, str]) -> list[str]:
                     "; ".join(dict.fromkeys(f"{r.setting}: {r.given_up}" for r in lost)),
                 ]
             )
-        lines += ["", *_table(head, cells), ""]
+        lines += ["", *markdown_table(head, cells), ""]
     return lines
 
 
@@ -327,7 +328,3 @@ def _time(us: float) -> str:
 
 def _error(kelvin: float) -> str:
     return "blew up" if not kelvin < BLOWN_K else f"{kelvin:.0e}" if kelvin < 1e-3 else f"{kelvin:.2g}"
-
-
-def _table(head: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:
-    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in cells)]

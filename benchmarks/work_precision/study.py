@@ -5,7 +5,6 @@ The rules stand first in the document (report.py). Everything is measured in one
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import os
@@ -23,6 +22,7 @@ from torch import Tensor
 from benchmarks.work_precision import report
 from benchmarks.work_precision.problems import Problem, problems
 from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, march
+from heatsplat.io.tables import write_csv
 from heatsplat.kernels.scheduling import thread_count, use_threads
 
 log = logging.getLogger("heatsplat")
@@ -76,10 +76,7 @@ def run(output_dir: Path | str, document: str | None = None, pictures: str | Non
     rows, titles = measurements(**settings)
     output_dir = Path(output_dir)
     output_dir.mkdir(parents=True, exist_ok=True)
-    with open(output_dir / "work_precision.csv", "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Row)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(map(asdict, rows))
+    write_csv(output_dir / "work_precision.csv", map(asdict, rows), [field.name for field in fields(Row)])
     load, seconds = max(load, os.getloadavg()[0]), time.perf_counter() - begin
     whole = settings.get("only") is None and settings.get("solvers") is None  # half a table replaces no whole one
     rules = report.rules(settings, load, seconds)

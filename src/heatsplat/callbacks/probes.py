@@ -13,9 +13,9 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import spread
-from heatsplat.callbacks.metrics import write_table
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet
 from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.tables import write_csv
 
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
 OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
@@ -112,7 +112,7 @@ class TemperatureCurves(pl.Callback):
         columns = ["time_s", *names, *([] if truth is None else [f"truth of {name}" for name in names])]
         stacked = np.concatenate([[times], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
-        write_table(module.output_dir / "renders" / "probes.csv", columns, rows)
+        write_csv(module.output_dir / "renders" / "probes.csv", rows)
 
 
 def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
