@@ -119,7 +119,7 @@ def check_first(ckpt: str) -> None:
     """Raises SceneError where the run that wrote a checkpoint, and after which another comes, has no results."""
     from heatsplat.contracts import SceneError
     from heatsplat.io.results import METRICS_FILE
-    from heatsplat.studies.sweeps import reason_of
+    from heatsplat.studies.finished import reason_of
 
     folder = Path(run_of(ckpt))
     if not (folder / METRICS_FILE).exists():
