@@ -7,9 +7,9 @@ import torch
 from fake_run import FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
-from heatsplat.callbacks.images import ImagePanels, file_stem, spread
+from heatsplat.callbacks.images import ImagePanels, file_stem
 from heatsplat.callbacks.metrics import QualityMetrics
-from heatsplat.callbacks.probes import TemperatureCurves, find_probes, project, recorded, seen_by
+from heatsplat.callbacks.probes import TemperatureCurves, find_probes, recorded, seen_by
 from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report
 from heatsplat.contracts import ViewSet
@@ -105,10 +105,7 @@ def test_panels_without_logger_and_bounds(tmp_path):
     assert not (none / "renders").exists()
 
 
-def test_positions_are_spread_and_names_unique():
-    assert spread(10, 3) == [0, 3, 6]
-    assert spread(2, 5) == [0, 1]
-    assert spread(5, 0) == []
+def test_names_are_unique():
     scene = wall()
     frames = [*scene.train.frames, *scene.test.frames]
     assert len({file_stem(frame) for frame in frames}) == len(frames)
@@ -127,7 +124,7 @@ def test_models_and_scenes_without_time_have_no_curves(tmp_path):
 
 
 def test_projection_by_hand():
-    pixels, depths = project(torch.tensor([[0.5, -1.0, 4.0], [0.0, 0.0, -1.0]]), camera(0.1))
+    pixels, depths = camera(0.1).project(torch.tensor([[0.5, -1.0, 4.0], [0.0, 0.0, -1.0]]))
     assert pixels[0].tolist() == pytest.approx([28 + 60 * 0.4 / 4, 20 - 60 / 4])
     assert depths.tolist() == [4.0, -1.0]
 
@@ -145,13 +142,13 @@ def test_probes_are_found_without_the_scenes_help():
     probes = find_probes(scene, 5)
     assert len(probes) == 5
     for probe in probes:
-        (column, row), _ = (x[0].tolist() if x.ndim > 1 else x for x in project(probe.point[None], probe.frame.camera))
+        (column, row), _ = (x[0].tolist() if x.ndim > 1 else x for x in probe.frame.camera.project(probe.point[None]))
         assert (int(row), int(column)) == (probe.row, probe.column)
     places = torch.stack([probe.point for probe in probes])
     assert torch.pdist(places).min() > 0.3
     times, values = recorded(probes[0], scene, "thermal")
     assert times == scene.train.times_s
-    column, row = (int(x) for x in project(probes[0].point[None], scene.train.frames[2].camera)[0][0])
+    column, row = (int(x) for x in scene.train.frames[2].camera.project(probes[0].point[None])[0][0])
     assert values[2] == scene.train[2].thermal[row, column].item()
 
 

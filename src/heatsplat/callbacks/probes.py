@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.callbacks.images import spread
-from heatsplat.contracts import Camera, Frame, SceneData, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.tables import write_csv
 
@@ -115,20 +114,12 @@ class TemperatureCurves(pl.Callback):
         write_csv(module.output_dir / "renders" / "probes.csv", rows)
 
 
-def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64; where the depth is not positive they lie
-    behind the camera and the pixel means nothing."""
-    view = points.double().cpu() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    homogeneous = view @ camera.K.T
-    return homogeneous[:, :2] / view[:, 2:].clamp_min(1e-12), view[:, 2]
-
-
 def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:
     """Which points [n, 3] the camera sees, [n] bool: in the image and not behind points of the cloud [P, 3]."""
-    pixels, depths = project(points, camera)
+    pixels, depths = camera.project(points)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     inside = (depths > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1)
-    others, other_depths = project(cloud, camera)
+    others, other_depths = camera.project(cloud)
     for i in inside.nonzero()[:, 0].tolist():
         near = ((others - pixels[i]).abs() < NEAR_PIXELS * camera.width).all(1)
         hiding = near & (other_depths > 0) & (other_depths < NEAR_DEPTH * depths[i])
@@ -144,10 +135,10 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
     Cameras are chosen greedily, the one that sees most first, so that few renders serve many probes.
     """
     views: ViewSet = scene.val if len(scene.val) else scene.train
-    frames = [views.frames[i] for i in spread(len(views), CANDIDATES)]
+    frames = [views.frames[i] for i in evenly_spread(len(views), CANDIDATES)]
     cloud = scene.points[:: max(1, len(scene.points) // 20_000)]
     if scene.probes is not None:
-        picked = spread(len(scene.probes), count)
+        picked = evenly_spread(len(scene.probes), count)
         points, told = scene.probes[picked], scene.notes.get("probes")
         names = [told[i] for i in picked] if isinstance(told, list) and len(told) == len(scene.probes) else None
     else:
@@ -165,7 +156,7 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
         left &= ~seen[best]
     probes = []
     for i, frame in sorted(chosen.items()):
-        column, row = project(points[i : i + 1], frame.camera)[0][0].tolist()
+        column, row = frame.camera.project(points[i : i + 1])[0][0].tolist()
         probes.append(Probe(names[i], points[i].detach().cpu(), frame, int(row), int(column)))
     return probes
 
@@ -180,7 +171,7 @@ def _spread_points(frames: Sequence[Frame], cloud: Tensor, count: int) -> Tensor
     points = visible[best]
     if not len(points):
         return points
-    pixels, _ = project(points, frames[best].camera)
+    pixels, _ = frames[best].camera.project(points)
     picked = [int((pixels - pixels.mean(0)).norm(dim=1).argmin())]
     while len(picked) < min(count, len(points)):
         picked.append(int(torch.cdist(pixels, pixels[picked]).amin(1).argmax()))
@@ -191,11 +182,11 @@ def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float]
     """What training images recorded of a probe: times in seconds and image values, from the cameras that see it."""
     cloud = scene.points[:: max(1, len(scene.points) // 5_000)]
     times, values = [], []
-    for i in spread(len(scene.train), DOTS):
+    for i in evenly_spread(len(scene.train), DOTS):
         frame = scene.train.frames[i]
         if not bool(seen_by(frame.camera, probe.point[None], cloud)[0]):
             continue
-        column, row = (int(x) for x in project(probe.point[None], frame.camera)[0][0].tolist())
+        column, row = (int(x) for x in frame.camera.project(probe.point[None])[0][0].tolist())
         view = scene.train[i]
         value = view.image(modality)[row, column].mean().item()
         if np.isfinite(value) and (view.mask is None or bool(view.mask[row, column])):

@@ -14,9 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from heatsplat.callbacks.board import board
-from heatsplat.callbacks.images import spread
 from heatsplat.callbacks.metrics import TEST_FILE
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
 from heatsplat.io.tables import markdown_table, read_csv
@@ -74,7 +73,7 @@ class Report(pl.Callback):
         results.write(folder / METRICS_FILE)
         curves = draw_curves(folder)
         pictures = sorted((folder / "renders" / "test").glob("*.png"))
-        shown = [pictures[i] for i in spread(len(pictures), self.pictures)]
+        shown = [pictures[i] for i in evenly_spread(len(pictures), self.pictures)]
         probes = folder / "renders" / "probes.png"
         write_atomically(
             folder / REPORT_FILE, report(results, folder, shown, curves, probes if probes.exists() else None)

@@ -93,7 +93,8 @@ def _read(folder: Path) -> dict[str, Any]:
         failed = f"{error}. Delete the folder to run it again."
     run = {} if results is None else results.run
     found = {
-        "folder": folder, "scene": str(run.get("scene", _scene(config))), "method": str(run.get("method", overrides.get("method"))),
+        "folder": folder, "scene": str(run.get("scene", _scene(config))),
+        "method": str(run.get("method", overrides.get("method"))),
         "row": named_row(overrides), "overrides": overrides, "failed": failed, "results": results,
         "data": config.get("data") or {},
     }  # fmt: skip

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, View
+from heatsplat.contracts import SceneData, View, evenly_spread
 
 log = logging.getLogger(__name__)
 
@@ -54,8 +54,7 @@ class SparseSources:
     def prepare(self, scene: SceneData, modality: str) -> None:
         """Takes moments of the record and, unless it is given, the noise from the training views."""
         times = sorted(set(scene.train.times_s))
-        places = torch.linspace(0, len(times) - 1, min(MOMENTS, len(times))).round().long().tolist()
-        self.times_s = [times[i] for i in places]
+        self.times_s = [times[i] for i in evenly_spread(len(times), MOMENTS)]
         if self.noise is None:
             shown = torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long().tolist()
             estimates = [noise_of(scene.train[i], modality) for i in shown]
