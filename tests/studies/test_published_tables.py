@@ -80,7 +80,7 @@ def test_every_table_is_planned_and_composes(path, tmp_path):
     run = next(run for run in plan.runs if run.method == plan.paper)
     composed = compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
     assert composed.table.paper == plan.paper and composed.data.scene == run.folder
-    assert composed.data._target_.split(".")[1] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
+    assert composed.data._target_.split(".")[2] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
     assert composed.max_steps == (7000 if run.setting == "7k" else 30000)
 
 
