@@ -40,6 +40,7 @@ from heatsplat.contracts import (
     View,
     ViewSet,
     Weather,
+    evenly_spread,
 )
 
 log = logging.getLogger(__name__)
@@ -182,7 +183,7 @@ def build_scene(
     train, test = split([f.name for f in frames], order, [f.subset for f in frames])
     train, test = sorted(train), sorted(test)
     first_s = times[train[0]] if times else None
-    val = [test[i] for i in _evenly(len(test), MAX_VAL_VIEWS)]
+    val = [test[i] for i in evenly_spread(len(test), MAX_VAL_VIEWS)]
     notes |= {
         "split": split.rule,
         "train_views": len(train),
@@ -493,8 +494,3 @@ def _image_notes(prepared: Mapping[int, _Prepared], downscale: float) -> dict[st
         )
         notes["masked_fraction"] = share
     return notes
-
-
-def _evenly(count: int, most: int) -> list[int]:
-    """At most ``most`` positions out of ``count``, evenly spaced, both ends included."""
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))})

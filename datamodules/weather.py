@@ -11,6 +11,7 @@ import csv
 import logging
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
@@ -266,19 +267,30 @@ def _quantity(plain: str) -> tuple[str, tuple[float, float]] | None:
     return None
 
 
+def _text(path: Path) -> str:
+    """The text of a file in UTF-8 or in one of the encodings that Excel saves tables in."""
+    content = path.read_bytes()
+    encodings = ("utf-16",) if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252")
+    for encoding in encodings:
+        with suppress(UnicodeDecodeError):
+            return content.decode(encoding)
+    raise SceneError(f"{path} is no text; save the table as CSV in UTF-8")
+
+
 def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
     """Times [T] and columns [T] (NaN where missing) of a table in our units, unsorted, and notes."""
     if not path.is_file():
         raise SceneError(f"there is no weather table {path}")
     lines = [
         (number, line)
-        for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
+        for number, line in enumerate(_text(path).splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith(("#", "sep="))  # "sep=;" is Excel's first line
     ]
     if len(lines) < 3:
         raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
     delimiter = max(",;\t|", key=lines[0][1].count)
-    header = next(csv.reader([lines[0][1]], delimiter=delimiter))
+    rows = csv.reader([line for _, line in lines], delimiter=delimiter)
+    header = next(rows)
     plain = [_plain(name) for name in header]
     time_at = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
     if time_at is None:
@@ -306,21 +318,20 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
         raise SceneError(f"{path} has none of the columns {', '.join(WEATHER_COLUMNS)}; it has {', '.join(header)}")
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
-    for number, line in lines[1:]:
-        cells = next(csv.reader([line], delimiter=delimiter))
-        if len(cells) < len(header):
-            raise SceneError(f"{path}, line {number}: {len(cells)} cells for {len(header)} columns")
-        times.append(utc_seconds(cells[time_at].strip(), own_zone, f"{path}, line {number}"))
+    for row in rows:
+        number = lines[rows.line_num - 1][0]
+        if len(row) < len(header):
+            raise SceneError(f"{path}, line {number}: {len(row)} cells for {len(header)} columns")
+        cells = [cell.strip() if delimiter == "," else cell.strip().replace(",", ".") for cell in row]
+        where = f"{path}, line {number}, column {header[time_at]}"
+        times.append(utc_seconds(cells[time_at], own_zone, where))
         for name, (position, (scale, offset)) in wanted.items():
-            cell = cells[position].strip()
-            if cell.lower() in MISSING:
-                values[name].append(np.nan)
-                continue
+            cell = cells[position]
             try:
-                values[name].append(scale * float(cell if delimiter == "," else cell.replace(",", ".")) + offset)
+                values[name].append(np.nan if cell.lower() in MISSING else scale * float(cell) + offset)
             except ValueError as error:
                 raise SceneError(
-                    f"{path}, line {number}: {cell!r} in column {header[position]} is no number"
+                    f"{path}, line {number}: {row[position]!r} in column {header[position]} is no number"
                 ) from error
     seconds = np.array(times)
     kinds = set((seconds >= FIRST_EPOCH_S).tolist())
@@ -352,20 +363,12 @@ def _in_order(
         raise SceneError(f"{notes['source']}: a time is not finite")
     if (np.diff(times_s) < 0).any():
         notes["unsorted"] = "its samples were not in order of time and have been sorted"
-    moments, group = np.unique(times_s, return_inverse=True)
-    if len(moments) == len(times_s):
-        order = np.argsort(times_s, kind="stable")
-        return times_s[order], {name: values[order] for name, values in columns.items()}, notes
-    notes["duplicates"] = (
-        f"{len(times_s) - len(moments)} samples repeat the time of another; those of one time are averaged"
-    )
-    merged = {}
-    for name, values in columns.items():
-        there = np.isfinite(values)
-        count = np.bincount(group[there], minlength=len(moments))
-        total = np.bincount(group[there], weights=values[there], minlength=len(moments))
-        merged[name] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return moments, merged, notes
+    import pandas as pd  # here, for it takes long to load
+
+    merged = pd.DataFrame(dict(columns), index=times_s).groupby(level=0).mean()
+    if repeated := len(times_s) - len(merged):
+        notes["duplicates"] = f"{repeated} samples repeat the time of another; those of one time are averaged"
+    return merged.index.to_numpy(copy=True), {name: merged[name].to_numpy(copy=True) for name in merged}, notes
 
 
 def _common_span(

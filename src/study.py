@@ -3,7 +3,8 @@
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+SOURCES = Path(__file__).resolve().parent
+sys.path[:0] = [str(SOURCES), str(SOURCES.parent)]  # the package, and benchmarks/ beside it
 
 if __name__ == "__main__":
     from heatsplat.cli import study

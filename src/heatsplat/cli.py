@@ -15,6 +15,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,7 @@ def check_first(ckpt: str) -> None:
     """Raises SceneError where the run that wrote a checkpoint, and after which another comes, has no results."""
     from heatsplat.contracts import SceneError
     from heatsplat.io.results import METRICS_FILE
-    from heatsplat.studies.sweeps import reason_of
+    from heatsplat.studies.finished import reason_of
 
     folder = Path(run_of(ckpt))
     if not (folder / METRICS_FILE).exists():
@@ -251,13 +252,22 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 @_command
 @_job
 def study(config: dict[str, Any], output_dir: Path) -> None:
-    """Runs a study; its tables and pictures lie in the run's folder."""
+    """Runs a study; its tables and pictures lie in the run's folder.
+
+    Raises:
+        SceneError: none is chosen, or it is one of the benchmarks, which are not installed.
+    """
     from heatsplat.contracts import SceneError
     from heatsplat.training.session import prepare_machine
 
     if config["study"] is None:
         there = sorted(path.stem for path in Path(CONF, "study").glob("*.yaml"))
         raise SceneError(f"which study? Give study=..., one of {', '.join(there)}")
+    if config["study"]["_target_"].startswith("benchmarks.") and find_spec("benchmarks") is None:
+        name = HydraConfig.get().runtime.choices.study
+        raise SceneError(
+            f"study={name} is a benchmark of the source checkout: run python src/study.py study={name} in a clone of it"
+        )
     prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)

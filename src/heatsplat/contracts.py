@@ -88,6 +88,12 @@ class Camera:
         """Position of the camera in the world, [3] float64."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64; where the depth is not positive they lie
+        behind the camera and the pixel means nothing."""
+        local = points.to(self.viewmat) @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        return (local @ self.K.T)[:, :2] / local[:, 2:].clamp_min(1e-12), local[:, 2]
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera on a grid of ``width`` x ``height`` pixels; intrinsics scale by the actual pixel counts."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)
@@ -370,3 +376,10 @@ class RenderOutput:
     alpha: Tensor
     depth: Tensor | None
     meta: dict[str, Tensor]
+
+
+def evenly_spread(count: int, limit: int) -> list[int]:
+    """At most ``limit`` positions out of ``count``, evenly spread, first and last among them; the first alone for one."""
+    if count <= limit:
+        return list(range(count))
+    return [round(i * (count - 1) / max(limit - 1, 1)) for i in range(limit)]

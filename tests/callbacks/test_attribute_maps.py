@@ -8,9 +8,10 @@ import torch
 from fake_run import HEIGHT, WIDTH, FakeModule, evaluate, events, fit, trainer, wall
 
 from heatsplat.callbacks.attributes import AttributeErrors, AttributeMaps, attribute_picture
-from heatsplat.callbacks.metrics import QualityMetrics, read_table
+from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.contracts import ViewSet
 from heatsplat.io.pictures import UNKNOWN
+from heatsplat.io.tables import read_csv
 
 
 class Telling(FakeModule):
@@ -51,7 +52,7 @@ def test_models_without_attributes_or_companions_leave_nothing(tmp_path):
     evaluate(module, trainer(tmp_path, watchers))
     assert not (tmp_path / "renders").exists()
     assert not [name for name in module.results.test if name.startswith("rgb")]
-    assert not [name for name in read_table(tmp_path / "test_per_image.csv")[0] if name.startswith("rgb")]
+    assert not [name for name in read_csv(tmp_path / "test_per_image.csv")[0] if name.startswith("rgb")]
 
 
 def test_companions_are_scored_as_images(tmp_path):

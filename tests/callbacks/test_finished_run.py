@@ -12,13 +12,14 @@ from fake_run import HEIGHT, RANGE, SECONDS, WIDTH, FakeModule, evaluate, events
 from skimage.metrics import peak_signal_noise_ratio
 
 from heatsplat.callbacks.images import ImagePanels
-from heatsplat.callbacks.metrics import CURVE_COLUMNS, QualityMetrics, read_table
+from heatsplat.callbacks.metrics import CURVE_COLUMNS, QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves
 from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report, hyperparameters
 from heatsplat.callbacks.statistics import SplatStatistics
 from heatsplat.callbacks.timing import CostMeter
 from heatsplat.io.results import COST, TEST, RunResults
+from heatsplat.io.tables import read_csv
 
 CONFIG = {
     "name": "etgs",
@@ -99,7 +100,7 @@ def test_costs_add_up(run):
 
 def test_course_over_steps_and_seconds(run):
     module, folder, _ = run
-    rows = read_table(folder / "curve.csv")
+    rows = read_csv(folder / "curve.csv")
     assert tuple(rows[0]) == CURVE_COLUMNS
     assert [row["step"] for row in rows] == [8, 16, 24]
     seconds = [row["train_seconds"] for row in rows]
@@ -119,7 +120,7 @@ def test_tensorboard(run):
     assert terms | {"cost/train_seconds", "cost/peak_memory_mb"} <= scalars
     for name in ("psnr", "ssim", "mae_c", "mae_roi_c"):
         assert {f"val/{name}", f"val_by_seconds/{name}", f"test/{name}", f"final/{name}"} <= scalars
-    curve = read_table(folder / "curve.csv")
+    curve = read_csv(folder / "curve.csv")
     assert [event.step for event in found.Scalars("val/psnr")] == [8, 16, 24]
     assert [event.value for event in found.Scalars("val/psnr")] == pytest.approx(
         [row["psnr"] for row in curve], rel=1e-5
@@ -168,7 +169,7 @@ def test_pictures_show_what_they_say(run):
 
 def test_curves_at_probes(run):
     module, folder, _ = run
-    rows = read_table(folder / "renders" / "probes.csv")
+    rows = read_csv(folder / "renders" / "probes.csv")
     times = np.array([row["time_s"] for row in rows])
     assert times == pytest.approx(np.linspace(0, SECONDS, 9))
     truth = RANGE.to_celsius(warmth(torch.from_numpy(times)).numpy())

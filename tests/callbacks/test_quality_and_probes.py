@@ -7,12 +7,13 @@ import torch
 from fake_run import FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
-from heatsplat.callbacks.images import ImagePanels, file_stem, spread
-from heatsplat.callbacks.metrics import QualityMetrics, read_table
-from heatsplat.callbacks.probes import TemperatureCurves, find_probes, project, recorded, seen_by
+from heatsplat.callbacks.images import ImagePanels, file_stem
+from heatsplat.callbacks.metrics import QualityMetrics
+from heatsplat.callbacks.probes import TemperatureCurves, find_probes, recorded, seen_by
 from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report
 from heatsplat.contracts import ViewSet
+from heatsplat.io.tables import read_csv
 
 
 def scored(scene, folder, *callbacks):
@@ -47,7 +48,7 @@ def test_images_without_region_of_interest_are_not_averaged_in(tmp_path):
 
     mixed = replace(scene, test=ViewSet(scene.test.frames, decode))
     results = scored(mixed, tmp_path)
-    rows = read_table(tmp_path / "test_per_image.csv")
+    rows = read_csv(tmp_path / "test_per_image.csv")
     having = [row["mae_roi_c"] for row in rows if row["mae_roi_c"] is not None]
     assert rows[1]["mae_roi_c"] is None and len(having) == 3
     assert results.test["mae_roi_c"] == pytest.approx(sum(having) / 3)
@@ -65,7 +66,7 @@ def test_identical_images_give_infinite_psnr_and_null_in_the_file(tmp_path):
     module.scene = replace(scene, test=ViewSet(scene.test.frames, decode))
     evaluate(module, trainer(tmp_path, [QualityMetrics(lpips_net=None), Report(show=False)], logger=False))
     assert module.results.test["psnr"] == float("inf")
-    assert read_table(tmp_path / "test_per_image.csv")[0]["psnr"] == float("inf")
+    assert read_csv(tmp_path / "test_per_image.csv")[0]["psnr"] == float("inf")
     content = module.results.as_json()
     assert content["test"]["psnr"] is None and content["reasons"]["test.psnr"] == "infinite"
     assert "`test.psnr`: infinite" in (tmp_path / "report.md").read_text()
@@ -76,12 +77,12 @@ def test_the_course_of_scores_survives_a_resume(tmp_path):
     module = FakeModule(wall(), tmp_path)
     job = trainer(tmp_path, [QualityMetrics(), save], steps=12, every=4)
     fit(module, job)
-    whole = read_table(tmp_path / "curve.csv")
+    whole = read_csv(tmp_path / "curve.csv")
     job.validate(module, loader(module.scene.val), verbose=False)  # of the last step again: a step has one row
-    assert read_table(tmp_path / "curve.csv") == whole
+    assert read_csv(tmp_path / "curve.csv") == whole
     again = FakeModule(wall(), tmp_path / "b")
     fit(again, trainer(tmp_path, [QualityMetrics()], steps=12, every=4), ckpt=tmp_path / "step=6.ckpt")
-    resumed = read_table(tmp_path / "b" / "curve.csv")
+    resumed = read_csv(tmp_path / "b" / "curve.csv")
     assert [row["step"] for row in resumed] == [row["step"] for row in whole] == [4, 8, 12]
     assert [row["psnr"] for row in resumed] == pytest.approx([row["psnr"] for row in whole], rel=1e-6)
 
@@ -91,7 +92,7 @@ def test_scores_can_be_monitored(tmp_path):
     job = trainer(tmp_path, [QualityMetrics()], steps=4, every=4)
     fit(module, job)
     assert float(job.callback_metrics["val/psnr"]) == pytest.approx(
-        read_table(tmp_path / "curve.csv")[0]["psnr"], rel=1e-5
+        read_csv(tmp_path / "curve.csv")[0]["psnr"], rel=1e-5
     )
 
 
@@ -104,10 +105,7 @@ def test_panels_without_logger_and_bounds(tmp_path):
     assert not (none / "renders").exists()
 
 
-def test_positions_are_spread_and_names_unique():
-    assert spread(10, 3) == [0, 3, 6]
-    assert spread(2, 5) == [0, 1]
-    assert spread(5, 0) == []
+def test_names_are_unique():
     scene = wall()
     frames = [*scene.train.frames, *scene.test.frames]
     assert len({file_stem(frame) for frame in frames}) == len(frames)
@@ -126,7 +124,7 @@ def test_models_and_scenes_without_time_have_no_curves(tmp_path):
 
 
 def test_projection_by_hand():
-    pixels, depths = project(torch.tensor([[0.5, -1.0, 4.0], [0.0, 0.0, -1.0]]), camera(0.1))
+    pixels, depths = camera(0.1).project(torch.tensor([[0.5, -1.0, 4.0], [0.0, 0.0, -1.0]]))
     assert pixels[0].tolist() == pytest.approx([28 + 60 * 0.4 / 4, 20 - 60 / 4])
     assert depths.tolist() == [4.0, -1.0]
 
@@ -144,13 +142,13 @@ def test_probes_are_found_without_the_scenes_help():
     probes = find_probes(scene, 5)
     assert len(probes) == 5
     for probe in probes:
-        (column, row), _ = (x[0].tolist() if x.ndim > 1 else x for x in project(probe.point[None], probe.frame.camera))
+        (column, row), _ = (x[0].tolist() if x.ndim > 1 else x for x in probe.frame.camera.project(probe.point[None]))
         assert (int(row), int(column)) == (probe.row, probe.column)
     places = torch.stack([probe.point for probe in probes])
     assert torch.pdist(places).min() > 0.3
     times, values = recorded(probes[0], scene, "thermal")
     assert times == scene.train.times_s
-    column, row = (int(x) for x in project(probes[0].point[None], scene.train.frames[2].camera)[0][0])
+    column, row = (int(x) for x in scene.train.frames[2].camera.project(probes[0].point[None])[0][0])
     assert values[2] == scene.train[2].thermal[row, column].item()
 
 
@@ -166,7 +164,7 @@ def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
     module = FakeModule(wall(truth=False), tmp_path)
     evaluate(module, trainer(tmp_path, [TemperatureCurves(times=4)]))
     assert (tmp_path / "renders" / "probes.png").exists()
-    assert list(read_table(tmp_path / "renders" / "probes.csv")[0]) == ["time_s", *(f"probe {i}" for i in range(1, 7))]
+    assert list(read_csv(tmp_path / "renders" / "probes.csv")[0]) == ["time_s", *(f"probe {i}" for i in range(1, 7))]
     assert "test/probes" in events(tmp_path).Tags()["images"]
 
 
@@ -175,7 +173,7 @@ def test_progress_says_how_far_it_is(tmp_path, capsys):
     fit(module, trainer(tmp_path, [QualityMetrics(lpips_net=None), Progress()], steps=8, every=4))
     said = capsys.readouterr().err
     assert "8/8" in said
-    curve = read_table(tmp_path / "curve.csv")
+    curve = read_csv(tmp_path / "curve.csv")
     for row in curve:
         assert f"step {row['step']:.0f}:  PSNR {row['psnr']:.2f} dB" in said
     quiet = FakeModule(wall(), tmp_path)

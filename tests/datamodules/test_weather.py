@@ -75,6 +75,16 @@ def test_columns_are_separated_in_four_ways(table, delimiter):
     assert weather.air_c.tolist() == [10.5, 11.5]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])
+def test_tables_that_excel_saves_are_read(tmp_path, encoding):
+    path = tmp_path / "weather.csv"
+    lines = ("sep=;", "Time_s;Air temperature (°C);GHI (W/m²)", "0,5;-3,25;120", '60,5;"4,75";130,5')
+    path.write_text("\r\n".join(lines), encoding=encoding)
+    weather = read_weather(path)
+    assert weather.times_s.tolist() == [0.5, 60.5]
+    assert weather.air_c.tolist() == [-3.25, 4.75] and weather.irradiance_w_m2.tolist() == [120.0, 130.5]
+
+
 @pytest.mark.parametrize(
     ("text", "zone", "hour"),
     [
@@ -130,6 +140,7 @@ def test_a_column_without_values_counts_as_missing(table):
         (["time_s,air_c"], "holds no weather"),
         (["time_s,air_c", "0,1", "60,warm"], "line 3: 'warm' in column air_c is no number"),
         (["time_s,air_c", "0,1", "60"], "line 3: 1 cells for 2 columns"),
+        (["sep=;", "time_s;air_c", "0;1", "60;1,2,3"], "weather.csv, line 4: '1,2,3' in column air_c is no number"),
         (["hour,air_c", "0,1", "1,2"], "no column of times .* it has hour, air_c"),
         (["time_s,snow_cm", "0,1", "1,2"], "none of the columns air_c, wind_m_s, .* it has time_s, snow_cm"),
         (
@@ -137,8 +148,11 @@ def test_a_column_without_values_counts_as_missing(table):
             "column 'temperature' has no unit; name it one of temperature_c, temp.*_k",
         ),
         (["time_s,air_c,temp_k", "0,1,2", "1,2,2"], "'air_c' and 'temp_k' are both air_c"),
-        (["time,air_c", "2024-07-11T06:00,1", "2024-07-11T07:00,1"], "line 2: .* has no time zone. .*weather_zone=UTC"),
-        (["time,air_c", "noon,1", "1,1"], "line 2: 'noon' is neither seconds nor a date-time"),
+        (
+            ["time,air_c", "2024-07-11T06:00,1", "2024-07-11T07:00,1"],
+            "line 2, column time: .* has no time zone. .*weather_zone=UTC",
+        ),
+        (["time,air_c", "noon,1", "1,1"], "line 2, column time: 'noon' is neither seconds nor a date-time"),
         (["time_s,air_c", "0,1", "1720656000,1"], "use one clock"),
         (["time_s,irradiance_w_m2", "0,10", "60,-40"], "irradiance_w_m2 is -40 at second 60 .* between 0 and 1600"),
         (["time_s,humidity_percent", "0,50", "60,104"], "humidity_percent is 104 at second 60 .* between 0 and 100"),

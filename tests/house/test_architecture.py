@@ -26,8 +26,7 @@ ALLOWED = {
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "composition": {"training", "heatsplat"},
     "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "training"},
-    "studies": {"contracts", "metrics", "physics", "io", "renderers", "kernels", "losses", "geometry", "heatsplat"}
-    | {"effects", "sensors", "thermal", "training", "runs"},
+    "studies": {"contracts", "metrics", "io", "training"},
     "training": {"contracts", "splats", "sensors", "losses", "renderers", "thermal", "density", "io", "kernels"},
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
@@ -83,6 +82,7 @@ def test_rooms_import_only_what_they_may(path):
         parts = name.split(".")
         if parts[:2] == ["heatsplat", "datamodules"]:
             assert room == "datamodules", f"{path} imports {name}: only configurations name data modules"
+        assert parts[0] != "benchmarks", f"{path} imports {name}: the package never imports what stands beside it"
         if parts[0] != "heatsplat" or len(parts) == 1 or room == parts[1]:
             continue
         other = parts[1] if (PACKAGE / parts[1]).exists() or (PACKAGE / f"{parts[1]}.py").exists() else "heatsplat"

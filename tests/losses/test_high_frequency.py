@@ -89,7 +89,7 @@ def test_the_truth_costs_nothing_and_a_blurred_one_does_with_a_gradient_towards_
     fine = smooth()
     record = resampled(fine, HEIGHT, WIDTH, "bicubic")
     term = HighFrequency(lambda: Oracle(fine))
-    assert term(inputs(fine, record)).item() == pytest.approx(0.0, abs=2e-4)  # lessons are kept in half precision
+    assert term(inputs(fine, record)).item() == pytest.approx(0.0, abs=2e-4)  # answers are kept in half precision
     blurred = averaged(fine, 9).requires_grad_()
     loss = term(inputs(blurred, record))
     loss.backward()
@@ -105,7 +105,7 @@ def test_levels_do_not_matter_only_detail_does():
     assert term(inputs(fine + 0.3, record)).item() == pytest.approx(0.0, abs=2e-4)
 
 
-def test_a_lesson_is_made_once_per_image():
+def test_the_teacher_is_asked_once_per_image():
     teacher = Oracle(smooth())
     term = HighFrequency(lambda: teacher)
     for index in (0, 0, 1, 0):
@@ -220,13 +220,13 @@ def save_enlarger(path, factor=FACTOR):
 @pytest.mark.parametrize("name, kind", [("net.pt", "TorchScript network"), ("net.pt2", "exported network")])
 def test_a_network_from_a_file_is_asked_once_and_its_answer_kept(tmp_path, name, kind):
     save_enlarger(tmp_path / name)
-    teacher = load_teacher(str(tmp_path / name), cache=str(tmp_path / "cache"))
+    teacher = load_teacher(str(tmp_path / name), cache=str(tmp_path / "cache"), trust=True)
     assert teacher.description.startswith(f"{kind} in {name} (SHA-256 ")
     answer = teacher(noise(), frame(), FACTOR)
     expected = noise().repeat_interleave(FACTOR, 0).repeat_interleave(FACTOR, 1)
     assert torch.allclose(answer, expected)
     assert len(list((tmp_path / "cache").glob("*.npy"))) == 1
-    again = load_teacher(str(tmp_path / name), cache=str(tmp_path / "cache"))
+    again = load_teacher(str(tmp_path / name), cache=str(tmp_path / "cache"), trust=True)
     again.network = lambda planes: pytest.fail("the network was asked again")
     assert torch.allclose(again(noise(), frame(), FACTOR), expected, atol=1e-3)
     with pytest.raises(pytest.fail.Exception):
@@ -235,7 +235,7 @@ def test_a_network_from_a_file_is_asked_once_and_its_answer_kept(tmp_path, name,
 
 def test_a_network_for_another_factor_is_refused(tmp_path):
     save_enlarger(tmp_path / "net.pt", factor=2)
-    teacher = load_teacher(str(tmp_path / "net.pt"), cache=None)
+    teacher = load_teacher(str(tmp_path / "net.pt"), cache=None, trust=True)
     message = r"made \[1, 3, 24, 32\], but \[1, 3, 48, 64\] is needed; is it a network for factor 4\?"
     with pytest.raises(SceneError, match=message):
         teacher(noise(), frame(), FACTOR)
@@ -250,7 +250,16 @@ def test_files_that_hold_no_network_are_refused(tmp_path):
         load_teacher(str(tmp_path / "other.pth"))
     (tmp_path / "text.pt2").write_text("hello")
     with pytest.raises(SceneError, match="is no program of torch.export"):
-        load_teacher(str(tmp_path / "text.pt2"))
+        load_teacher(str(tmp_path / "text.pt2"), trust=True)
+
+
+@pytest.mark.parametrize("name", ["net.pt", "net.pt2"])
+def test_files_that_run_code_are_refused_unless_they_are_trusted(tmp_path, monkeypatch, name):
+    save_enlarger(tmp_path / name)
+    for loader in (torch.jit, torch.export):
+        monkeypatch.setattr(loader, "load", lambda *_, **__: pytest.fail("its code was loaded"))
+    with pytest.raises(SceneError, match=rf"{name} is no state dictionary, .* say so with trust=true"):
+        load_teacher(str(tmp_path / name))
 
 
 # SwinIR ---------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ class Given:
     description = "given"
 
     def __init__(self, fine):
-        self.fine, self.asked = fine.half().float(), 0  # lessons are kept in half precision
+        self.fine, self.asked = fine.half().float(), 0  # answers are kept in half precision
 
     def check(self, frame, factor):
         return

@@ -15,7 +15,7 @@ from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.studies import frontier
-from heatsplat.studies.frontier import asked_for, dominated, group, read_runs, run, seconds_to
+from heatsplat.studies.frontier import asked_for, dominated, find_runs, group, run, seconds_to
 
 CONFIG = Path(cli.CONF) / "study" / "frontier.yaml"
 LEVELS = {"psnr_levels_db": [25, 30], "mae_levels_c": [15, 10]}
@@ -55,16 +55,16 @@ def runs(tmp_path) -> Path:
 
 
 def test_runs_are_found_at_any_depth_and_grouped_over_seeds(runs):
-    recipes = {recipe.name: recipe for recipe in group(read_runs(runs))}
+    recipes = {recipe.name: recipe for recipe in group(find_runs([runs]))}
     assert set(recipes) == {"etgs", "3dgs", "3dgs thermal.sh_degree=2"}
     etgs = recipes["etgs"]
-    assert len(etgs.runs) == 2 and etgs.mean("psnr") == 31.0 and etgs.spread("psnr") == pytest.approx(2**0.5)
-    assert etgs.runs[0].course["psnr"] == [(1, 20), (3, 28), (5, 31)]
+    assert etgs.count == 2 and etgs.mean("psnr") == 31.0 and etgs.spread("psnr") == pytest.approx(2**0.5)
+    assert etgs.table["course"].iloc[0]["psnr"] == [(1, 20), (3, 28), (5, 31)]
 
 
 def test_the_front_is_what_nothing_beats_in_both(runs):
     made(runs / "d", "ti3dgs", ["max_steps=9"], [(0.5, 10)], 0.9, 19.0)
-    front = {recipe.name: recipe.on_front for recipe in group(read_runs(runs))}
+    front = {recipe.name: recipe.on_front for recipe in group(find_runs([runs]))}
     assert front["ti3dgs"] == {"psnr": True, "mae_c": True}  # the quickest
     assert front["etgs"] == {"psnr": True, "mae_c": True}  # the best
     assert front["3dgs"] == {"psnr": False, "mae_c": False}  # quicker than etgs at its end, which was better on its way
@@ -110,7 +110,7 @@ def measured(size: str, test: int, *more: str, split: str = "every_8th") -> dict
 
 def names_by_panel(folder: Path) -> dict[str, set[str]]:
     panels: dict[str, set[str]] = {}
-    for recipe in group(read_runs(folder)):
+    for recipe in group(find_runs([folder])):
         panels.setdefault(recipe.scene, set()).add(recipe.name)
     return panels
 
@@ -122,7 +122,7 @@ def test_runs_that_measured_other_images_have_panels_of_their_own(tmp_path):
             folder = tmp_path / f"{method}_{size}"
             made(folder, method, [f"data.size={size}", "max_steps=9"], [], 1.0, psnr, **measured(shown, test))
     made(tmp_path / "half", "etgs", ["data.downscale=2"], [], 9.0, 20.0, **measured("80x64", 9))
-    recipes = group(read_runs(tmp_path))
+    recipes = group(find_runs([tmp_path]))
     assert {recipe.scene for recipe in recipes} == {
         f"cooling, image size {text}" for text in ("64x52", "160x128", "80x64")
     }
@@ -166,8 +166,8 @@ def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
     assert names_by_panel(tmp_path) == {
         "cooling": {"etgs, K = 8", "etgs, K = 24, max_steps=9", "etgs, K = 24, max_steps=18"}
     }
-    (eight,) = (recipe for recipe in group(read_runs(tmp_path)) if recipe.name == "etgs, K = 8")
-    assert len(eight.runs) == 2
+    (eight,) = (recipe for recipe in group(find_runs([tmp_path])) if recipe.name == "etgs, K = 8")
+    assert eight.count == 2
 
 
 def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
@@ -181,8 +181,8 @@ def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
         1.0,
         31.0,
     )
-    (recipe,) = group(read_runs(tmp_path))
-    assert recipe.name == "etgs max_steps=9" and len(recipe.runs) == 3
+    (recipe,) = group(find_runs([tmp_path]))
+    assert recipe.name == "etgs max_steps=9" and recipe.count == 3
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
     assert asked[0] == [
         "data.size=tiny", "method=etgs", "data.scene=heated", "seed=0", "dtype=float32", "thermal.frequencies=8"
     ]  # fmt: skip
-    assert {len(recipe.runs) for recipe in recipes} == {4}  # the stand-in says cooling of all: seeds and scenes are one
+    assert {recipe.count for recipe in recipes} == {4}  # the stand-in says cooling of all: seeds and scenes are one
     assert len(recipes) == 6
 
 

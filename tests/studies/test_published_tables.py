@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 import yaml
@@ -15,9 +16,9 @@ from running import compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
+from heatsplat.studies.finished import Runs
 from heatsplat.studies.published import Plan, Run, make_plan
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
-from heatsplat.studies.sweeps import Row
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENTS = sorted((ROOT / "conf" / "experiment").glob("table_*.yaml"))
@@ -79,7 +80,7 @@ def test_every_table_is_planned_and_composes(path, tmp_path):
     run = next(run for run in plan.runs if run.method == plan.paper)
     composed = compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
     assert composed.table.paper == plan.paper and composed.data.scene == run.folder
-    assert composed.data._target_.split(".")[1] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
+    assert composed.data._target_.split(".")[2] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
     assert composed.max_steps == (7000 if run.setting == "7k" else 30000)
 
 
@@ -205,7 +206,7 @@ def test_the_command_line_wins_over_the_settings_of_the_table(tmp_path):
 def test_methods_beyond_the_paper_join_its_table(tmp_path):
     plan = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench"), methods=["etgs", "energy_balance"])
     assert [run.row for run in plan.runs] == ["etgs", "energy_balance"]
-    lines = compare(plan, {("energy_balance", "cooling_bench"): Row("energy_balance", "x", {"psnr": [39.0]}, 1)})
+    lines = compare(plan, {("energy_balance", "cooling_bench"): runs("energy_balance", "x", psnr=39.0)})
     (line,) = (line for line in lines if line.method == "energy_balance" and line.scene == "cooling_bench")
     assert line.ours == {"psnr": 39.0} and not line.printed
     assert "| cooling_bench | energy_balance | 39.00 / – | – | – |" in markdown(plan, lines)
@@ -257,9 +258,9 @@ def test_runs_of_one_row_with_other_settings_have_lines_of_their_own(tmp_path):
     """A folder that two commands filled."""
     plan = plan_of("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
     found = [
-        Row("etgs", "cooling_bench", {"psnr": [38.0]}, 1, other="max_steps=300"),
-        Row("etgs", "cooling_bench", {"psnr": [39.0]}, 1, other="max_steps=3000"),
-        Row("3dgs", "cooling_bench", {"psnr": [30.0]}, 1),
+        runs("etgs", "cooling_bench", "max_steps=300", psnr=38.0),
+        runs("etgs", "cooling_bench", "max_steps=3000", psnr=39.0),
+        runs("3dgs", "cooling_bench", psnr=30.0),
     ]
     lines = compare_all(plan, found)
     text = markdown(plan, lines)
@@ -275,9 +276,13 @@ def compare_at(plan: Plan, scene: str) -> list:
     return [line for line in compare(plan, {}) if line.scene == scene]
 
 
+def runs(row: str, scene: str, other: str = "", **values: float | list[float]) -> Runs:
+    table = pd.DataFrame({name: pd.Series(value) for name, value in values.items()})
+    return Runs(row, scene, table.assign(failed=None), other)
+
+
 def results(scene: str, row: str, **values: float | list[float]) -> dict:
-    lists = {key: value if isinstance(value, list) else [value] for key, value in values.items()}
-    return {(row, scene): Row(row, scene, lists, max(len(value) for value in lists.values()))}
+    return {(row, scene): runs(row, scene, **values)}
 
 
 def test_ours_stands_beside_the_printed_value_with_the_difference_and_its_cost(tmp_path):

@@ -13,8 +13,9 @@ from running import compose_run
 
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
+from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, row_name
 from heatsplat.studies.published import figures, quoted
-from heatsplat.studies.sweeps import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, collect, row_name, write_sweep
+from heatsplat.studies.sweeps import collect, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +53,7 @@ def test_rows_have_means_spreads_and_reasons(sweep):
     rows = {row.name: row for row in collect(sweep)}
     assert list(rows) == ["K = 8", "K = 24", "broken", "stopped"]
     assert rows["K = 8"].mean("psnr") == 30.5 and rows["K = 8"].spread("psnr") == pytest.approx(0.5**0.5)
-    assert rows["K = 24"].values["train_seconds"] == [12.0, 13.0] and rows["K = 24"].jobs == 2
+    assert rows["K = 24"].values("train_seconds") == [12.0, 13.0] and rows["K = 24"].count == 2
     assert rows["K = 8"].mean("ssim") is None and rows["K = 8"].spread("ssim") is None
     assert rows["broken"].failed == ["SceneError: no points"] and rows["stopped"].failed == ["not finished"]
 
@@ -119,7 +120,7 @@ def test_jobs_of_one_row_with_other_settings_are_rows_of_their_own(tmp_path):
         job(tmp_path, number, own, 30.0 + steps + seed)
     rows = {row.label: row for row in collect(tmp_path)}
     assert list(rows) == ["K = 8, max_steps=9", "K = 8, max_steps=99", "K = 24"]
-    assert [row.jobs for row in rows.values()] == [2, 1, 2] and rows["K = 8, max_steps=9"].mean("psnr") == 39.5
+    assert [row.count for row in rows.values()] == [2, 1, 2] and rows["K = 8, max_steps=9"].mean("psnr") == 39.5
     write_sweep(tmp_path, ["K = 24", "K = 8"], {"K = 8": {"psnr": "40.57"}})
     text = (tmp_path / "table.md").read_text()
     assert "| K = 8, max_steps=99 | 1 | 129.00 |" in text and text.count("40.57") == 2
@@ -136,7 +137,7 @@ def test_results_that_cannot_be_read_are_told_beside_the_others(sweep):
     damaged = next(path for path in sweep.iterdir() if "_1_" in path.name)
     (damaged / METRICS_FILE).write_text("{")
     rows = {row.label: row for row in collect(sweep)}
-    assert rows["K = 24"].jobs == 1
+    assert rows["K = 24"].count == 1
     (reason,) = rows["K = 24"].failed
     assert f"{damaged / METRICS_FILE} is not a metrics.json" in reason and "Delete the folder" in reason
 

@@ -7,8 +7,8 @@ import pytest
 from running import TINY, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from heatsplat.callbacks.metrics import read_table
 from heatsplat.contracts import SceneError, ViewSet
+from heatsplat.io.tables import read_csv
 
 SHORT = (
     "data.size=tiny",
@@ -35,10 +35,10 @@ def test_both_images_are_scored(finished):
     assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5 and 0 < found["test"]["rgb_ssim"] <= 1
     assert found["test"]["rgb_lpips"] is not None or "LPIPS" in found["reasons"]["test.rgb_lpips"]
     assert "data range 1" in found["definitions"]["rgb_psnr"]
-    rows = read_table(folder / "test_per_image.csv")
+    rows = read_csv(folder / "test_per_image.csv")
     assert found["test"]["rgb_psnr"] == pytest.approx(sum(row["rgb_psnr"] for row in rows) / len(rows))
-    assert [row["step"] for row in read_table(folder / "curve.csv")] == [6, 12]
-    assert read_table(folder / "curve.csv")[1]["rgb_psnr"] > 5
+    assert [row["step"] for row in read_csv(folder / "curve.csv")] == [6, 12]
+    assert read_csv(folder / "curve.csv")[1]["rgb_psnr"] > 5
     assert f"| rgb_psnr | {found['test']['rgb_psnr']:.4g} dB |" in (folder / "report.md").read_text()
 
 

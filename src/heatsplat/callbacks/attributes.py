@@ -8,8 +8,8 @@ import numpy as np
 import pytorch_lightning as pl
 
 from heatsplat.callbacks.board import board
-from heatsplat.callbacks.images import file_stem, spread
-from heatsplat.contracts import Frame
+from heatsplat.callbacks.images import file_stem
+from heatsplat.contracts import Frame, evenly_spread
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
 from heatsplat.metrics.attribute_errors import attribute_errors
 
@@ -39,7 +39,7 @@ class AttributeMaps(pl.Callback):
 
     def _draw(self, split: str, module: pl.LightningModule, count: int, step: int) -> None:
         frames = getattr(module.scene, split).frames
-        for i in spread(len(frames), count):
+        for i in evenly_spread(len(frames), count):
             picture = attribute_picture(module, frames[i])
             if picture is None:
                 return

@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.contracts import Frame, SceneData, View
+from heatsplat.contracts import Frame, SceneData, View, evenly_spread
 from heatsplat.io.pictures import comparison_picture, write_png
 from heatsplat.metrics import mae_c, psnr
 
@@ -34,14 +34,14 @@ class ImagePanels(pl.Callback):
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
     ) -> None:
         count = min(len(module.scene.val), int(trainer.num_val_batches[0]))
-        if not trainer.sanity_checking and batch_idx in spread(count, self.val_views):
+        if not trainer.sanity_checking and batch_idx in evenly_spread(count, self.val_views):
             self._draw("val", module, outputs, trainer.global_step)
 
     def on_test_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
     ) -> None:
         count = min(len(module.scene.test), int(trainer.num_test_batches[0]))
-        if batch_idx in spread(count, count if self.test_views < 0 else self.test_views):
+        if batch_idx in evenly_spread(count, count if self.test_views < 0 else self.test_views):
             self._draw("test", module, outputs, trainer.global_step)
 
     def _draw(self, split: str, module: pl.LightningModule, outputs: dict[str, Any], step: int) -> None:
@@ -67,11 +67,6 @@ def panels(view: View, modality: str, prediction: Tensor, scene: SceneData) -> n
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
     title += [text.format(value) for value, text in scores if value is not None]
     return comparison_picture(target, prediction, thermal_range, mask, title="   ·   ".join(title))
-
-
-def spread(count: int, chosen: int) -> list[int]:
-    """Positions of ``chosen`` of ``count`` things, evenly spread, first one included."""
-    return [i * count // chosen for i in range(min(count, chosen))] if count > chosen else list(range(count))
 
 
 def file_stem(frame: Frame) -> str:

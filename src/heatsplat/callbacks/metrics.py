@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pytorch_lightning as pl
@@ -12,7 +10,8 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.contracts import SceneData
-from heatsplat.io.results import CURVE_FILE, write_atomically
+from heatsplat.io.results import CURVE_FILE
+from heatsplat.io.tables import write_csv
 from heatsplat.metrics import (
     DEFINITIONS,
     IMAGE_SCORES,
@@ -114,7 +113,7 @@ class QualityMetrics(pl.Callback):
             self._log(module, "val_by_seconds", means, round(seconds))
         self.curve = [row for row in self.curve if row["step"] < step]
         self.curve.append({"step": step, "train_seconds": seconds, "gaussians": len(module.splats), **means})
-        write_table(module.output_dir / CURVE_FILE, tuple(self.curve[-1]), self.curve)
+        write_csv(module.output_dir / CURVE_FILE, self.curve, tuple(self.curve[-1]))
 
     # Test ------------------------------------------------------------------------------------------------------------
 
@@ -149,7 +148,7 @@ class QualityMetrics(pl.Callback):
         results.data["test_pixels_counted"] = mean_of_images(self._rows, "counted")
         results.data["test_pixels_saturated"] = mean_of_images(self._rows, "saturated")
         self._log(module, "test", results.test, trainer.global_step)
-        write_table(module.output_dir / TEST_FILE, tuple(self._rows[0]), self._rows)
+        write_csv(module.output_dir / TEST_FILE, self._rows)
 
     def _why_not(self, name: str, module: pl.LightningModule) -> str:
         """Why no test image has this score."""
@@ -194,28 +193,6 @@ class QualityMetrics(pl.Callback):
 def _scores_of(companion: str) -> tuple[str, ...]:
     """The scores that a further image has: the clean one is an image of temperature like the recorded one."""
     return (*IMAGE_SCORES, "mae_c") if companion == "clean" else IMAGE_SCORES
-
-
-def write_table(path: Any, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes rows as CSV, as a whole or not at all: floats in full precision, None empty, infinity as ``inf``."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(path, text.getvalue())
-
-
-def read_table(path: Any) -> list[dict[str, float | str | None]]:
-    """Rows of a CSV that ``write_table`` wrote, numbers as floats and empty cells as None."""
-    with open(path, newline="", encoding="utf-8") as file:
-        return [{key: _cell(text) for key, text in row.items()} for row in csv.DictReader(file)]
-
-
-def _cell(text: str) -> float | str | None:
-    try:
-        return float(text) if text else None
-    except ValueError:
-        return text
 
 
 def _all_images(scene: SceneData) -> Iterable[tuple[Tensor, Tensor | None]]:

@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.callbacks.images import spread
-from heatsplat.callbacks.metrics import write_table
-from heatsplat.contracts import Camera, Frame, SceneData, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.tables import write_csv
 
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
 OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
@@ -110,23 +109,15 @@ class TemperatureCurves(pl.Callback):
         columns = ["time_s", *names, *([] if truth is None else [f"truth of {name}" for name in names])]
         stacked = np.concatenate([[times], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
-        write_table(module.output_dir / "renders" / "probes.csv", columns, rows)
-
-
-def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64; where the depth is not positive they lie
-    behind the camera and the pixel means nothing."""
-    view = points.double().cpu() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    homogeneous = view @ camera.K.T
-    return homogeneous[:, :2] / view[:, 2:].clamp_min(1e-12), view[:, 2]
+        write_csv(module.output_dir / "renders" / "probes.csv", rows)
 
 
 def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:
     """Which points [n, 3] the camera sees, [n] bool: in the image and not behind points of the cloud [P, 3]."""
-    pixels, depths = project(points, camera)
+    pixels, depths = camera.project(points)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     inside = (depths > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1)
-    others, other_depths = project(cloud, camera)
+    others, other_depths = camera.project(cloud)
     for i in inside.nonzero()[:, 0].tolist():
         near = ((others - pixels[i]).abs() < NEAR_PIXELS * camera.width).all(1)
         hiding = near & (other_depths > 0) & (other_depths < NEAR_DEPTH * depths[i])
@@ -142,10 +133,10 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
     Cameras are chosen greedily, the one that sees most first, so that few renders serve many probes.
     """
     views: ViewSet = scene.val if len(scene.val) else scene.train
-    frames = [views.frames[i] for i in spread(len(views), CANDIDATES)]
+    frames = [views.frames[i] for i in evenly_spread(len(views), CANDIDATES)]
     cloud = scene.points[:: max(1, len(scene.points) // 20_000)]
     if scene.probes is not None:
-        picked = spread(len(scene.probes), count)
+        picked = evenly_spread(len(scene.probes), count)
         points, told = scene.probes[picked], scene.notes.get("probes")
         names = [told[i] for i in picked] if isinstance(told, list) and len(told) == len(scene.probes) else None
     else:
@@ -163,7 +154,7 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
         left &= ~seen[best]
     probes = []
     for i, frame in sorted(chosen.items()):
-        column, row = project(points[i : i + 1], frame.camera)[0][0].tolist()
+        column, row = frame.camera.project(points[i : i + 1])[0][0].tolist()
         probes.append(Probe(names[i], points[i].detach().cpu(), frame, int(row), int(column)))
     return probes
 
@@ -178,7 +169,7 @@ def _spread_points(frames: Sequence[Frame], cloud: Tensor, count: int) -> Tensor
     points = visible[best]
     if not len(points):
         return points
-    pixels, _ = project(points, frames[best].camera)
+    pixels, _ = frames[best].camera.project(points)
     picked = [int((pixels - pixels.mean(0)).norm(dim=1).argmin())]
     while len(picked) < min(count, len(points)):
         picked.append(int(torch.cdist(pixels, pixels[picked]).amin(1).argmax()))
@@ -189,11 +180,11 @@ def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float]
     """What training images recorded of a probe: times in seconds and image values, from the cameras that see it."""
     cloud = scene.points[:: max(1, len(scene.points) // 5_000)]
     times, values = [], []
-    for i in spread(len(scene.train), DOTS):
+    for i in evenly_spread(len(scene.train), DOTS):
         frame = scene.train.frames[i]
         if not bool(seen_by(frame.camera, probe.point[None], cloud)[0]):
             continue
-        column, row = (int(x) for x in project(probe.point[None], frame.camera)[0][0].tolist())
+        column, row = (int(x) for x in frame.camera.project(probe.point[None])[0][0].tolist())
         view = scene.train[i]
         value = view.image(modality)[row, column].mean().item()
         if np.isfinite(value) and (view.mask is None or bool(view.mask[row, column])):

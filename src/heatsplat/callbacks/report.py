@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 
 from heatsplat.callbacks.board import board
-from heatsplat.callbacks.images import spread
-from heatsplat.callbacks.metrics import TEST_FILE, read_table
-from heatsplat.contracts import SceneData
+from heatsplat.callbacks.metrics import TEST_FILE
+from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
+from heatsplat.io.tables import markdown_table, read_csv
 from heatsplat.metrics import DEFINITIONS
 
 REPORT_FILE = "report.md"
@@ -73,7 +73,7 @@ class Report(pl.Callback):
         results.write(folder / METRICS_FILE)
         curves = draw_curves(folder)
         pictures = sorted((folder / "renders" / "test").glob("*.png"))
-        shown = [pictures[i] for i in spread(len(pictures), self.pictures)]
+        shown = [pictures[i] for i in evenly_spread(len(pictures), self.pictures)]
         probes = folder / "renders" / "probes.png"
         write_atomically(
             folder / REPORT_FILE, report(results, folder, shown, curves, probes if probes.exists() else None)
@@ -169,7 +169,7 @@ def draw_curves(folder: Path) -> Path | None:
     """Draws scores against seconds of training, and returns the picture's path, or None without a course to draw."""
     if not (folder / CURVE_FILE).exists():
         return None
-    rows = [row for row in read_table(folder / CURVE_FILE) if row["train_seconds"] is not None]
+    rows = [row for row in read_csv(folder / CURVE_FILE) if row["train_seconds"] is not None]
     scores = [("psnr", "PSNR (dB)"), ("ssim", "SSIM"), ("mae_c", "MAE (°C)")]
     scores = [(name, label) for name, label in scores if any(row[name] is not None for row in rows)]
     if len(rows) < 2 or not scores:
@@ -192,11 +192,9 @@ def report(
     content = results.as_json()
     run, reasons = content["run"], content["reasons"]
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
-    lines += ["## Scores and what they cost", "", "| score | value | | cost | value |", "|---|---|---|---|---|"]
-    for (score, value), (cost, price) in zip_longest(
-        cells(content, "test"), cells(content, "cost"), fillvalue=("", "")
-    ):
-        lines.append(f"| {score} | {value} | | {cost} | {price} |")
+    pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
+    table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
+    lines += ["## Scores and what they cost", "", *table]
     missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
     if missing:
         lines += ["", "Not to be had:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
@@ -245,19 +243,16 @@ def _effects_section(effects: Mapping[str, Any]) -> list[str]:
 
 def effects_table(effects: Mapping[str, Any]) -> list[str]:
     """Lines of a Markdown table of ``describe_effects``: what is simulated, why, and what it costs."""
-    lines = [
-        "| effect | simulated | statistic | threshold | reason | parameters | ms per step |",
-        "|---|---|---:|---:|---|---:|---:|",
-    ]
+    rows = []
     for name, effect in effects.items():
         statistic, threshold, parameters, milliseconds = (
             "–" if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
             for key in ("statistic", "threshold", "parameters", "ms_per_step")
         )
-        reason = effect["reason"].replace("|", "/")
         on = "**yes**" if effect["on"] else "no"
-        lines.append(f"| {name} | {on} | {statistic} | {threshold} | {reason} | {parameters} | {milliseconds} |")
-    return lines
+        rows.append((name, on, statistic, threshold, effect["reason"], parameters, milliseconds))
+    head = ("effect", "simulated", "statistic", "threshold", "reason", "parameters", "ms per step")
+    return markdown_table(head, rows, align="llrrlrr")
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:

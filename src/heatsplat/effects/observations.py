@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import SceneData, View
+from heatsplat.contracts import SceneData, View, evenly_spread
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
@@ -104,7 +104,7 @@ class Observations:
 def observe(scene: SceneData) -> Observations:
     """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
     frames = scene.train.frames
-    chosen = spread(len(frames), MAX_FRAMES)
+    chosen = evenly_spread(len(frames), MAX_FRAMES)
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
@@ -139,18 +139,13 @@ def observe(scene: SceneData) -> Observations:
     return Observations(scene, images, masks, times_s, noise, still, tracks, why)
 
 
-def spread(count: int, most: int) -> list[int]:
-    """At most ``most`` positions out of ``count``, evenly spread, first and last among them."""
-    return sorted(set(torch.linspace(0, count - 1, min(count, most)).round().long().tolist())) if count else []
-
-
 def _stands_still(views: list[View], points: Tensor) -> bool:
     """Whether the views were taken from one place: seen from all of them, points move by less than STILL_PX.
 
     A reconstruction gives a tripod a little motion. Where no point is in front of all cameras, their matrices are equal.
     """
     cameras = [view.camera for view in views]
-    points = points[torch.tensor(spread(len(points), MAX_CANDIDATES), dtype=torch.long)]
+    points = points[torch.tensor(evenly_spread(len(points), MAX_CANDIDATES), dtype=torch.long)]
     seen = torch.stack([to_camera(points, camera.viewmat)[:, 2] > 1e-9 for camera in cameras]).all(0)
     if not seen.any():
         viewmats = torch.stack([camera.viewmat for camera in cameras])
@@ -188,9 +183,9 @@ def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
 
 def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
     """Tracks of scene points; None where too few are seen often enough."""
-    points = points[torch.tensor(spread(len(points), MAX_IN_FRONT))]
+    points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
     count, height, width = images.shape
-    followed = torch.tensor(spread(len(points), MAX_CANDIDATES))
+    followed = torch.tensor(evenly_spread(len(points), MAX_CANDIDATES))
     cell = max(2.0, math.sqrt(2.0 * width * height / len(points)))
     slopes = _steepest(images, noise)
     has_rgb = all(view.rgb is not None and view.rgb.shape[:2] == (height, width) for view in views)

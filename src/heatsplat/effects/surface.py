@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.effects.observations import MAX_IN_FRONT, Observations, spread
+from heatsplat.contracts import evenly_spread
+from heatsplat.effects.observations import MAX_IN_FRONT, Observations
 
 NEIGHBOURS = 8
 FEWEST = 12  # points below which no surface can be told
@@ -17,7 +18,7 @@ def normals(obs: Observations) -> Tensor | None:
     tracks, points = obs.tracks, obs.scene.points.double()
     if tracks is None or obs.still or len(points) < FEWEST:
         return None
-    points = points[torch.tensor(spread(len(points), MAX_IN_FRONT))]
+    points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
     near = torch.cdist(tracks.points, points).topk(min(NEIGHBOURS + 1, len(points)), largest=False).indices
     around = points[near]
     around = around - around.mean(1, keepdim=True)

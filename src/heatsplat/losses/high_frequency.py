@@ -13,7 +13,7 @@ from heatsplat.geometry.resampling import resampled
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.edge import GAIN, sobel
 from heatsplat.losses.low_resolution import check_fineness, counted_finely
-from heatsplat.losses.teacher import Lessons, Teacher
+from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
 class HighFrequency:
@@ -50,19 +50,21 @@ class HighFrequency:
                 f"gammas must not be negative and factor at least 1, got {gamma_pixel}, {gamma_gradient}, {factor}"
             )
         self.factor = factor
-        self._lessons = Lessons(
+        self._teacher_images = TeacherImages(
             teacher, factor, lambda fine, record: (self.detail(fine), self.confidence(fine, record))
         )
         self.gamma_pixel, self.gamma_gradient = gamma_pixel, gamma_gradient
         self.inner, self.outer = inner, outer
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Makes the lessons of a scene; see ``Lessons.prepare``."""
-        return self._lessons.prepare(scene, modality)
+        """Asks the teacher for the images of a scene; see ``TeacherImages.prepare``."""
+        return self._teacher_images.prepare(scene, modality)
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         check_fineness(inputs, self.factor)
-        detail, confidence = (made.to(inputs.prediction) for made in self._lessons.of(inputs.view, inputs.target))
+        detail, confidence = (
+            made.to(inputs.prediction) for made in self._teacher_images.of(inputs.view, inputs.target)
+        )
         error = confidence * (self.detail(inputs.prediction) - detail).abs()
         if inputs.mask is None:
             return error.mean()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import warnings
+import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +25,8 @@ INTERPOLATIONS = ("lanczos", "bicubic")
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 WHERE = (
     "Give a file with a network (a state dict of SwinIR such as 002_lightweightSR_DIV2K_s64w8_SwinIR-S_x4.pth from "
-    "github.com/JingyunLiang/SwinIR/releases, TorchScript, or torch.export's .pt2) or a folder with one enlarged image "
-    "per training image, by teacher=PATH; or choose interpolation by teacher=lanczos or teacher=bicubic."
+    "github.com/JingyunLiang/SwinIR/releases; with trust=true also TorchScript or torch.export's .pt2) or a folder with one "
+    "enlarged image per training image, by teacher=PATH; or choose interpolation by teacher=lanczos or teacher=bicubic."
 )
 
 
@@ -47,15 +48,16 @@ class Teacher(ABC):
         """The image ``factor`` times as fine, [factor H, factor W, C], of [H, W, C] in [0, 1]."""
 
 
-def load_teacher(source: str | None, cache: str | None = "~/.cache/heatsplat/teacher") -> Teacher:
+def load_teacher(source: str | None, cache: str | None = "~/.cache/heatsplat/teacher", trust: bool = False) -> Teacher:
     """The teacher that a word or a path means.
 
     Args:
         source: "lanczos" or "bicubic"; a folder of enlarged images; or a file that holds a network.
         cache: folder in which a network's answers are kept, so that later runs need not ask again; None keeps none.
+        trust: whether a file may run code that it brings along (TorchScript, .pt2); a state dictionary has none.
 
     Raises:
-        SceneError: nothing was chosen, there is no such path, or the file holds no network that is understood.
+        SceneError: nothing was chosen, there is no such path, or the file holds no network that is understood or trusted.
     """
     if source in INTERPOLATIONS:
         return Interpolation(source)
@@ -66,10 +68,10 @@ def load_teacher(source: str | None, cache: str | None = "~/.cache/heatsplat/tea
         return Images(path)
     if not path.is_file():
         raise SceneError(f"teacher={source}: there is no file or folder {path.absolute()}. {WHERE}")
-    return Network(path, None if cache is None else Path(cache).expanduser())
+    return Network(path, None if cache is None else Path(cache).expanduser(), trust)
 
 
-class Lessons:
+class TeacherImages:
     """What is learnt of a teacher's images: made once per training image, kept in half precision.
 
     Args:
@@ -84,7 +86,7 @@ class Lessons:
         factor: int,
         made: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
     ) -> None:
-        self._hire, self._teacher, self.factor, self._make = teacher, None, factor, made
+        self._load, self._teacher, self.factor, self._make = teacher, None, factor, made
         self._made: dict[int, tuple[Tensor, ...]] = {}
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
@@ -92,7 +94,7 @@ class Lessons:
 
         Returns what the report should say.
         """
-        teacher = self._hired()
+        teacher = self._loaded()
         log.info("super-resolution teacher: %s", teacher.description)
         for frame in scene.train.frames:
             teacher.check(frame, self.factor)
@@ -107,13 +109,13 @@ class Lessons:
         key = view.frame.frame_id
         if key not in self._made:
             record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
-            fine = self._hired()(record, view.frame, self.factor)
+            fine = self._loaded()(record, view.frame, self.factor)
             self._made[key] = tuple(kept.half() for kept in self._make(fine, record))
         return self._made[key]
 
-    def _hired(self) -> Teacher:
+    def _loaded(self) -> Teacher:
         if self._teacher is None:
-            self._teacher = self._hire()
+            self._teacher = self._load()
         return self._teacher
 
 
@@ -188,9 +190,9 @@ class Network(Teacher):
     It gets [1, 3, H, W] in [0, 1] (grey is repeated) and must return [1, 3, fH, fW].
     """
 
-    def __init__(self, path: Path, cache: Path | None) -> None:
+    def __init__(self, path: Path, cache: Path | None, trust: bool = False) -> None:
         self.path, self.cache = path, cache
-        self.network, kind = load_network(path)
+        self.network, kind = load_network(path, trust)
         self._digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
         self.description = f"{kind} in {path.name} (SHA-256 {self._digest[:8]})"
 
@@ -227,13 +229,23 @@ class Network(Teacher):
         return self.cache / f"{key}.npy"
 
 
-def load_network(path: Path) -> tuple[nn.Module, str]:
+def load_network(path: Path, trust: bool = False) -> tuple[nn.Module, str]:
     """The network in a file, ready to be asked, and what it is.
 
+    Args:
+        path: of the file.
+        trust: whether it may run code that it brings along; without, only state dictionaries are loaded.
+
     Raises:
-        SceneError: the file holds none that is understood, with what it holds instead.
+        SceneError: the file holds none that is understood, with what it holds instead, or brings code and is not trusted.
     """
+    untrusted = (
+        f"teacher={path} is no state dictionary, and TorchScript and .pt2 files run code that they bring along. If you "
+        "trust the place that it comes from, say so with trust=true; else give a state dictionary."
+    )
     if path.suffix == ".pt2":
+        if not trust:
+            raise SceneError(untrusted)
         try:
             return torch.export.load(path).module(), "exported network"
         except Exception as error:
@@ -246,6 +258,8 @@ def load_network(path: Path) -> tuple[nn.Module, str]:
         stored = None
     if stored is not None:
         return swinir.from_state_dict(stored, path), "SwinIR"
+    if not trust and zipfile.is_zipfile(path):
+        raise SceneError(untrusted)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript is what many released networks come in

@@ -11,7 +11,7 @@ from heatsplat.contracts import SceneData
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.low_resolution import OnTargetGrid, check_fineness, counted_finely
 from heatsplat.losses.photometric import Photometric
-from heatsplat.losses.teacher import Lessons, Teacher
+from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
 class TaughtAndRecorded:
@@ -49,17 +49,17 @@ class TaughtAndRecorded:
         self.record_weight = 0.0 if sr_only else record_weight
         self._compare = Photometric(dssim_weight)
         self._on_record = OnTargetGrid(self._compare, kernel)
-        self._lessons = Lessons(teacher, factor, lambda fine, record: (fine,))
+        self._teacher_images = TeacherImages(teacher, factor, lambda fine, record: (fine,))
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Makes the lessons of a scene (``Lessons.prepare``), unless w = 1 asks for none."""
-        return self._lessons.prepare(scene, modality) if self.record_weight < 1.0 else {}
+        """Asks the teacher for the images of a scene (``TeacherImages.prepare``), unless w = 1 asks for none."""
+        return self._teacher_images.prepare(scene, modality) if self.record_weight < 1.0 else {}
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         check_fineness(inputs, self.factor)
         terms: dict[str, Tensor] = {}
         if self.record_weight < 1.0:
-            (fine,) = (kept.to(inputs.prediction) for kept in self._lessons.of(inputs.view, inputs.target))
+            (fine,) = (kept.to(inputs.prediction) for kept in self._teacher_images.of(inputs.view, inputs.target))
             mask = None if inputs.mask is None else counted_finely(inputs.mask, self.factor)
             taught = self._compare(replace(inputs, target=fine, mask=mask))
             terms |= {f"teacher/{name}": (1.0 - self.record_weight) * value for name, value in taught.items()}

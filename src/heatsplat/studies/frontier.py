@@ -21,19 +21,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
+import pandas as pd
 from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, write_atomically
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE, write_atomically
+from heatsplat.io.tables import markdown_table, number, read_csv, write_csv
 from heatsplat.studies.child_runs import trained
-from heatsplat.studies.recorded import OVERRIDES, config_of, overrides_of
-from heatsplat.studies.sweeps import named_row, settings_of, unshared
+from heatsplat.studies.finished import Runs, read_runs, settings_of, unshared
+from heatsplat.studies.recorded import OVERRIDES
 
 log = logging.getLogger("heatsplat")
 
-COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
+COLUMNS = {  # digits, and whether the spread stands beside the mean
+    "train_seconds": (1, True), "psnr": (2, True), "ssim": (4, False), "mae_c": (3, True),
+    "peak_memory_mb": (0, False), "render_fps": (0, False), "gaussians": (0, False),
+}  # fmt: skip
 # Options of the data that choose what is measured, beside the rule of the split, and those of a rule. What only training
 # sees, such as data.degrade, is not here.
 OF_MEASURED = ("noise_k", "only")
@@ -41,58 +45,18 @@ OF_SPLIT = {"block": ("split_fraction", "split_position"), "list": ("split_file"
 
 
 @dataclass
-class Run:
-    """One finished run.
+class Recipe(Runs):
+    """The runs of one recipe on one scene; ``scene`` is the title of its panel, with what was measured where that differs.
 
     Args:
-        folder: where it lies.
-        scene: its name.
-        measured: what tells its validation and test views from others of the scene: "image size" -> "64x52" and the like.
-        method, row: its method, and its row in a sweep ("" without).
-        settings: other overrides that make its recipe, such as "thermal.frequencies=8".
-        end: scores of the test views and costs, by name.
-        course: score -> (seconds, value) of the validations in order.
-    """
-
-    folder: Path
-    scene: str
-    measured: dict[str, str]
-    method: str
-    row: str
-    settings: list[str]
-    end: dict[str, float]
-    course: dict[str, list[tuple[float, float]]]
-
-
-@dataclass
-class Recipe:
-    """The runs of one recipe on one scene.
-
-    Args:
-        scene: title of the panel: the scene, and what was measured of it where that differs between runs.
-        name: of the recipe.
-        runs: one per seed.
         on_front: score -> whether no other recipe of the panel was as good in less time, at its end or on its way.
     """
 
-    scene: str
-    name: str
-    runs: list[Run] = field(default_factory=list)
     on_front: dict[str, bool] = field(default_factory=dict)
-
-    def mean(self, name: str) -> float | None:
-        """Mean of a score or cost at the end of the runs that have it."""
-        values = [run.end[name] for run in self.runs if name in run.end]
-        return statistics.fmean(values) if values else None
-
-    def spread(self, name: str) -> float:
-        """Its standard deviation, 0 for fewer than two."""
-        values = [run.end[name] for run in self.runs if name in run.end]
-        return statistics.stdev(values) if len(values) > 1 else 0.0
 
     def course(self, name: str) -> list[tuple[float, float]]:
         """Mean (seconds, value) of each validation of a score that all runs have."""
-        courses = zip(*(run.course.get(name, []) for run in self.runs), strict=False)
+        courses = zip(*(course[name] for course in self.table["course"]), strict=False)
         return [(statistics.fmean(s for s, _ in points), statistics.fmean(v for _, v in points)) for points in courses]
 
     def points(self, name: str) -> list[tuple[float, float]]:
@@ -102,7 +66,7 @@ class Recipe:
 
     def seconds_to(self, name: str, level: float) -> float | None:
         """Mean seconds until a validation reaches a level of a score; None where a run never does."""
-        found = [seconds_to(run.course.get(name, []), level, higher=name == "psnr") for run in self.runs]
+        found = [seconds_to(course[name], level, higher=name == "psnr") for course in self.table["course"]]
         return statistics.fmean(found) if found and None not in found else None
 
 
@@ -148,9 +112,8 @@ def run(
     for place, wanted in asked_for(methods or (), scenes, seeds, knobs or {}):
         trained(output_dir / "runs" / place, train, [*overrides, *wanted], output_dir)
         folders = [*folders, output_dir / "runs" / place]
-    # Folders may lie in each other; a run counts once.
-    found = list({one.folder.resolve(): one for folder in folders for one in read_runs(folder)}.values())
-    if not found:
+    found = find_runs(folders)
+    if found.empty:
         raise SceneError(
             f"runs={', '.join(map(str, folders))}: there is no finished run (no {METRICS_FILE} that can be read with a "
             f"{CURVE_FILE} beside). Give folders that src/train.py wrote, such as "
@@ -164,7 +127,7 @@ def run(
     vector = io.StringIO()
     figure.savefig(vector, format="svg", metadata={"Date": None})
     write_atomically(output_dir / "frontier.svg", vector.getvalue())
-    write_atomically(output_dir / "frontier.csv", table_csv(recipes))
+    write_csv(output_dir / "frontier.csv", _records(recipes))
     text = markdown(recipes, levels)
     write_atomically(output_dir / "frontier.md", text)
     write_atomically(output_dir / "frontier.html", page(recipes, levels, vector.getvalue()))
@@ -211,36 +174,30 @@ def checked_levels(name: str, levels: Any) -> list[float]:
 # Reading -------------------------------------------------------------------------------------------------------------
 
 
-def read_runs(folder: Path) -> list[Run]:
-    """The finished runs in a folder at any depth, in the order of their paths; evaluations of a run are not runs.
+def find_runs(folders: Iterable[Path]) -> pd.DataFrame:
+    """The finished runs in folders at any depth (``read_runs``), in the order of their paths; each once.
 
-    One whose files cannot be read is left out, and a warning names it and says why.
+    Further columns: measured, what tells its validation and test views from others of the scene ("image size" -> "64x52" and
+    the like), and course, score -> (seconds, value) of the validations in order. One whose files cannot be read is left out,
+    and a warning names it and says why. Evaluations of a run are not runs.
     """
-    found = []
-    for file in sorted(folder.rglob(METRICS_FILE)):
-        place = file.parent
-        if not (place / CURVE_FILE).exists() or not (place / OVERRIDES).exists():
-            continue
+    places = [file.parent for folder in folders for file in sorted(folder.rglob(METRICS_FILE))]
+    places = [place for place in places if (place / CURVE_FILE).exists() and (place / OVERRIDES).exists()]
+    found = read_runs({place.resolve(): place for place in places}.values())  # folders may lie in each other
+    if found.empty:
+        return found
+    courses = []
+    for one in found.itertuples():
         try:
-            found.append(_read_run(place))
-        except (ValueError, OSError, yaml.YAMLError, csv.Error) as error:
-            log.warning("%s is left out: %s", place, error)
-    return found
-
-
-def _read_run(place: Path) -> Run:
-    results = RunResults.read(place / METRICS_FILE)
-    overrides = overrides_of(place)
-    return Run(
-        place,
-        str(results.run.get("scene")),
-        _measured(results.data, config_of(place).get("data") or {}),
-        str(results.run.get("method")),
-        named_row(overrides),
-        settings_of(overrides),
-        {name: value for name, value in (results.test | results.cost).items() if value is not None},
-        _courses(place / CURVE_FILE),
-    )
+            if pd.notna(one.failed):
+                raise ValueError(one.failed)
+            courses.append(_courses(one.folder / CURVE_FILE))
+        except (ValueError, OSError, csv.Error) as error:
+            log.warning("%s is left out: %s", one.folder, error)
+            courses.append(None)
+    found["course"] = courses
+    found = found[found["course"].notna()]
+    return found.assign(measured=[_measured(one.results.data, one.data) for one in found.itertuples()])
 
 
 def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
@@ -268,40 +225,37 @@ def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, 
 
 def _courses(path: Path) -> dict[str, list[tuple[float, float]]]:
     courses: dict[str, list[tuple[float, float]]] = {"psnr": [], "mae_c": []}
-    with open(path, newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            for name, course in courses.items():
-                if row.get(name) and row.get("train_seconds"):
-                    course.append((float(row["train_seconds"]), float(row[name])))
+    for row in read_csv(path):
+        for name, course in courses.items():
+            if row.get(name) is not None and row.get("train_seconds") is not None:
+                course.append((float(row["train_seconds"]), float(row[name])))
     return courses
 
 
-def group(runs: Iterable[Run]) -> list[Recipe]:
+def group(runs: pd.DataFrame) -> list[Recipe]:
     """Runs by panel and recipe, with what lies on the front of its panel.
 
     A panel is a scene whose runs measured alike views. Names leave out what all recipes share.
     """
-    runs = list(runs)
-    recipes: dict[tuple[str, str], Recipe] = {}
     titles = _titles(runs)
-    for one, title, name in zip(runs, titles, _names(runs, titles), strict=True):
-        recipes.setdefault((title, name), Recipe(title, name)).runs.append(one)
-    for scene in {recipe.scene for recipe in recipes.values()}:
-        of_scene = [recipe for recipe in recipes.values() if recipe.scene == scene]
+    panels = runs.assign(title=titles, name=_names(runs, titles)).groupby(["title", "name"], sort=False)
+    recipes = [Recipe(name, title, own) for (title, name), own in panels]
+    for scene in {recipe.scene for recipe in recipes}:
+        of_scene = [recipe for recipe in recipes if recipe.scene == scene]
         for name, sign in (("psnr", 1.0), ("mae_c", -1.0)):
             points = {id(recipe): [(s, sign * value) for s, value in recipe.points(name)] for recipe in of_scene}
             for recipe in of_scene:
                 others = [point for other in of_scene if other is not recipe for point in points[id(other)]]
                 if recipe.mean("train_seconds") is not None and recipe.mean(name) is not None:
                     recipe.on_front[name] = not dominated(*points[id(recipe)][-1], others)
-    return sorted(recipes.values(), key=lambda recipe: (recipe.scene, recipe.mean("train_seconds") or 0.0))
+    return sorted(recipes, key=lambda recipe: (recipe.scene, recipe.mean("train_seconds") or 0.0))
 
 
-def _titles(runs: Sequence[Run]) -> list[str]:
+def _titles(runs: pd.DataFrame) -> list[str]:
     """For each run the title of its panel: the scene, and of what was measured as much as tells panels apart."""
-    titles = [one.scene for one in runs]
-    for part in dict.fromkeys(name for one in runs for name in one.measured):
-        values = [one.measured.get(part, "unknown") for one in runs]
+    titles = runs["scene"].tolist()
+    for part in dict.fromkeys(name for measured in runs["measured"] for name in measured):
+        values = [measured.get(part, "unknown") for measured in runs["measured"]]
         kinds: dict[str, set[str]] = {}
         for title, value in zip(titles, values, strict=True):
             kinds.setdefault(title, set()).add(value)
@@ -312,23 +266,23 @@ def _titles(runs: Sequence[Run]) -> list[str]:
     return titles
 
 
-def _names(runs: Sequence[Run], titles: Sequence[str]) -> list[str]:
+def _names(runs: pd.DataFrame, titles: Sequence[str]) -> list[str]:
     """For each run the name of its recipe: method, row, and settings that tell it from others.
 
     A named row has those that not all runs of the row share; else they are those that not all runs share, of the data
     those that not all runs of the panel share.
     """
-    settings = [one.settings for one in runs]
-    several = len({(one.method, one.row, *one.settings) for one in runs}) > 1
+    methods, rows, settings = runs["method"], runs["row"], [settings_of(overrides) for overrides in runs["overrides"]]
+    several = len({(*one, *own) for *one, own in zip(methods, rows, settings, strict=True)}) > 1
     in_all = unshared([""] * len(runs), settings) if several else settings
-    in_row = unshared([f"{one.method}, {one.row}" for one in runs], settings)
+    in_row = unshared([f"{method}, {row}" for method, row in zip(methods, rows, strict=True)], settings)
     in_panel = unshared(titles, settings) if several else settings
     names = []
-    for one, of_all, of_row, of_panel in zip(runs, in_all, in_row, in_panel, strict=True):
-        told = of_row if one.row else of_all
+    for method, row, of_all, of_row, of_panel in zip(methods, rows, in_all, in_row, in_panel, strict=True):
+        told = of_row if row else of_all
         told = " ".join(text for text in told if text in of_panel or not text.lstrip("+~").startswith("data."))
-        start = f"{one.method}, {one.row}" if one.row else one.method
-        names.append(start + (f"{', ' if one.row else ' '}{told}" if told else ""))
+        start = f"{method}, {row}" if row else method
+        names.append(start + (f"{', ' if row else ' '}{told}" if told else ""))
     return names
 
 
@@ -362,7 +316,8 @@ def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> l
     """The levels that some recipe reaches and not all reach at their first validation."""
     reached = [[recipe.seconds_to(name, level) for recipe in recipes] for level in levels]
     starts = [
-        min((run.course[name][0][0] for run in recipe.runs if run.course.get(name)), default=0.0) for recipe in recipes
+        min((course[name][0][0] for course in recipe.table["course"] if course[name]), default=0.0)
+        for recipe in recipes
     ]
     return [
         level
@@ -370,10 +325,6 @@ def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> l
         if any(t is not None for t in times)
         and not all(t is not None and t <= s for t, s in zip(times, starts, strict=True))
     ]
-
-
-def _cell(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:,.{digits}f}"
 
 
 def tables(
@@ -402,13 +353,12 @@ def tables(
         ]
         rows = []
         for recipe in own:
-            digits = dict(zip(COLUMNS, (1, 2, 4, 3, 0, 0, 0), strict=True))
-            cells = [_cell(recipe.mean(name), digits[name]) for name in COLUMNS]
-            for i, name in ((0, "train_seconds"), (1, "psnr"), (3, "mae_c")):
-                if recipe.spread(name):
-                    cells[i] += f" ± {recipe.spread(name):,.{digits[name]}f}"
+            cells = [
+                number(recipe.mean(name), digits, (spread and recipe.spread(name)) or None)
+                for name, (digits, spread) in COLUMNS.items()
+            ]
             marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
-            rows.append([recipe.name, str(len(recipe.runs)), *cells, ", ".join(marks)])
+            rows.append([recipe.name, str(recipe.count), *cells, ", ".join(marks)])
         found.append((f"{scene}: results beside their costs{_views_of(own)}", head, rows))
         psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
         if psnr or mae:
@@ -416,8 +366,8 @@ def tables(
             rows = [
                 [
                     recipe.name,
-                    *(_cell(recipe.seconds_to("psnr", level), 1) for level in psnr),
-                    *(_cell(recipe.seconds_to("mae_c", level), 1) for level in mae),
+                    *(number(recipe.seconds_to("psnr", level), 1) for level in psnr),
+                    *(number(recipe.seconds_to("mae_c", level), 1) for level in mae),
                 ]
                 for recipe in own
             ]
@@ -427,35 +377,37 @@ def tables(
 
 def _views_of(recipes: Sequence[Recipe]) -> str:
     """How many views were measured on the way and at the end, in brackets; empty where the runs of a panel do not tell."""
-    told = [(one.measured.get("validation views"), one.measured.get("test views")) for r in recipes for one in r.runs]
-    if len(set(told)) != 1 or None in told[0]:
-        return ""
-    return f" ({told[0][0]} validation views on the way, {told[0][1]} test views at the end)"
+    measured = [one for recipe in recipes for one in recipe.table["measured"]]
+    counts = {(one.get("validation views"), one.get("test views")) for one in measured}
+    val, test = counts.pop() if len(counts) == 1 else (None, None)
+    return "" if None in (val, test) else f" ({val} validation views on the way, {test} test views at the end)"
 
 
 def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -> str:
     """The tables for people."""
     lines = ["# Accuracy against training time", ""]
     for title, head, rows in tables(recipes, levels):
-        lines += [f"## {title}", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-        lines += ["| " + " | ".join(row) + " |" for row in rows] + [""]
+        lines += [f"## {title}", "", *markdown_table(head, rows), ""]
     return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])
 
 
-def table_csv(recipes: Sequence[Recipe]) -> str:
+def _records(recipes: Sequence[Recipe]) -> list[dict[str, Any]]:
     """Every point of every course, all scores and costs of the ends, and which ends are on the front, for programs."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scene", "recipe", "folder", "views", "seconds", "score", "value", "on_front"])
-    for recipe, one in [(mean, one) for mean in recipes for one in mean.runs]:
-        place = [recipe.scene, recipe.name, one.folder.name]
-        for name, course in one.course.items():
-            writer.writerows([*place, "validation", s, name, v, ""] for s, v in course)
-        seconds = one.end.get("train_seconds")
-        for name in COLUMNS[1:]:
-            if name in one.end and seconds is not None:
-                writer.writerow([*place, "test", seconds, name, one.end[name], recipe.on_front.get(name, "")])
-    return text.getvalue()
+    records = []
+    for recipe, one in ((shown, one) for shown in recipes for _, one in shown.table.iterrows()):
+        place = {"scene": recipe.scene, "recipe": recipe.name, "folder": one["folder"].name}
+        for score, course in one["course"].items():
+            records += [
+                {**place, "views": "validation", "seconds": s, "score": score, "value": v, "on_front": ""}
+                for s, v in course
+            ]
+        seconds = one.get("train_seconds")
+        for score in COLUMNS:
+            value = one.get(score)
+            if score != "train_seconds" and pd.notna(seconds) and pd.notna(value):
+                end = {"views": "test", "seconds": seconds, "score": score, "value": value}
+                records.append({**place, **end, "on_front": recipe.on_front.get(score, "")})
+    return records
 
 
 def picture(recipes: Sequence[Recipe]) -> Figure:
@@ -473,14 +425,14 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
             for recipe in own:
                 j = places[recipe.name]
                 color, mark = f"C{j % 10}", "os^Dv<>P"[j // 10 % 8]
-                for one in recipe.runs:
-                    if one.course.get(name):
-                        axes.plot(*zip(*one.course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
+                for course in recipe.table["course"]:
+                    if course[name]:
+                        axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
                 x, y = recipe.mean("train_seconds"), recipe.mean(name)
                 if x is not None and y is not None:
                     edge = "black" if recipe.on_front.get(name) else color
                     axes.errorbar(
-                        x, y, recipe.spread(name), color=color, marker=mark, markeredgecolor=edge, capsize=2,
+                        x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
                         linestyle="", label=recipe.name,
                     )  # fmt: skip
             sign = 1.0 if name == "psnr" else -1.0

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import FAILED, METRICS_FILE, RunResults, write_atomically
-from heatsplat.studies.recorded import OVERRIDES, config_of, overrides_of
+from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.studies.finished import Runs, read_runs, row_names
+from heatsplat.studies.recorded import OVERRIDES
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them, with heading and digits.
@@ -34,50 +31,8 @@ COSTS = {
     "gaussians": ("Gaussians", 0),
     "render_fps": ("frames/s", 0),
 }
-# Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
-# are among them; the method is named by itself.
-SEEDS = {"seed", "data.seed", "data.scene_seed"}
-PLACES = {"data", "data.root", "data.scene", "data.scenes"}
-NAMES = {"method", "row", "ablation", "experiment"}
-HOW_IT_RUNS = {"threads", "ckpt", "test"}
-NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
-NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra", "table"}  # these groups with all below
 
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
-
-
-@dataclass
-class Row:
-    """The jobs of one row on one scene.
-
-    Args:
-        name: of the row.
-        scene: on which they ran.
-        values: score or cost -> its values, one per job that has it.
-        jobs: how many have results.
-        failed: first lines of why the others have none.
-        other: overrides that not all jobs of a row of this name have, such as "max_steps=3000"; empty where all agree.
-    """
-
-    name: str
-    scene: str
-    values: dict[str, list[float]] = field(default_factory=dict)
-    jobs: int = 0
-    failed: list[str] = field(default_factory=list)
-    other: str = ""
-
-    @property
-    def label(self) -> str:
-        """The name, with what tells the row from others of its name."""
-        return f"{self.name}, {self.other}" if self.other else self.name
-
-    def mean(self, name: str) -> float | None:
-        """Mean over the jobs, None where none has the value."""
-        return statistics.fmean(self.values[name]) if self.values.get(name) else None
-
-    def spread(self, name: str) -> float | None:
-        """Standard deviation over the jobs (n - 1), None for fewer than two."""
-        return statistics.stdev(self.values[name]) if len(self.values.get(name, ())) > 1 else None
 
 
 def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None = None) -> list[Path]:
@@ -94,7 +49,7 @@ def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None =
     place = {name: i for i, name in enumerate(order)}
     rows.sort(key=lambda row: (row.scene, place.get(row.name, len(place))))
     write_atomically(folder / TABLE_FILE, markdown(rows, paper or {}))
-    write_atomically(folder / CSV_FILE, table_csv(rows, paper or {}))
+    write_csv(folder / CSV_FILE, _records(rows, paper or {}))
     written = [folder / TABLE_FILE, folder / CSV_FILE]
     figure = picture(rows)
     if figure is not None:
@@ -103,90 +58,14 @@ def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None =
     return written
 
 
-def collect(folder: Path) -> list[Row]:
+def collect(folder: Path) -> list[Runs]:
     """The rows of a sweep's folder, in the order of its jobs. Jobs of one name and other settings are rows of their own."""
-    rows: dict[tuple[str, str, str], Row] = {}
-    jobs = sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number)
-    names = row_names([overrides_of(job) for job in jobs])
-    for job, (name, other) in zip(jobs, names, strict=True):
-        results, reason = _results(job)
-        scene = str(results.run["scene"]) if results and "scene" in results.run else _scene(config_of(job))
-        row = rows.setdefault((scene, name, other), Row(name, scene, other=other))
-        if results is None:
-            row.failed.append(reason)
-            continue
-        row.jobs += 1
-        for key, value in (results.test | results.cost).items():
-            if value is not None:
-                row.values.setdefault(key, []).append(value)
-    return list(rows.values())
-
-
-def row_names(jobs: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
-    """For each job the name of its row, and the settings that not all jobs of a row of this name have ("" for none).
-
-    A job without a named row has its settings for a name (``row_name``).
-
-    Args:
-        jobs: overrides of each: key -> value.
-    """
-    names = [named_row(overrides) for overrides in jobs]
-    settings = [[*_method(overrides), *settings_of(overrides)] for overrides in jobs]
-    others = [" ".join(words) for words in unshared(names, settings)]
-    return [
-        (name, other) if name else (row_name(overrides), "")
-        for overrides, name, other in zip(jobs, names, others, strict=True)
-    ]
-
-
-def unshared(names: Sequence[str], settings: Sequence[Sequence[str]]) -> list[list[str]]:
-    """For each job those of its settings that not all jobs of its name have."""
-    shared: dict[str, set[str]] = {}
-    for name, own in zip(names, settings, strict=True):
-        shared[name] = shared.get(name, set(own)) & set(own)
-    return [[text for text in own if text not in shared[name]] for name, own in zip(names, settings, strict=True)]
-
-
-def named_row(overrides: Mapping[str, str]) -> str:
-    """Name of the row that a job was given (``row=``), empty for none."""
-    name = overrides.get("row", "").strip("'\"")
-    return "" if name == "null" else name
-
-
-def row_name(overrides: Mapping[str, str]) -> str:
-    """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
-    return " ".join([*_method(overrides), *settings_of(overrides)]) or "run"
-
-
-def _method(overrides: Mapping[str, str]) -> list[str]:
-    return [overrides["method"]] if "method" in overrides else []
-
-
-def settings_of(overrides: Mapping[str, str]) -> list[str]:
-    """Overrides that make a recipe besides its method: "key=value" in alphabetical order."""
-
-    def makes_a_recipe(key: str) -> bool:
-        key = key.lstrip("+~")
-        return key not in NOT_A_ROW and key.partition(".")[0] not in NOT_WHAT_WAS_LEARNED
-
-    return sorted(f"{key}={value}" for key, value in overrides.items() if makes_a_recipe(key))
-
-
-def _results(job: Path) -> tuple[RunResults | None, str]:
-    """The results of a job, or None and why there are none."""
-    if not (job / METRICS_FILE).exists():
-        return None, reason_of(job)
-    try:
-        return RunResults.read(job / METRICS_FILE), ""
-    except (ValueError, OSError) as error:
-        return None, f"{error}. Delete the folder to run it again."
-
-
-def _scene(config: Mapping[str, Any]) -> str:
-    """The scene that a job was told; a method's own synthetic preset is a reference to another key."""
-    data = config.get("data") or {}
-    scene = str(data.get("scene") or "+".join(data.get("scenes") or ()) or "?")
-    return str(config.get(scene[2:-1], scene)) if scene.startswith("${") else scene
+    table = read_runs(sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number))
+    if table.empty:
+        return []
+    table[["name", "other"]] = row_names(table["overrides"])
+    groups = table.groupby(["scene", "name", "other"], sort=False)
+    return [Runs(name, scene, own, other) for (scene, name, other), own in groups]
 
 
 def _number(job: Path) -> tuple[int, str]:
@@ -195,39 +74,32 @@ def _number(job: Path) -> tuple[int, str]:
     return (numbers[-1] if numbers else 0, job.name)
 
 
-def reason_of(job: Path) -> str:
-    """Why a job has no result: the last line of its FAILED file that names an error, since Hydra adds lines of its own."""
-    if not (job / FAILED).exists():
-        return "not finished"
-    lines = [line.strip() for line in (job / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
-    named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
-    return (named or lines or ["failed"])[-1]
-
-
-def _columns(rows: Iterable[Row]) -> dict[str, tuple[str, int]]:
-    return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in row.values for row in rows)}
+def _columns(rows: Iterable[Runs]) -> dict[str, tuple[str, int]]:
+    return {name: shown for name, shown in (SCORES | COSTS).items() if any(row.values(name) for row in rows)}
 
 
 def _printed(paper: Printed) -> dict[str, tuple[str, int]]:
     return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in texts for texts in paper.values())}
 
 
-def markdown(rows: Sequence[Row], paper: Printed) -> str:
+def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     """The table for people: mean ± standard deviation over the seeds."""
     columns = _columns(rows)
     printed = _printed(paper)
     several = len({row.scene for row in rows}) > 1
     head = [*(["scene"] if several else []), "row", "runs", *(title for title, _ in columns.values())]
     head += [f"paper: {title}" for title, _ in printed.values()]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for row in rows:
-        cells = [*([row.scene] if several else []), row.label, str(row.jobs)]
-        for name, (_, digits) in columns.items():
-            mean, spread = row.mean(name), row.spread(name)
-            text = "–" if mean is None else f"{mean:,.{digits}f}"
-            cells.append(text if spread is None else f"{text} ± {spread:,.{digits}f}")
-        cells += [paper.get(row.name, {}).get(name, "–") for name in printed]
-        lines.append("| " + " | ".join(cells) + " |")
+    cells = [
+        [
+            *([row.scene] if several else []),
+            row.label,
+            row.count,
+            *(number(row.mean(name), digits, row.spread(name)) for name, (_, digits) in columns.items()),
+            *(paper.get(row.name, {}).get(name, NONE) for name in printed),
+        ]
+        for row in rows
+    ]
+    lines = markdown_table(head, cells)
     failed = [f"- {row.label} on {row.scene}: {reason}" for row in rows for reason in row.failed]
     if failed:
         lines += ["", f"Jobs without a result: {len(failed)}", "", *failed]
@@ -235,26 +107,19 @@ def markdown(rows: Sequence[Row], paper: Printed) -> str:
     return "\n".join([f"# Sweep on {scenes}", "", "Mean ± standard deviation over seeds.", "", *lines, ""])
 
 
-def table_csv(rows: Sequence[Row], paper: Printed) -> str:
+def _records(rows: Sequence[Runs], paper: Printed) -> list[dict[str, Any]]:
     """The table for programs: full precision, mean and standard deviation in columns of their own."""
-    columns = _columns(rows)
-    spread, printed = [f"{name}_std" for name in columns], _printed(paper)
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(
-        text,
-        ["scene", "row", "runs", "failed", *columns, *spread, *map("paper_{}".format, printed)],
-        lineterminator="\n",
-    )
-    writer.writeheader()
-    for row in rows:
-        numbers = {name: row.mean(name) for name in columns} | {f"{name}_std": row.spread(name) for name in columns}
-        counts = {"scene": row.scene, "row": row.label, "runs": row.jobs, "failed": len(row.failed)}
-        texts = {f"paper_{name}": paper.get(row.name, {}).get(name) for name in printed}
-        writer.writerow(counts | numbers | texts)
-    return text.getvalue()
+    columns, printed = _columns(rows), _printed(paper)
+    return [
+        {"scene": row.scene, "row": row.label, "runs": row.count, "failed": len(row.failed)}
+        | {name: row.mean(name) for name in columns}
+        | {f"{name}_std": row.spread(name) for name in columns}
+        | {f"paper_{name}": paper.get(row.name, {}).get(name) for name in printed}
+        for row in rows
+    ]
 
 
-def picture(rows: Sequence[Row]) -> Figure | None:
+def picture(rows: Sequence[Runs]) -> Figure | None:
     """PSNR and MAE against seconds of training, a mark per row with its spread; None without such values."""
     shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
     if not shown or not any(row.mean("train_seconds") for row in rows):

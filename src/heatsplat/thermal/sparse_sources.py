@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.physics.noise import MIN_NOISE, noise_of, quantum_of
 
 log = logging.getLogger(__name__)
@@ -53,8 +53,7 @@ class SparseSources:
     def prepare(self, scene: SceneData, modality: str) -> None:
         """Takes moments of the record and, unless it is given, the noise from the training views."""
         times = sorted(set(scene.train.times_s))
-        places = torch.linspace(0, len(times) - 1, min(MOMENTS, len(times))).round().long().tolist()
-        self.times_s = [times[i] for i in places]
+        self.times_s = [times[i] for i in evenly_spread(len(times), MOMENTS)]
         if self.noise is None:
             self.noise = _noise_of(scene, modality)
             if self.noise <= MIN_NOISE:

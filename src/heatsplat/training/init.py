@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.io.ply import read_splats
 from heatsplat.splats import GEOMETRY, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
@@ -183,18 +183,14 @@ def image_values_at(scene: SceneData, points: Tensor, modality: str, channels: i
 
     Points that no view sees get the median of the others. No test for occlusion: the median over views stands it.
     """
-    positions = np.unique(
-        np.linspace(0, len(scene.train) - 1, min(SAMPLED_VIEWS, len(scene.train))).round().astype(int)
-    )
+    positions = evenly_spread(len(scene.train), SAMPLED_VIEWS)
     samples = torch.full((len(positions), len(points), channels), float("nan"))
     for row, position in enumerate(positions):
-        view = scene.train[int(position)]
+        view = scene.train[position]
         image, camera = view.image(modality), view.camera
-        local = points.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        pixels = local @ camera.K.T
-        column = (pixels[:, 0] / pixels[:, 2]).floor()
-        line = (pixels[:, 1] / pixels[:, 2]).floor()
-        seen = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
+        pixels, depths = camera.project(points)
+        column, line = pixels.floor().unbind(1)
+        seen = (depths > 0) & (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
         ids = seen.nonzero().squeeze(1)
         at_line, at_column = line[ids].long(), column[ids].long()
         if view.mask is not None:

@@ -7,11 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.joint.evidence import selected_kind
 from heatsplat.effects.look import Look
-from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between, spread
+from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between
 from heatsplat.geometry.projection import to_camera, to_pixels
 
 MAX_POINTS = 6000
@@ -58,8 +58,8 @@ def missing(scene: SceneData) -> str | None:
 def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
     """For each point that lies behind others in some frames, 1 where the nearer one keeps its value, -1 where the farther
     one does, 0 where neither does clearly: by the thermal and by the visible images."""
-    points = scene.points.double()[torch.tensor(spread(len(scene.points), MAX_POINTS))]
-    views = [scene.train[i] for i in spread(len(scene.train), MAX_FRAMES)]
+    points = scene.points.double()[torch.tensor(evenly_spread(len(scene.points), MAX_POINTS))]
+    views = [scene.train[i] for i in evenly_spread(len(scene.train), MAX_FRAMES)]
     views = [view for view in views if view.thermal is not None]
     if any(view.rgb is None or view.rgb.shape[:2] != view.thermal.shape[:2] for view in views):
         return None

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import statistics
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from heatsplat.io.results import METRICS_FILE, RunResults, write_atomically
+from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.studies.finished import Runs
 from heatsplat.studies.published.figures import METRICS, Figure
 from heatsplat.studies.published.plans import Plan, row_name
-from heatsplat.studies.sweeps import COSTS, Row, collect
+from heatsplat.studies.sweeps import COSTS, collect
 
 COMPARISON_FILE, COMPARISON_CSV = "comparison.md", "comparison.csv"
 BESIDE = ("train_seconds", "peak_memory_mb", "gaussians")  # costs that stand beside every row
@@ -68,13 +68,14 @@ def write_comparison(folder: Path, plan: Plan) -> list[Path]:
     found = collect(folder)
     lines = compare_all(plan, found)
     failed = [f"{row.label} on {row.scene}: {reason}" for row in found for reason in row.failed]
-    write_atomically(folder / COMPARISON_FILE, markdown(plan, lines, _reasons(folder, plan), failed))
-    write_atomically(folder / COMPARISON_CSV, comparison_csv(plan, lines))
+    results = [one for row in found for one in row.table["results"].dropna()]
+    write_atomically(folder / COMPARISON_FILE, markdown(plan, lines, _reasons(results, plan), failed))
+    write_csv(folder / COMPARISON_CSV, _records(lines))
     return [folder / COMPARISON_FILE, folder / COMPARISON_CSV]
 
 
-def compare_all(plan: Plan, found: Sequence[Row]) -> list[Line]:
-    """The lines of the comparison; a row that ran with several settings (``Row.other``) has a line for each of them."""
+def compare_all(plan: Plan, found: Sequence[Runs]) -> list[Line]:
+    """The lines of the comparison; a row that ran with several settings (``Runs.other``) has a line for each of them."""
     key_of = {run.folder: run.scene for run in plan.runs}
     known = [row for row in found if row.scene in key_of]
     lines = [
@@ -89,7 +90,7 @@ def compare_all(plan: Plan, found: Sequence[Row]) -> list[Line]:
     return [line for same in shown for line in same]
 
 
-def compare(plan: Plan, results: Mapping[tuple[str, str], Row]) -> list[Line]:
+def compare(plan: Plan, results: Mapping[tuple[str, str], Runs]) -> list[Line]:
     """The lines of the comparison, scene by scene in the order of the table.
 
     Args:
@@ -132,15 +133,15 @@ def compare(plan: Plan, results: Mapping[tuple[str, str], Row]) -> list[Line]:
     return lines
 
 
-def _of(results: Mapping[tuple[str, str], Row], method: str, setting: str, scene: str) -> Row | None:
+def _of(results: Mapping[tuple[str, str], Runs], method: str, setting: str, scene: str) -> Runs | None:
     row = results.get((row_name(method, setting), scene))
-    return row if row and row.jobs else None
+    return row if row and row.count else None
 
 
-def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[str, str], Row]) -> None:
+def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[str, str], Runs]) -> None:
     """Puts ours into a line: the mean over scenes of the means over seeds."""
     runs = [row for scene in have if (row := _of(results, line.method, line.setting, scene))]
-    line.have, line.seeds = have, min((row.jobs for row in runs), default=0)
+    line.have, line.seeds = have, min((row.count for row in runs), default=0)
     for metric in dict.fromkeys(figure.metric for figure in plan.figures):
         ours = plan.ours(metric)
         values = [row.mean(ours) for row in runs] if ours else []
@@ -154,12 +155,9 @@ def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[
             line.cost[name] = statistics.fmean(values)
 
 
-def _reasons(folder: Path, plan: Plan) -> list[str]:
+def _reasons(runs: Sequence[RunResults], plan: Plan) -> list[str]:
     """Why printed metrics have no value of ours, a line each."""
-    runs, lines = [], []
-    for path in sorted(folder.glob(f"*/{METRICS_FILE}")):
-        with suppress(ValueError):  # told among the jobs without a result
-            runs.append(RunResults.read(path))
+    lines = []
     for metric in dict.fromkeys(figure.metric for figure in plan.figures):
         ours, known = plan.ours(metric), METRICS[metric]
         if ours is None:
@@ -179,20 +177,19 @@ def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), fai
     several = any(setting for _, setting in plan.rows)
     head = ["scene", "method", *(["setting"] if several else []), *(METRICS[metric].title for metric in metrics)]
     head += [f"ours: {COSTS[name][0]}" for name in costs]
-    table = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows = []
     for line in lines:
-        method = ", ".join(filter(None, [line.method, line.other])) or "–"
-        cells = [line.label, method, *([line.setting or "–"] if several else [])]
+        method = ", ".join(filter(None, [line.method, line.other])) or NONE
+        cells = [line.label, method, *([line.setting or NONE] if several else [])]
         cells += [_cell(line, metric) for metric in metrics]
-        cells += [f"{line.cost[name]:,.{COSTS[name][1]}f}" if name in line.cost else "–" for name in costs]
-        table.append("| " + " | ".join(cells) + " |")
+        rows.append(cells + [number(line.cost.get(name), COSTS[name][1]) for name in costs])
     text = [
         f"# {plan.title}: ours beside the paper's",
         "",
         "A cell reads: ours / printed (ours less printed). – is none. Ours is a mean over seeds (± standard deviation where "
         "there are several), then over scenes. Seconds, memory and frames/s are of other machines than the paper's.",
         "",
-        *table,
+        *markdown_table(head, rows),
     ]
     wanted = {metric: plan.metrics[metric] for metric in metrics if metric in plan.metrics}
     notes = [f"{METRICS[metric].title} of ours is `{name}` (docs/conventions.md)." for metric, name in wanted.items()]
@@ -214,39 +211,34 @@ def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), fai
 def _cell(line: Line, metric: str) -> str:
     digits, figure = METRICS[metric].digits, line.printed.get(metric)
     ours, theirs, difference = line.ours.get(metric), line.theirs.get(metric), line.difference(metric)
-    paper = (figure.printed if figure else "" if theirs is None else f"{theirs:.{digits}f}") or "–"
+    paper = (figure.printed if figure else "" if theirs is None else f"{theirs:.{digits}f}") or NONE
     if ours is None:
-        return paper if paper == "–" else f"– / {paper}"
-    spread = f" ± {line.spread[metric]:.{digits}f}" if metric in line.spread else ""
-    return f"{ours:,.{digits}f}{spread} / {paper}" + ("" if difference is None else f" ({difference:+,.{digits}f})")
+        return paper if paper == NONE else f"{NONE} / {paper}"
+    text = f"{number(ours, digits, line.spread.get(metric))} / {paper}"
+    return text if difference is None else f"{text} ({difference:+,.{digits}f})"
 
 
-def comparison_csv(plan: Plan, lines: Sequence[Line]) -> str:
+def _records(lines: Sequence[Line]) -> list[dict[str, Any]]:
     """The comparison for programs: a row per scene, method, setting and metric, in full precision."""
-    columns = [
-        "scene",
-        "method",
-        "setting",
-        "overrides",
-        "metric",
-        "ours",
-        "ours_std",
-        "runs",
-        "scenes",
-        "printed",
-        "difference",
-    ]
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, [*columns, *BESIDE, "note"], lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for line in lines:
         for metric in dict.fromkeys([*line.printed, *line.ours]):
             figure = line.printed.get(metric)
-            told = figure.printed if figure else line.theirs.get(metric)
-            numbers = {"ours": line.ours.get(metric), "ours_std": line.spread.get(metric), "runs": line.seeds}
-            numbers |= {"scenes": len(line.have), "printed": told, "difference": line.difference(metric)}
-            place = {"scene": line.scene, "method": line.method, "setting": line.setting, "metric": metric}
-            writer.writerow(
-                place | {"overrides": line.other} | numbers | line.cost | {"note": figure.note if figure else ""}
+            rows.append(
+                {
+                    "scene": line.scene,
+                    "method": line.method,
+                    "setting": line.setting,
+                    "overrides": line.other,
+                    "metric": metric,
+                    "ours": line.ours.get(metric),
+                    "ours_std": line.spread.get(metric),
+                    "runs": line.seeds,
+                    "scenes": len(line.have),
+                    "printed": figure.printed if figure else line.theirs.get(metric),
+                    "difference": line.difference(metric),
+                    **{name: line.cost.get(name) for name in BESIDE},
+                    "note": figure.note if figure else "",
+                }
             )
-    return text.getvalue()
+    return rows

@@ -1,0 +1,216 @@
+"""What choosing effects is worth: auto against none, all and the truth, and each chosen effect left out in turn."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from heatsplat.effects import assembly
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.tables import markdown_table, number
+from heatsplat.studies.child_runs import trained
+
+TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
+NOTE = (
+    "Means over seeds on held-out images as the camera records them; clean is the image before the camera, against the truth "
+    "without its flaws, which matters where frames have numbers of their own that nobody knows of held-out ones. "
+    "Milliseconds are those of whole training steps of the run itself, one run after another: compare them on a machine that "
+    "does nothing else. Parameters are those at the end, after Gaussians were added and removed."
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of the study: a selection of effects on a preset; ``left_out`` names an effect that auto must do without."""
+
+    preset: str
+    selection: str
+    seed: int
+    left_out: str | None = None
+
+    @property
+    def folder(self) -> str:
+        return "_".join([self.preset, self.selection, *([f"without_{self.left_out}"] if self.left_out else [])])
+
+    def overrides(self, truth: Sequence[str]) -> list[str]:
+        """What the command line of the run says of it."""
+        if self.selection == "oracle":
+            effects = ["effects=none", *(f"effects.{name}=on" for name in truth)]
+        else:
+            effects = [f"effects={self.selection}"]
+        if self.left_out:
+            effects.append(f"effects.{self.left_out}=off")
+        scene = ["data=synthetic", f"data.scene={self.preset}", f"data.scene_seed={self.seed}", f"seed={self.seed}"]
+        return ["method=auto", *scene, *effects]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Means over the seeds of a job: PSNR in dB, of the recorded and of the clean image, MAE in °C, numbers that are learned,
+    milliseconds per step."""
+
+    job: Job
+    effects: tuple[str, ...]
+    psnr: float
+    clean_psnr: float | None
+    mae_c: float | None
+    parameters: float
+    ms_per_step: float
+
+
+def run(
+    output_dir: Path | str,
+    train: str | None,
+    presets: Mapping[str, Sequence[str]],
+    selections: Sequence[str],
+    leave_one_out: bool,
+    seeds: Sequence[int],
+    overrides: Sequence[str],
+    threads: int | None = None,
+) -> None:
+    """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
+
+    Without any effect there is one recipe, whoever chose it: it is trained once.
+
+    Args:
+        output_dir: of the study; runs that have results there are not run again.
+        train: path of train.py; None: the installed heatsplat-train.
+        presets: synthetic scene -> the effects that are truly there.
+        selections: some of "auto", "none", "all", "oracle".
+        leave_one_out: whether chosen effects are left out in turn.
+        seeds: of every row.
+        overrides: of every run.
+        threads: CPU threads of every run; None takes all cores.
+
+    Raises:
+        SceneError: a run failed, or its folder holds a run of other settings.
+    """
+    folder = Path(output_dir).resolve()
+    common = [*([f"threads={threads}"] if threads else []), *overrides]
+    plain: dict[tuple[str, int], RunResults] = {}  # without any effect, by preset and seed
+
+    def of(job: Job, bare: bool) -> RunResults:
+        """The results of a run; ``bare`` where it is known before that no effect will be on."""
+        if bare and (job.preset, job.seed) in plain:
+            return plain[job.preset, job.seed]
+        place = folder / "runs" / job.folder / str(job.seed)
+        results = trained(place, train, [*common, *job.overrides(presets[job.preset])], folder)
+        if not _on(results):
+            plain[job.preset, job.seed] = results
+        return results
+
+    rows = []
+    for preset, truth in presets.items():
+        for selection in selections:
+            job, bare = Job(preset, selection, 0), selection == "none" or (selection == "oracle" and not truth)
+            whole = [of(replace(job, seed=seed), bare) for seed in seeds]
+            rows.append(_mean(job, whole))
+            if selection == "auto" and leave_one_out:
+                for name in rows[-1].effects:
+                    left = replace(job, left_out=name)
+                    less = [
+                        of(replace(left, seed=seed), _on(results) <= assembly.falls_with(name))
+                        for seed, results in zip(seeds, whole, strict=True)
+                    ]
+                    rows.append(_mean(left, less))
+        write_atomically(folder / TABLE_FILE, tables(rows))  # what is known so far
+    figure = picture(rows)
+    if figure is not None:
+        write_png(folder / PICTURE_FILE, figure_picture(figure))
+
+
+def _on(results: RunResults) -> frozenset[str]:
+    """Names of the effects that were on in a run."""
+    return frozenset(name for name, effect in results.effects.items() if effect["on"])
+
+
+def _mean(job: Job, results: Sequence[RunResults]) -> Row:
+    """The row of a job's runs; effects are those that were on in any of them."""
+    effects = {name: None for result in results for name, effect in result.effects.items() if effect["on"]}
+
+    def mean(name: str) -> float | None:
+        known = [result.test[name] for result in results if result.test.get(name) is not None]
+        return statistics.fmean(known) if known else None
+
+    return Row(
+        job,
+        tuple(effects),
+        statistics.fmean(result.test["psnr"] for result in results),
+        mean("clean_psnr"),
+        mean("mae_c"),
+        statistics.fmean(result.run["parameters"] for result in results),
+        statistics.fmean(1000.0 / result.cost["steps_per_second"] for result in results),
+    )
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown: selections side by side, then what leaving each effect out costs."""
+    chosen = [
+        (
+            row.job.preset, row.job.selection, ", ".join(row.effects) or "none", number(row.psnr, 2), number(row.clean_psnr, 2),
+            number(row.mae_c, 3), number(row.parameters, 0), number(row.ms_per_step, 1),
+        )
+        for row in rows
+        if row.job.left_out is None
+    ]  # fmt: skip
+    head = ("scene", "selection", "effects", "PSNR (dB)", "clean (dB)", "MAE (°C)", "parameters", "ms per step")
+    lines = ["# What choosing effects is worth", "", NOTE, "", *markdown_table(head, chosen, align="lllrrrrr")]
+    whole = {row.job.preset: row for row in rows if row.job.selection == "auto" and row.job.left_out is None}
+    left = []
+    for row in (row for row in rows if row.job.left_out):
+        auto = whole[row.job.preset]
+        worse, cleaner = _difference(row.mae_c, auto.mae_c), _difference(auto.clean_psnr, row.clean_psnr)
+        left.append((
+            row.job.preset, row.job.left_out, number(auto.psnr - row.psnr, 2), number(cleaner, 2), number(worse, 3),
+            number(auto.parameters - row.parameters, 0), number(auto.ms_per_step - row.ms_per_step, 2),
+        ))  # fmt: skip
+    if left:
+        head = (
+            "scene",
+            "without",
+            "PSNR lost (dB)",
+            "clean",
+            "MAE gained (°C)",
+            "parameters saved",
+            "ms per step saved",
+        )
+        lines += ["", "## Left out of what auto chose", ""]
+        lines += ["What the run loses (PSNR down, MAE up) and saves without the effect and what stands on it.", ""]
+        lines += markdown_table(head, left, align="llrrrrr")
+    return "\n".join([*lines, ""])
+
+
+def _difference(more: float | None, less: float | None) -> float | None:
+    return None if more is None or less is None else more - less
+
+
+def picture(rows: Sequence[Row]) -> Figure | None:
+    """PSNR and milliseconds per step of each selection beside those of the truth, by scene; None without an oracle."""
+    truths = {row.job.preset: row for row in rows if row.job.selection == "oracle"}
+    if not truths:
+        return None
+    figure = Figure(figsize=(10, 0.5 * len(truths) + 1.8), dpi=110, layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    names = list(truths)
+    for i, selection in enumerate(("auto", "none", "all")):
+        found = [row for row in rows if row.job.selection == selection and row.job.left_out is None]
+        found = [row for row in found if row.job.preset in truths]
+        heights = [names.index(row.job.preset) + 0.15 * (i - 1) for row in found]
+        style = {"marker": "os^"[i], "linestyle": "", "color": f"C{i}", "label": selection}
+        left.plot([row.psnr - truths[row.job.preset].psnr for row in found], heights, **style)
+        right.plot([row.ms_per_step / truths[row.job.preset].ms_per_step for row in found], heights, **style)
+    left.axvspan(-0.3, 0.3, color="0.9", zorder=0)  # what counts as equal
+    left.set(xlabel="PSNR minus that of the true effects (dB)", yticks=range(len(names)), yticklabels=names)
+    left.set_xscale("symlog", linthresh=1.0)
+    right.axvline(1.0, color="0.7", linewidth=1)
+    right.set(xlabel="time of a training step over that with the true effects")
+    for axes in (left, right):
+        axes.grid(alpha=0.25)
+    left.invert_yaxis()
+    right.legend()
+    return figure

@@ -1,0 +1,154 @@
+"""Where the time of a training step goes, from the data loader to the optimiser, and how little it could take.
+
+The steps are those of a run: Lightning's loop, the training module, its guards. The scene holds still, because learning
+rates of zero change no time, so every step costs the same. Parts are timed by standing a clock before the kernels
+that they call.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch.utils.data import DataLoader
+
+from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
+from heatsplat.kernels import binning, compositing, projection, relaxation, ssim
+
+VIEWS = 60  # enough moments for 24 harmonics
+TURN = 0.002  # radians between neighbouring views, so that no view is the one before
+
+# Part of a step -> what does its work: pairs of an object and the name of a function in it.
+PARTS: dict[str, list[tuple[Any, str]]] = {
+    "projection": [(projection, "project")],
+    "binning": [(binning, "sort_by_depth"), (binning, "find_instances"), (binning, "deal_to_tiles")],
+    "forward": [(compositing, "composite")],
+    "loss": [(ssim, "forward"), (ssim, "backward")],
+    "backward": [(compositing, "composite_backward")],
+    "gradients": [(compositing, "sum_slots"), (projection, "project_backward")],
+    "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
+    "optimiser": [(torch, "_fused_adam_")],
+}
+# What the module does in a step, its kernels included; the rest of a step is Lightning's.
+MODULE = ("training_step", "backward", "on_after_backward")
+WARM_UP = 5  # steps in which kernels are compiled and memory is found
+
+
+def still_scene(scene: dict[str, Any]) -> SceneData:
+    """Views of the benchmark's Gaussians (``scenes.build``), all from about the same place.
+
+    Targets are smooth noise: what they show costs no time.
+    """
+    camera = scene["camera"]
+    width, height = camera["width"], camera["height"]
+    generator = torch.Generator().manual_seed(1)
+    coarse = torch.rand(1, 1, 8, 8, generator=generator)
+    target = torch.nn.functional.interpolate(coarse, (height, width), mode="bicubic")[0, 0, :, :, None].clamp(0, 1)
+    frames = []
+    for k in range(VIEWS):
+        angle = torch.tensor(TURN * (k - VIEWS / 2) / VIEWS, dtype=torch.float64)
+        turn = torch.eye(4, dtype=torch.float64)
+        turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+        turn[0, 3] = 0.01 * k / VIEWS  # cameras apart, or the scene would have no extent
+        seen_by = Camera(turn @ camera["viewmats"].double(), camera["Ks"], width, height)
+        frames.append(Frame(f"{k:03d}", k, seen_by, time_s=10.0 * k))
+    views = ViewSet(frames, lambda k: View(frames[k], thermal=target))
+    nothing = ViewSet([], lambda k: View(frames[k]))
+    return SceneData(
+        "benchmark", views, nothing, nothing, scene["means"], thermal_range=ThermalRange(0.0, 100.0), ambient_c=20.0
+    )
+
+
+class StepClock:
+    """Seconds of the parts of each step: of the functions it stands before, while it is entered.
+
+    A step lasts from one call of ``training_step`` to the next.
+    """
+
+    def __init__(self, module: Any) -> None:
+        self.module = module
+        self.steps: list[dict[str, float]] = []
+        self._patches = ExitStack()
+
+    def __enter__(self) -> StepClock:
+        for part, functions in PARTS.items():
+            for owner, name in functions:
+                self._stand_before(owner, name, part)
+        for name in MODULE:
+            self._stand_before(self.module, name, f"module.{name}")
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._patches.close()
+
+    def _stand_before(self, owner: Any, name: str, part: str) -> None:
+        function = getattr(owner, name)
+
+        def timed(*arguments: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            if part == "module.training_step":
+                self.steps.append({"start": start})
+            try:
+                return function(*arguments, **options)
+            finally:
+                if self.steps:
+                    step = self.steps[-1]
+                    step[part] = step.get(part, 0.0) + time.perf_counter() - start
+
+        self._patches.enter_context(patch.object(owner, name, timed))
+
+    def milliseconds(self) -> dict[str, float]:
+        """Of the whole step and its parts, which add up to it: means over the quickest quarter of the steps.
+
+        "torch" is what the module does besides its kernels: activations, autograd, statistics. "Lightning" is what is
+        left: the loop, its hooks and guards, the data loader, the schedule of learning rates.
+        """
+        steps = []
+        for step, after in zip(self.steps[WARM_UP:-1], self.steps[WARM_UP + 1 :], strict=True):
+            parts = {part: step.get(part, 0.0) for part in PARTS}
+            kernels = sum(parts.values()) - parts["optimiser"]
+            parts["torch"] = sum(step.get(f"module.{name}", 0.0) for name in MODULE) - kernels
+            whole = after["start"] - step["start"]
+            steps.append({"step": whole} | parts | {"Lightning": whole - sum(parts.values())})
+        steps.sort(key=lambda parts: parts["step"])
+        quick = steps[: max(1, len(steps) // 4)]
+        return {name: 1e3 * sum(parts[name] for parts in quick) / len(quick) for name in quick[0]}
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What training steps took (``StepClock.milliseconds``), and what they had to do besides rendering."""
+
+    milliseconds: dict[str, float]
+    frequencies: int
+    parameters: int
+
+
+def time_steps(module: Callable[[], Any], trainer: Callable[..., Any], scene: dict[str, Any], steps: int) -> Steps:
+    """What a training step takes, and its parts.
+
+    Args:
+        module: makes the training module, with learning rates of zero.
+        trainer: makes the trainer; takes ``max_steps``.
+        scene: Gaussians and camera, as ``scenes.build`` gives them.
+        steps: how many are timed, besides those that warm up.
+    """
+    module = copy.deepcopy(module)()  # its parts would otherwise be shared with the next one
+    views = still_scene(scene)
+    module.attach(views)
+    with torch.no_grad():
+        module.splats["means"].copy_(scene["means"])
+        module.splats["log_scales"].copy_(scene["scales"].log())
+        module.splats["quats"].copy_(scene["quats"])
+        module.splats["opacity_logits"].copy_(scene["opacities"].reshape(-1, len(scene["means"])).T.logit())
+    with StepClock(module) as clock:
+        loader = DataLoader(views.train, batch_size=None, num_workers=0)
+        trainer(max_steps=steps + WARM_UP + 1).fit(module, train_dataloaders=loader)
+    frequencies = module.splats["source_gains"].shape[2] if "source_gains" in module.splats else 0
+    return Steps(clock.milliseconds(), frequencies, sum(parameter.numel() for parameter in module.parameters()))

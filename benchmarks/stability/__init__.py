@@ -1,0 +1,1 @@
+"""Hard cases of arithmetic, one family per file; ``study.py`` runs them."""

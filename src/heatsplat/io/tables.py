@@ -1,0 +1,71 @@
+"""Tables: Markdown for people, CSV for programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from heatsplat.io.results import write_atomically
+
+NONE = "–"
+
+
+def number(value: float | None, digits: int, spread: float | None = None) -> str:
+    """A number with separated thousands and its spread if there is one; a dash for None and NaN."""
+    if value is None or math.isnan(value):
+        return NONE
+    text = f"{value:,.{digits}f}"
+    return text if spread is None or math.isnan(spread) else f"{text} ± {spread:,.{digits}f}"
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: str = "") -> list[str]:
+    """Lines of a Markdown table; bars within cells are escaped.
+
+    Args:
+        head: titles of the columns.
+        rows: their cells.
+        align: "l" or "r" for each column; "" puts all to the left.
+    """
+    rule = ["---:" if side == "r" else "---" for side in align or "l" * len(head)]
+    lines = [_line(head), "|" + "|".join(rule) + "|"]
+    return lines + [_line(row) for row in rows]
+
+
+def _line(cells: Iterable[Any]) -> str:
+    return "| " + " | ".join(re.sub(r"(?<!\\)\|", r"\|", str(cell)) for cell in cells) + " |"
+
+
+def write_csv(path: Path | str, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
+    """Writes rows as CSV, as a whole or not at all: floats in full precision, None and what a row lacks empty.
+
+    Args:
+        path: of the file; infinity stands in it as ``inf``.
+        rows: name of column -> value.
+        columns: their order; None for the order in which they occur.
+    """
+    rows = list(rows)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(
+        text, columns or list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n"
+    )
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
+
+
+def read_csv(path: Path | str) -> list[dict[str, float | str | None]]:
+    """Rows of a file that ``write_csv`` wrote, numbers as floats and empty cells as None."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _value(text: str) -> float | str | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text

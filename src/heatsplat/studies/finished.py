@@ -1,0 +1,170 @@
+"""Finished runs as one table, and the runs of one recipe as one of its parts; sweeps, fronts and comparisons are views of it."""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+from heatsplat.studies.recorded import config_of, overrides_of
+
+# Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
+# are among them; the method is named by itself.
+SEEDS = {"seed", "data.seed", "data.scene_seed"}
+PLACES = {"data", "data.root", "data.scene", "data.scenes"}
+NAMES = {"method", "row", "ablation", "experiment"}
+HOW_IT_RUNS = {"threads", "ckpt", "test"}
+NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
+NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra", "table"}  # these groups with all below
+
+
+@dataclass
+class Runs:
+    """The runs of one recipe on one scene.
+
+    Args:
+        name: of the recipe.
+        scene: on which they ran.
+        table: the rows of ``read_runs``; those without results too.
+        other: settings that not all runs of this name have, such as "max_steps=3000"; empty where all agree.
+    """
+
+    name: str
+    scene: str
+    table: pd.DataFrame
+    other: str = ""
+
+    @property
+    def label(self) -> str:
+        """The name, with what tells the runs from others of its name."""
+        return f"{self.name}, {self.other}" if self.other else self.name
+
+    @property
+    def count(self) -> int:
+        """How many have results."""
+        return int(self.table["failed"].isna().sum())
+
+    @property
+    def failed(self) -> list[str]:
+        """Why the others have none."""
+        return self.table["failed"].dropna().tolist()
+
+    def values(self, name: str) -> list[float]:
+        """A score or cost of the runs that have it."""
+        return self.table[name].dropna().tolist() if name in self.table else []
+
+    def mean(self, name: str) -> float | None:
+        """Mean over the runs that have the value, None where none has."""
+        values = self.values(name)
+        return statistics.fmean(values) if values else None
+
+    def spread(self, name: str) -> float | None:
+        """Standard deviation over them (n - 1), None for fewer than two."""
+        values = self.values(name)
+        return statistics.stdev(values) if len(values) > 1 else None
+
+
+def read_runs(folders: Iterable[Path]) -> pd.DataFrame:
+    """A row for each run, in the order of the folders.
+
+    Columns: folder, scene, method, row (of a sweep, "" for none), overrides (key -> value), failed (why there are no results,
+    None where there are), results (None where there are none), data (the options of the data), then every score of the test
+    views and every cost, NaN where a run has none.
+    """
+    return pd.DataFrame([_read(folder) for folder in folders])
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    overrides, config, results, failed = {}, {}, None, None
+    try:
+        overrides, config = overrides_of(folder), config_of(folder)
+        if (folder / METRICS_FILE).exists():
+            results = RunResults.read(folder / METRICS_FILE)
+        else:
+            failed = reason_of(folder)
+    except (ValueError, OSError, yaml.YAMLError) as error:
+        failed = f"{error}. Delete the folder to run it again."
+    run = {} if results is None else results.run
+    found = {
+        "folder": folder, "scene": str(run.get("scene", _scene(config))),
+        "method": str(run.get("method", overrides.get("method"))),
+        "row": named_row(overrides), "overrides": overrides, "failed": failed, "results": results,
+        "data": config.get("data") or {},
+    }  # fmt: skip
+    return found if results is None else found | results.test | results.cost
+
+
+def _scene(config: Mapping[str, Any]) -> str:
+    """The scene that a run was given; a method's own synthetic preset is a reference to another key."""
+    data = config.get("data") or {}
+    scene = str(data.get("scene") or "+".join(data.get("scenes") or ()) or "?")
+    return str(config.get(scene[2:-1], scene)) if scene.startswith("${") else scene
+
+
+def reason_of(folder: Path) -> str:
+    """Why a run has no result: the last line of its FAILED file that names an error, since Hydra adds lines of its own."""
+    if not (folder / FAILED).exists():
+        return "not finished"
+    lines = [line.strip() for line in (folder / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
+    named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
+    return (named or lines or ["failed"])[-1]
+
+
+# Names ---------------------------------------------------------------------------------------------------------------
+
+
+def row_names(jobs: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
+    """For each job the name of its row, and the settings that not all jobs of a row of this name have ("" for none).
+
+    A job without a named row has its settings for a name (``row_name``).
+
+    Args:
+        jobs: overrides of each: key -> value.
+    """
+    names = [named_row(overrides) for overrides in jobs]
+    settings = [[*_method(overrides), *settings_of(overrides)] for overrides in jobs]
+    others = [" ".join(words) for words in unshared(names, settings)]
+    return [
+        (name, other) if name else (row_name(overrides), "")
+        for overrides, name, other in zip(jobs, names, others, strict=True)
+    ]
+
+
+def unshared(names: Sequence[str], settings: Sequence[Sequence[str]]) -> list[list[str]]:
+    """For each job those of its settings that not all jobs of its name have."""
+    shared: dict[str, set[str]] = {}
+    for name, own in zip(names, settings, strict=True):
+        shared[name] = shared.get(name, set(own)) & set(own)
+    return [[text for text in own if text not in shared[name]] for name, own in zip(names, settings, strict=True)]
+
+
+def named_row(overrides: Mapping[str, str]) -> str:
+    """Name of the row that a job was given (``row=``), empty for none."""
+    name = overrides.get("row", "").strip("'\"")
+    return "" if name == "null" else name
+
+
+def row_name(overrides: Mapping[str, str]) -> str:
+    """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
+    return " ".join([*_method(overrides), *settings_of(overrides)]) or "run"
+
+
+def _method(overrides: Mapping[str, str]) -> list[str]:
+    return [overrides["method"]] if "method" in overrides else []
+
+
+def settings_of(overrides: Mapping[str, str]) -> list[str]:
+    """Overrides that make a recipe besides its method: "key=value" in alphabetical order."""
+
+    def makes_a_recipe(key: str) -> bool:
+        key = key.lstrip("+~")
+        return key not in NOT_A_ROW and key.partition(".")[0] not in NOT_WHAT_WAS_LEARNED
+
+    return sorted(f"{key}={value}" for key, value in overrides.items() if makes_a_recipe(key))

@@ -1,0 +1,32 @@
+"""Runs beside each other: how the study times them. (The ratio itself is measured on an idle machine.)"""
+
+import sys
+
+import pytest
+
+from benchmarks import company
+from heatsplat.contracts import SceneError
+
+WAIT = "import time; time.sleep(1)"
+
+
+def test_runs_side_by_side_start_at_once(tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    together = company.seconds_of([sys.executable, "-S", "-c", WAIT], folders)
+    assert 1.0 < together < 2.9
+
+
+def test_a_run_that_fails_is_quoted(tmp_path):
+    with pytest.raises(SceneError, match="no such thing"):
+        company.seconds_of([sys.executable, "-S", "-c", "raise SystemExit('no such thing')"], [tmp_path])
+
+
+@pytest.mark.parametrize("side_by_side", [2.0, 3.0])
+def test_the_ratio_is_written_and_one_above_the_limit_fails(tmp_path, monkeypatch, side_by_side):
+    monkeypatch.setattr(company, "seconds_of", lambda _, folders: 1.0 if len(folders) == 1 else side_by_side)
+    if side_by_side > 2.2:
+        with pytest.raises(SceneError, match=r"3\.00 times as long"):
+            company.run(tmp_path, "train.py", [])
+    else:
+        company.run(tmp_path, "train.py", [])
+    assert f"{side_by_side:.2f} times" in (tmp_path / company.TABLE_FILE).read_text()

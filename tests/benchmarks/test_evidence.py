@@ -1,0 +1,75 @@
+"""Verdicts against truth on small synthetic scenes, and the page that tells of them."""
+
+from functools import partial
+
+import pytest
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+
+from benchmarks.evidence import judged, run, written
+from heatsplat.contracts import SceneError
+from heatsplat.effects.catalogue import CATALOGUE
+
+SCENES = ("static", "cooling", "drifting")
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    return [judged(Synthetic, scene, "tiny", seed) for scene in SCENES for seed in range(2)]
+
+
+def test_verdicts_are_right_where_truth_is_known(outcomes):
+    cases, wrong = len(outcomes) * len(CATALOGUE), sum(outcome.wrong for outcome in outcomes)
+    assert wrong <= 0.05 * cases, [(one.scene, one.seed, one.found ^ one.present) for one in outcomes if one.wrong]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_what_a_scene_shows_is_found(outcomes, scene):
+    for outcome in outcomes:
+        if outcome.scene == scene:
+            assert outcome.present <= outcome.found, (outcome.seed, outcome.found)
+
+
+def test_a_drift_of_the_sensor_is_not_taken_for_heat(outcomes):
+    for outcome in outcomes:
+        if outcome.scene == "drifting":
+            assert outcome.verdicts["frame_offset"].on
+            assert not {"relaxation", "harmonic_source"} & outcome.found
+
+
+def test_the_page_counts_what_was_judged(outcomes):
+    text = written(outcomes)
+    for effect in CATALOGUE:
+        assert f"| {effect.name} | {effect.stage} |" in text
+    row = next(line for line in text.splitlines() if line.startswith("| frame_offset |") and "sensor" not in line)
+    counts = [int(cell) for cell in row.split("|")[2:6]]
+    assert sum(counts) == len(outcomes) and counts[0] + counts[1] == 2
+
+
+def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
+    last = outcomes[-1].seed
+    fresh = [outcome for outcome in outcomes if outcome.seed == last]
+    text = written(outcomes, frozenset({last}))
+    cases = [int(line.split()[2]) for line in text.splitlines() if "verdicts are right" in line]
+    assert cases == [len(CATALOGUE) * (len(outcomes) - len(fresh)), len(CATALOGUE) * len(fresh)]
+    assert "## Verdicts against truth, tiny, on recordings that no threshold was set on" in text
+
+
+def test_scenes_without_a_known_truth_are_refused(tmp_path):
+    class Unknown:
+        def __init__(self, **_):
+            self.scene = Synthetic(scene="static", size="tiny", frames=2).scene
+            self.scene.notes.pop("effects")
+
+    with pytest.raises(SceneError, match="does not say in its notes which effects it shows"):
+        run(tmp_path, partial(Unknown), ["static"], seeds=[0])
+
+
+def test_every_preset_says_what_it_shows_and_many_are_told_apart():
+    names = {effect.name for effect in CATALOGUE}
+    presets = PRESETS | OUTDOOR
+    assert all(preset.effects <= names for preset in presets.values())
+    assert len({preset.effects for preset in presets.values()}) >= 10
+    assert sum(len(preset.effects) > 1 for preset in presets.values()) >= 5
+    assert set().union(*(preset.effects for preset in presets.values())) == names

@@ -1,0 +1,56 @@
+"""Every naive form that is put back is noticed by a test; study=mutations says by which."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.mutations import MUTATIONS, SURVIVED, Mutation
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name)
+def test_what_is_mutated_still_stands_in_the_source(mutation):
+    assert mutation.source() != mutation.path.read_text()
+    compile(mutation.source(), mutation.module, "exec")
+    for word in mutation.tests.split(" -k")[0].split(" "):
+        path, _, name = word.partition("::")
+        assert name in (ROOT / path).read_text(), word
+
+
+def test_a_place_that_is_gone_is_named():
+    with pytest.raises(ValueError, match=r"mutation 'none' looks for one place in units.py, found 0"):
+        Mutation("none", "physics.units", "no such line", "", "tests/physics/test_units.py").source()
+
+
+PROBE = """
+from benchmarks import mutations
+harmless = mutations.Mutation("harmless", "physics.units", "return celsius + KELVIN_AT_0_C",
+                              "return KELVIN_AT_0_C + celsius", "tests/physics/test_units.py")
+fatal = mutations.Mutation("fatal", "physics.units", "return celsius + KELVIN_AT_0_C", "return celsius",
+                           "tests/physics/test_units.py")
+mutations.MUTATIONS = (harmless, fatal)
+print(mutations.run("OUTPUT"))
+"""
+
+
+def test_a_mutation_that_changes_nothing_survives_and_one_that_does_is_noticed(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE.replace("OUTPUT", str(tmp_path))],
+        cwd=ROOT, env={"PYTHONPATH": str(ROOT / "src"), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "'harmless': None" in done.stdout
+    assert "'fatal': 'tests/physics/test_units.py::test_zero_celsius_and_back'" in done.stdout
+    assert SURVIVED in (tmp_path / "mutations.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_test_fails_for_every_mutation(tmp_path):
+    command = [sys.executable, str(ROOT / "src/study.py"), "study=mutations", "study.document=null"]
+    done = subprocess.run([*command, f"hydra.run.dir={tmp_path}"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert SURVIVED not in (tmp_path / "mutations.md").read_text(encoding="utf-8")

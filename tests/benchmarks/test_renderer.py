@@ -1,0 +1,80 @@
+"""The renderer benchmark: its peers compute the same, its clocks and floors are plausible, its tables are complete."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from running import compose_run
+
+from benchmarks.renderer import peers
+from benchmarks.renderer.floors import Machine, Work
+from benchmarks.renderer.scenes import Case, build
+from heatsplat import cli
+from heatsplat.kernels.scheduling import thread_count, use_threads
+from heatsplat.renderers import rasterization
+
+ARRAYS = ("means", "quats", "scales", "opacities", "features")
+
+
+@pytest.fixture(autouse=True)
+def keep_threads():
+    kernels, torchs = thread_count(), torch.get_num_threads()
+    yield
+    use_threads(kernels)
+    torch.set_num_threads(torchs)
+
+
+def test_the_torch_tiles_draw_what_the_renderer_draws():
+    scene, _ = build(Case(500, 48, 40, channels=3))
+    arguments = {key: scene[key] for key in ARRAYS} | scene["camera"]
+    expected = rasterization(**arguments, backend="reference").features
+    found = peers.render_torch_tiles(**arguments)
+    assert (found - expected).abs().mean() < 1e-4  # it does not stop at a transmittance of 1e-4
+
+
+def test_the_losses_compared_are_one_loss():
+    prediction, target = torch.rand(2, 30, 41, 2, generator=torch.Generator().manual_seed(0))
+    full, separable = peers.full_window_loss(prediction, target), peers.separable_loss(prediction, target)
+    assert full.item() == pytest.approx(separable.item(), rel=1e-5)
+
+
+def test_work_counts_what_was_rendered():
+    scene, _ = build(Case(300, 64, 48))
+    scene["means"].requires_grad_()
+    output = rasterization(
+        **{key: scene[key] for key in ARRAYS}, **scene["camera"], backend="cpu", depth=False
+    )  # fmt: skip
+    work = Work.of(output.features)
+    assert (work.gaussians, work.pixels, work.channels, work.modalities) == (300, 64 * 48, 1, 1)
+    assert work.visible == len(output.meta["visible_ids"])
+    # A 64x48 image has 2 x 2 tiles, 16 x 12 blocks; every instance that mattered reaches at least one block.
+    assert work.visible <= work.instances <= 4 * work.visible
+    assert work.visible * 0.5 < work.blocks <= work.visible * 16 * 12
+    floors = work.floors(Machine(1e9, 1e10))
+    assert set(floors) == {"projection", "binning", "forward", "backward", "gradients"}
+    assert work.floors(Machine(2e9, 2e10))["forward"] == pytest.approx(floors["forward"] / 2)
+
+
+def test_the_quick_study_writes_complete_and_plausible_tables(tmp_path):
+    config = compose_run(tmp_path, "study=renderer_quick", config_name="study")
+    tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
+    assert [len(tables[name]) for name in ("renderer", "modalities", "loss", "memory")] == [7, 1, 4, 1]
+    for row in tables["renderer"]:
+        assert row["floor_forward_ms"] > 0 and row["share_forward"] > 0
+        assert row["threads"] > 1 or row["share_forward"] < 1.5  # two threads may never have had both cores
+    assert tables["peers"][0]["ratio, 1 thread(s)"] > 1
+    for row in tables["training"]:
+        parts = [value for key, value in row.items() if key.endswith("_ms") and not key.startswith("floor_")]
+        assert sum(parts) == pytest.approx(2 * row["step_ms"], rel=1e-6)  # the step, and its parts once more
+        assert min(parts) >= 0
+    static, etgs = tables["training"]
+    assert static["thermal_ms"] == 0 < etgs["thermal_ms"]
+    for name, rows in tables.items():
+        with open(tmp_path / f"{name}.csv", newline="") as file:
+            assert len(list(csv.DictReader(file))) == len(rows)
+    text = (tmp_path / "renderer.md").read_text()
+    assert "reached" in text and "Lightning" in text and "nan" not in text
+    assert (tmp_path / "renderer.png").stat().st_size > 10_000
+    assert np.isfinite(tables["memory"][0]["megabytes"])

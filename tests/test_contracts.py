@@ -1,0 +1,31 @@
+"""Nouns that all packages share: positions evenly spread, and points seen by a camera."""
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera, evenly_spread
+
+
+@pytest.mark.parametrize(
+    ("count", "limit", "found"),
+    [(10, 4, [0, 3, 6, 9]), (10, 3, [0, 4, 9]), (2, 5, [0, 1]), (5, 1, [0]), (5, 0, []), (0, 3, [])],
+)
+def test_positions_are_spread_from_the_first_to_the_last(count, limit, found):
+    assert evenly_spread(count, limit) == found
+
+
+def test_positions_are_as_many_as_asked_for_and_all_different():
+    for count, limit in ((1000, 64), (65, 64), (100_000, 1500), (20_001, 20_000)):
+        found = evenly_spread(count, limit)
+        gaps = {later - earlier for earlier, later in zip(found, found[1:], strict=False)}
+        assert len(found) == limit and found[0] == 0 and found[-1] == count - 1
+        assert min(gaps) > 0 and max(gaps) - min(gaps) <= 1
+
+
+def test_a_camera_projects_points_of_the_world():
+    K = torch.tensor([[100.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]])
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([0.0, 1.0, 2.0])
+    pixels, depths = Camera(viewmat, K, 60, 40).project(torch.tensor([[1.0, 1.0, 2.0], [0.0, 0.0, -3.0]]))
+    assert pixels[0].tolist() == [100 / 4 + 30, 50 * 2 / 4 + 20]
+    assert depths.tolist() == [4.0, -1.0] and pixels.dtype == depths.dtype == torch.float64
