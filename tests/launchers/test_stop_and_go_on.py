@@ -96,7 +96,12 @@ def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):
 
 
 def test_under_slurm_a_stray_checkpoint_of_the_working_directory_is_not_gone_on_from(tmp_path, monkeypatch):
-    for name, value in {"SLURM_NTASKS": "1", "SLURM_JOB_NAME": "job", "SLURM_JOB_ID": "1", "SLURM_NODELIST": "a"}.items():
+    for name, value in {
+        "SLURM_NTASKS": "1",
+        "SLURM_JOB_NAME": "job",
+        "SLURM_JOB_ID": "1",
+        "SLURM_NODELIST": "a",
+    }.items():
         monkeypatch.setenv(name, value)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hpc_ckpt_1.ckpt").write_bytes(b"of another run")
