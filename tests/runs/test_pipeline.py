@@ -32,10 +32,10 @@ def test_a_notebook_composes_trains_loads_and_looks_at_temperatures(trained):
     assert heatsplat.train(config, folder).test == results.test  # which are there
     scene = heatsplat.load(folder / "checkpoints" / "last.ckpt")
     frame = scene.scene.test.frames[0]
-    celsius, bounds = scene.render(frame), scene.scene.thermal_range
+    celsius, bounds = scene.render(frame, unseen="keep"), scene.scene.thermal_range
     assert celsius.shape == (frame.camera.height, frame.camera.width)
     assert bounds.min_c <= celsius.min() and celsius.max() <= bounds.max_c
-    assert torch.equal(scene.render(frame.camera, 0.0), celsius)  # static splats know no time
+    assert torch.equal(scene.render(frame.camera, 0.0, "keep"), celsius)  # static splats know no time
 
 
 def test_a_step_changes_no_configuration_that_it_is_given(trained):
