@@ -193,7 +193,7 @@ MUTATIONS = (
         "tests/thermal/test_imaging_field.py",
     ),
     Mutation(
-        "sin(2^k π p) of the rounded product", "thermal.atmospheric_field",
+        "sin(2^k π p) of the rounded product", "thermal.coordinates",
         "phase = math.pi * (scaled - 2.0 * torch.round(scaled / 2.0))", "phase = math.pi * scaled",
         "tests/thermal/test_imaging_field.py -k octaves",
     ),

@@ -10,7 +10,16 @@ WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores() // int(WORKERS))))
 
-RUNS = {"benchmarks", "callbacks", "effects", "house", "losses", "studies", "training"}  # folders with tests that train
+RUNS = {
+    "benchmarks",
+    "callbacks",
+    "effects",
+    "house",
+    "losses",
+    "runs",
+    "studies",
+    "training",
+}  # folders with tests that train
 FILMED = {}  # settings of a recording -> the scene, which nobody changes
 
 

@@ -378,11 +378,12 @@ def test_nothing_has_flowed_at_the_start_and_hardly_anything_differs_after_very_
 
 def test_flow_counts_in_spans_of_the_record_from_its_start():
     model, splats = conducting()
-    before = model.state.features(splats, query(-50.0)).features
-    assert torch.equal(model.features(splats, query(-50.0)).features, before)  # nothing flows back
+    values = model.state.features(splats, query())
+    assert torch.equal(model.conducted(values, splats, -50.0), values)  # nothing flows back
+    flowed = model.conducted(values, splats, 150.0)
     late = ViewSet([replace(frame, time_s=frame.time_s + 1000.0) for frame in scene().train.frames], lambda i: None)
     model.prepare(replace(scene(), train=late))
-    assert model.span_s.item() == SPAN_S
+    assert not torch.equal(flowed, values) and torch.allclose(model.conducted(values, splats, 1150.0), flowed)
 
 
 def test_the_graph_is_drawn_anew_when_gaussians_change_and_at_stated_steps():
