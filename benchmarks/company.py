@@ -55,7 +55,9 @@ def run(
         ["runs", "seconds until the last one ends"],
         [(name, ", ".join(f"{seconds:.1f}" for seconds in found)) for name, found in rows],
     )
-    write_atomically(output_dir / TABLE_FILE, "\n".join(lines) + f"\n\nSide by side they take {ratio:.2f} times as long.\n")
+    write_atomically(
+        output_dir / TABLE_FILE, "\n".join(lines) + f"\n\nSide by side they take {ratio:.2f} times as long.\n"
+    )
     log.info("%d side by side take %.2f times as long as one alone (at most %.2f)", together, ratio, limit)
     if ratio > limit:
         raise SceneError(

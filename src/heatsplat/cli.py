@@ -103,6 +103,14 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             if all_of_it:
                 raise
             sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
+        except Exception as error:  # of a job of a sweep, when all others have run
+            cause = _expected(error)
+            if all_of_it or cause is None:
+                raise
+            sys.exit(f"{type(cause).__name__}: {cause}")
+        finally:
+            if not all_of_it:
+                del os.environ["HYDRA_FULL_ERROR"]
 
     return command
 
