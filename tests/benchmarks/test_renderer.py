@@ -57,6 +57,7 @@ def test_work_counts_what_was_rendered():
     assert work.floors(Machine(2e9, 2e10))["forward"] == pytest.approx(floors["forward"] / 2)
 
 
+@pytest.mark.slow
 def test_the_quick_study_writes_complete_and_plausible_tables(tmp_path):
     config = compose_run(tmp_path, "study=renderer_quick", config_name="study")
     tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)

@@ -133,7 +133,7 @@ def test_tensorboard(run):
     parts = [found.Scalars(f"loss/{name}")[-1].value for name in ("data", "prior")]
     assert losses[24] == pytest.approx(sum(parts), rel=1e-5)
     assert "splats/opacity_0" in found.Tags()["histograms"]
-    assert {"val/0006_000", "val/0007_001", "probes", "test/probes", "test/0009_000"} <= set(found.Tags()["images"])
+    assert {"val/0006_000", "val/0008_002", "probes", "test/probes", "test/0009_000"} <= set(found.Tags()["images"])
     summaries = found.SummaryMetadata
     assert summaries("_hparams_/session_start_info").plugin_data.plugin_name == "hparams"
 
@@ -157,10 +157,10 @@ def test_pictures_show_what_they_say(run):
     drawn = sorted(p.relative_to(folder).as_posix() for p in folder.glob("renders/*/*.png"))
     assert drawn == [
         "renders/test/0009_000.png",
-        "renders/test/0010_001.png",
         "renders/test/0011_002.png",
+        "renders/test/0012_003.png",
         "renders/val/0006_000.png",
-        "renders/val/0007_001.png",
+        "renders/val/0008_002.png",
     ]
     for path in drawn:
         picture = cv2.imread(str(folder / path))

@@ -137,6 +137,7 @@ def scores(tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 def test_one_opacity_fails_in_the_pane_and_two_do_not(scores):
     """Measured: 34.3 dB heat and 30.4 dB colour with two, 31.6 dB and 24.2 dB with one."""
     two, one = scores[True], scores[False]

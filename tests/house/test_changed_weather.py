@@ -48,8 +48,8 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
     monkeypatch.setattr(run, "build", lambda settings: data)
     monkeypatch.setattr(run, "restore", lambda *_: None)
     monkeypatch.setattr("heatsplat.training.session.prepare_machine", lambda threads: None)
-    options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", *overrides)
-    cli.render.__wrapped__.__wrapped__(compose(options, "render"), folder)
+    options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", "unseen=keep", *overrides)
+    cli.render.__wrapped__.__wrapped__.__wrapped__(compose(options, "render"), folder)
     return seen, data.scene
 
 

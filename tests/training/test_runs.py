@@ -79,7 +79,7 @@ def test_a_checkpoint_of_another_method_is_refused(tmp_path):
     run(tmp_path / "etgs", *SHORT, "method=etgs", "test=false")
     last = tmp_path / "etgs" / "checkpoints" / "last.ckpt"
     with pytest.raises(SceneError, match="method 'etgs', this run is method '3dgs'"):
-        run(tmp_path / "3dgs", *SHORT, "method=3dgs", f"ckpt={last}")
+        run(tmp_path / "3dgs", *SHORT, "method=3dgs", "data.scene=cooling", f"ckpt={last}")
 
 
 def test_a_missing_checkpoint_is_named_with_those_that_exist(tmp_path):
