@@ -217,7 +217,7 @@ def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
 
 
 def test_the_log_tells_verdict_statistic_price_and_reason():
-    told = assembly.told(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
+    told = assembly.verdicts_as_dicts(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
     head, *rows = assembly.lines(told)
     assert head.split() == ["effect", "statistic", "ms/step", "numbers", "reason"] and len(rows) == len(assembly.NAMES)
     of = {row.split()[0]: row.split() for row in rows}

@@ -533,8 +533,8 @@ def written_out(model, splats, query, off):
 
     def exchange():  # with the air, in the mean of the record
         if radiates and windy:
-            return (1 - share) * (1 + wind * climate.breeze_mean)
-        return 1 - share if radiates else 1 + wind * climate.breeze_mean
+            return (1 - share) * (1 + wind * climate.wind_anomaly_mean)
+        return 1 - share if radiates else 1 + wind * climate.wind_anomaly_mean
 
     def balance(values, beam, mean):
         take = {name: values[..., j] for name, j in climate.columns.items()}

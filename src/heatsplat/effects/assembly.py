@@ -237,7 +237,7 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
     Args:
         config: as composed.
         parts: of ``recipe``, or the configuration of an earlier run.
-        verdicts: as ``told`` puts them.
+        verdicts: as ``verdicts_as_dicts`` puts them.
     """
     thermal, sensor = deepcopy(parts["thermal"]), deepcopy(parts["sensor"])
     terms = parts["loss"].get("terms", parts["loss"])  # an earlier run has all of its loss
@@ -254,13 +254,13 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
     }
 
 
-def told(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def verdicts_as_dicts(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Verdicts as plain containers, with what the effects add where that was measured (``runs.prices``)."""
     return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
 
 
 def lines(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A table for the log of what ``told`` says: effect, verdict, statistic and threshold, price, reason."""
+    """A table for the log of what ``verdicts_as_dicts`` says: effect, verdict, statistic and threshold, price, reason."""
     rows = [("effect", "", "statistic", "ms/step", "numbers", "reason")]
     for name, verdict in verdicts.items():
         measured = verdict["statistic"] is not None
