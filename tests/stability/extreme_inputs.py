@@ -115,7 +115,7 @@ def train(scene: SceneData, plain: dict[str, Any], output_dir: Path):
         callbacks=[*build_callbacks(kept, output_dir), shown],
     )  # fmt: skip
     module = build(plain["module"], output_dir=str(output_dir))
-    module.recipe = plain
+    module.config = plain
     fit(module, Given(scene), trainer, test=False)
     return module, shown
 

@@ -61,4 +61,4 @@ def filled(config: dict[str, Any]) -> dict[str, Any]:
     verdicts = {
         name: Verdict(**{key: said[key] for key in names if key in said}) for name, said in config["verdicts"].items()
     }
-    return assembly.filled(config, assembly.recipe(verdicts, config["effects"]), config["verdicts"])
+    return assembly.filled(config, assembly.assemble(verdicts, config["effects"]), config["verdicts"])
