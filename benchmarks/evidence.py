@@ -52,7 +52,7 @@ Nothing else changes. The file says:
   selected), its `null` hypothesis and its `threshold`, with a comment where the number comes from;
 - its `term` in the joint fit, if tracks can show it: `Own` numbers of each point, `Shared` numbers of all points, or a `Path`
   that lets a share of the heat arrive (`effects/joint/terms.py`), with the rules that it has to meet beside its threshold;
-- its `part`: the slot of the recipe, the settings, and what is set when it is off while another effect needs the part;
+- its `part`: the slot of the configuration, the settings, and what is set when it is off while another effect needs the part;
 - what it `stands_on`, and which effects it `displaces`.
 
 `effects/physical/tone.py` is a short one to start from, `tests/effects/test_new_effect.py` adds one. The part itself is a class

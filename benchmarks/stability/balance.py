@@ -15,7 +15,7 @@ from heatsplat.physics.responses import step_weights
 
 COUNT = 200
 REFERENCE_K = 288.0
-STIFF = 60  # bodies that are marched
+STIFF = 60  # bodies that are integrated in steps
 AIR = (0.0, 20.0, -10.0, 5.0, 30.0, -20.0, 0.0, 10.0, -5.0)  # K above the reference at the samples
 START = 25.0
 
@@ -75,17 +75,17 @@ def _bodies() -> dict[str, Tensor]:
     return {"rate": log_uniform("stiffness", 1e-9, 1e4, STIFF), "step": log_uniform("step", 0.01, 3600.0, STIFF)}
 
 
-def _marched_ours(rate: Tensor, step: Tensor) -> Tensor:
+def _stepped_ours(rate: Tensor, step: Tensor) -> Tensor:
     found = []
     for r, seconds in zip(rate, step.tolist(), strict=True):
         times = seconds * torch.arange(len(AIR), dtype=torch.float64)
         climate = Climate(Drivers(times, REFERENCE_K, torch.tensor(AIR, dtype=torch.float64)))
         surface = Surface(torch.full_like(r[None], START), r[None].log(), torch.zeros_like(r[None]))
-        found.append(climate.marched_temperature(surface, float(times[-1]))[0])
+        found.append(climate.stepped_temperature(surface, float(times[-1]))[0])
     return torch.stack(found)
 
 
-def _marched_printed(rate: Tensor, step: Tensor) -> Tensor:
+def _stepped_printed(rate: Tensor, step: Tensor) -> Tensor:
     """Euler's explicit steps from sample to sample."""
     x = torch.full_like(rate, START)
     for air in AIR[:-1]:
@@ -93,7 +93,7 @@ def _marched_printed(rate: Tensor, step: Tensor) -> Tensor:
     return x
 
 
-def _marched_exact(rate, step):
+def _stepped_exact(rate, step):
     import mpmath
 
     y, x = rate * step, mpmath.mpf(START)
@@ -145,7 +145,7 @@ CASES = (
         "rate 1e-9 .. 1e4 1/s, steps of 0.01 s .. 1 h",
         "explicit Euler",
         "50 K",
-        _bodies, _marched_printed, _marched_ours, _marched_exact,
+        _bodies, _stepped_printed, _stepped_ours, _stepped_exact,
         constants=("step",), scale=lambda exact: 50, promise=20.0, types=("float32",),
     ),
 )  # fmt: skip

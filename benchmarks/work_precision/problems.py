@@ -37,7 +37,7 @@ Moment = Callable[[float], Tensor]
 
 @dataclass(frozen=True)
 class Form:
-    """A solution that needs no march: it answers any moment by itself.
+    """A solution that needs no time steps: it answers any moment by itself.
 
     Args:
         name, knob: which, and its setting for people ("" for none).
@@ -63,7 +63,7 @@ class Problem:
         kinks_s: moments within (0, last frame) at which drivers bend; solvers must step onto them.
         initial: [N] float64.
         equation: of a type; see ``Newton`` and ``Balance``.
-        forms: the solutions without a march in the types and for the table sizes asked for.
+        forms: the solutions without time steps in the types and for the table sizes asked for.
         reference: [S, F] float64 of the first S Gaussians; computed on the first call.
     """
 
@@ -211,7 +211,7 @@ def newton_problem(
 class Balance:
     """dx/dt = r [g G + (1 - p)(1 + v b)(air - x) + p (s - w(x))] as in heatsplat.physics.energy_balance, in one type.
 
-    Drivers are linear between samples. Of an interval, its start and its growth are kept: a march meets it many times.
+    Drivers are linear between samples. Of an interval, its start and its growth are kept: an integration meets it many times.
     """
 
     def __init__(self, surface: Surface, climate: Climate, dtype: torch.dtype) -> None:
@@ -221,7 +221,7 @@ class Balance:
         )
         self.reference_k, self.times = climate.drivers.reference_k, climate.drivers.times_s.tolist()
         rows = climate.rows.to(dtype)
-        self.air, self.breeze = climate.rows[0].tolist(), climate.rows[4].tolist()
+        self.air, self.wind_anomaly = climate.rows[0].tolist(), climate.rows[4].tolist()
         self.sky, self.around, self.light, self.beams = rows[1], rows[2], rows[3], rows[5:]
         self.seen = None if self.normals is None else climate.share_of_sky(self.normals)
         self.interval = -1
@@ -248,16 +248,16 @@ class Balance:
             start = self._forcing(k)
             self.interval, self.start, self.growth = k, start, self._forcing(k + 1) - start
         share = (t - self.times[k]) / (self.times[k + 1] - self.times[k])
-        air, breeze = (x[k] + share * (x[k + 1] - x[k]) for x in (self.air, self.breeze))
-        return self.start + share * self.growth, air, breeze
+        air, anomaly = (x[k] + share * (x[k + 1] - x[k]) for x in (self.air, self.wind_anomaly))
+        return self.start + share * self.growth, air, anomaly
 
-    def _exchange(self, breeze: float) -> Tensor | float:
-        return self.convecting if self.wind is None else self.convecting * (1 + breeze * self.wind)
+    def _exchange(self, anomaly: float) -> Tensor | float:
+        return self.convecting if self.wind is None else self.convecting * (1 + anomaly * self.wind)
 
     def slope(self, t: float, x: Tensor) -> Tensor:
         """dx/dt, [N]."""
-        heat, air, breeze = self._at(t)
-        heat = heat + self._exchange(breeze) * (air - x)
+        heat, air, anomaly = self._at(t)
+        heat = heat + self._exchange(anomaly) * (air - x)
         if not self.linear:
             heat = heat - self.share * power_excess(x, self.reference_k)
         return self.rate * heat
@@ -293,7 +293,7 @@ def weather(span_s: float, wind: bool, sky: bool) -> Drivers:
         around=power_excess(air, REFERENCE_K) if sky else None,
         light=0.12 * sun[:, 2].clamp(min=0.0),
         beams=(0.85 * clear * sun[:, 2].clamp(min=0.0) ** 0.3)[:, None] * sun,
-        breeze=0.4 * noise[2] + 0.3 * torch.sin(3 * day) if wind else None,
+        wind_anomaly=0.4 * noise[2] + 0.3 * torch.sin(3 * day) if wind else None,
         up=up,
     )
 
@@ -328,9 +328,9 @@ def weather_problem(gaussians: int, frames: int, name: str, title: str, span_s: 
     def cast(kind: str) -> Surface:
         return Surface(*(None if x is None else x.to(getattr(torch, kind)) for x in surface))
 
-    def marched(kind: str) -> Moment:
+    def stepped(kind: str) -> Moment:
         own, record = cast(kind), Climate(drivers)
-        return lambda t: record.marched_temperature(own, t)
+        return lambda t: record.stepped_temperature(own, t)
 
     def tabulated(kind: str, size: int) -> Moment:
         own, record = cast(kind), Climate(drivers)
@@ -345,7 +345,7 @@ def weather_problem(gaussians: int, frames: int, name: str, title: str, span_s: 
     def forms(types: tuple[str, ...], sizes: tuple[int, ...]) -> list[Form]:
         found = []
         for kind in types:
-            found.append(Form("balance, marched kernel", "", kind, partial(marched, kind), True))
+            found.append(Form("balance, time-stepped kernel", "", kind, partial(stepped, kind), True))
             if name != "thin":  # the tables end at time constants of one second
                 tables = (Form("rate table", f"{n} rates", kind, partial(tabulated, kind, n), True) for n in sizes)
                 found += tables
@@ -414,8 +414,8 @@ def stiff_truth(surface: Surface, climate: Climate, moments: tuple[float, ...], 
         first(surface.wind),
     )
     seen = 0.5 * (1 + surface.normals[:count].numpy() @ drivers.up.numpy())
-    sky, around, breeze = (
-        np.zeros_like(air) if x is None else x.numpy() for x in (drivers.sky, drivers.around, drivers.breeze)
+    sky, around, anomaly = (
+        np.zeros_like(air) if x is None else x.numpy() for x in (drivers.sky, drivers.around, drivers.wind_anomaly)
     )
     heat = (sun[:, None] * light + share[:, None] * (seen[:, None] * sky + (1 - seen[:, None]) * around)).T
     cubed = 4 * drivers.reference_k**3
@@ -425,7 +425,7 @@ def stiff_truth(surface: Surface, climate: Climate, moments: tuple[float, ...], 
         return (
             heat[k] + s * (heat[k + 1] - heat[k]),
             air[k] + s * (air[k + 1] - air[k]),
-            breeze[k] + s * (breeze[k + 1] - breeze[k]),
+            anomaly[k] + s * (anomaly[k + 1] - anomaly[k]),
         )
 
     def slope(x, t, k):

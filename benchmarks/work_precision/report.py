@@ -19,13 +19,13 @@ from heatsplat.physics.responses import RATES
 
 LEVELS_K = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-6)
 BLOWN_K = 300.0  # and more is drawn at the upper edge
-LEAST_K = 1e-10  # and less at the lower edge
+MIN_K = 1e-10  # and less at the lower edge
 CAMERA_K = 0.03  # noise of a good thermal camera
 EQUAL = 2.0  # errors within this factor are of one accuracy
 STYLES = {  # colour, mark
     "closed form, fused kernel": ("#d1231c", "*"),
     "closed form, torch": ("#ef8a17", "*"),
-    "balance, marched kernel": ("#d1231c", "*"),
+    "balance, time-stepped kernel": ("#d1231c", "*"),
     "rate table": ("#b8479c", "P"),
     "printed formula": ("#000000", "X"),
     "explicit Euler": ("#9aa0a6", "o"),
@@ -48,19 +48,19 @@ def rules(settings: Mapping[str, Any], load: float, seconds: float) -> list[str]
     """
     return [
         "One process, one thread, {gaussians} Gaussians, {frames} frames, K = {frequencies} frequencies. "
-        "No gradients are asked for; the marched kernel computes its own all the same.".format(**settings),
+        "No gradients are asked for; the time-stepped kernel computes its own all the same.".format(**settings),
         "Time is that of the processor, the minimum of {rounds} rounds in which all solvers take turns; what takes over "
-        "{once_above_s:g} s runs once. A march over {limit_s:g} s ({adaptive_limit_s:g} s if it chooses its steps) is given up "
-        "and listed. An adaptive solver's time holds its controller and refused steps.".format(**settings),
-        "*In order*: the solver passes through all frames once; a march could not have it better. *Alone*: each frame is "
-        "asked for by itself, as in training, so that a march starts anew; not measured but counted from the first, by "
+        "{once_above_s:g} s runs once. An integration over {limit_s:g} s ({adaptive_limit_s:g} s if it chooses its steps) is "
+        "given up and listed. An adaptive solver's time holds its controller and refused steps.".format(**settings),
+        "*In order*: the solver passes through all frames once; an integration could not have it better. *Alone*: each frame is "
+        "asked for by itself, as in training, so that an integration starts anew; not measured but counted from the first, by "
         "the share of the record before each frame. What answers any moment by itself costs the same in both.",
         "Errors are in kelvin, the worst and the root mean square over all frames of {sample} Gaussians, those with "
         "the fastest and the slowest rate among them. The truth has 50 digits (mpmath) where there is a formula; with T⁴ "
         "it is scipy's LSODA at 1e-12, restarted at each sample of the weather. Inputs are values of float32.".format(
             **settings
         ),
-        "Marches step onto every frame and every sample of the weather (but Radau, whose frames are interpolated), take "
+        "Integrations step onto every frame and every sample of the weather (but Radau, whose frames are interpolated), take "
         "one product of matrix and vector for all harmonics, share the source between stages of one moment, and keep "
         "exponentials while steps and rates stay equal. All are in torch. torchdiffeq's implicit Adams iterates without a "
         "Jacobian; scipy's Radau has the exact, diagonal one, and float64 only.",
@@ -123,13 +123,13 @@ HEAD = [
 LEGEND = [
     "Left is quick, down is exact. Stars and marks with a black rim are ours. Full marks are float32, hollow ones float64. The "
     f"grey line is the front: nothing lies left of and below it. Dotted: the noise of a good camera, {CAMERA_K:g} K. Faint marks "
-    f"on the upper edge blew up; marks on the lower edge err by less than {LEAST_K:g} K.",
+    f"on the upper edge blew up; marks on the lower edge err by less than {MIN_K:g} K.",
 ]
 
 
 def drawn(row: Any) -> float:
     """The worst error, kept within the axes."""
-    return min(max(row.worst_k, LEAST_K), BLOWN_K)
+    return min(max(row.worst_k, MIN_K), BLOWN_K)
 
 
 def front(rows: Sequence[Any], order: str) -> list[Any]:
@@ -192,7 +192,7 @@ def picture(rows: Sequence[Any], titles: dict[str, str], order: str, title: str)
                 0.015, 0.02, "\n".join(missing), transform=axes.transAxes, fontsize=8, color="#555555", va="bottom"
             )
         axes.set_title(text, fontsize=11)
-        axes.set(xscale="log", yscale="log", ylim=(LEAST_K, BLOWN_K), xlim=(min(times) / 1.8, max(times) * 1.8))
+        axes.set(xscale="log", yscale="log", ylim=(MIN_K, BLOWN_K), xlim=(min(times) / 1.8, max(times) * 1.8))
         axes.yaxis.set_major_locator(LogLocator(numticks=14))
         axes.yaxis.set_minor_locator(LogLocator(numticks=1))
         axes.grid(alpha=0.25, linewidth=0.6)
@@ -204,7 +204,7 @@ def picture(rows: Sequence[Any], titles: dict[str, str], order: str, title: str)
     for axes in list(axes_of.flat)[max(0, len(titles) - columns) : len(titles)]:
         axes.set_xlabel("µs per Gaussian and frame, one thread")
     figure.suptitle(f"What accuracy costs. {title}", fontsize=13, fontweight="bold")
-    shown = [s for s in STYLES if any(r.solver == s for r in rows) and s != "balance, marched kernel"]
+    shown = [s for s in STYLES if any(r.solver == s for r in rows) and s != "balance, time-stepped kernel"]
     handles = []
     for solver in shown:
         color, mark = STYLES[solver]

@@ -1,4 +1,4 @@
-"""Ways to march a problem from frame to frame: fixed steps, torchdiffeq's, and scipy's Radau.
+"""Ways to integrate a problem from frame to frame: fixed steps, torchdiffeq's, and scipy's Radau.
 
 All take the same equation and step onto every frame and every kink of the drivers.
 """
@@ -16,7 +16,7 @@ from benchmarks.work_precision.problems import Problem
 
 
 class OverLimit(Exception):
-    """A march took longer than it may."""
+    """An integration took longer than it may."""
 
 
 class Missing(Exception):
@@ -24,7 +24,7 @@ class Missing(Exception):
 
 
 class _Clocked:
-    """An equation that stops a march which is over its limit."""
+    """An equation that stops an integration that is over its limit."""
 
     def __init__(self, equation, limit_s: float) -> None:
         self.equation, self.end = equation, time.process_time() + limit_s
@@ -93,8 +93,8 @@ class _Weights:
         return found
 
 
-def march(problem: Problem, name: str, knob: float, dtype: torch.dtype, limit_s: float) -> Callable[[], Tensor]:
-    """A function that marches once and returns temperatures [F, N].
+def integrate(problem: Problem, name: str, knob: float, dtype: torch.dtype, limit_s: float) -> Callable[[], Tensor]:
+    """A function that integrates once and returns temperatures [F, N].
 
     Args:
         knob: seconds of a step, or the tolerance (relative to 1 K) of an adaptive solver.

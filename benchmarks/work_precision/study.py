@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks.work_precision import report
 from benchmarks.work_precision.problems import Problem, problems
-from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, march
+from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, integrate
 from heatsplat.io.tables import write_csv
 from heatsplat.kernels.scheduling import thread_count, use_threads
 
@@ -113,9 +113,9 @@ def measurements(
         rates: sizes of the tables over log rate.
         rounds: interleaved rounds; the minimum counts.
         once_above_s: what takes longer runs only once.
-        limit_s, adaptive_limit_s: a march is given up after so many seconds of the processor.
+        limit_s, adaptive_limit_s: an integration is given up after so many seconds of the processor.
         only: names of problems; None for all.
-        solvers: names of marching solvers; None for all.
+        solvers: names of time-stepping solvers; None for all.
 
     Raises:
         ValueError: a name is unknown.
@@ -141,7 +141,7 @@ def measurements(
                     adaptive = solver in ADAPTIVE
                     knobs, limit = (tolerances, adaptive_limit_s) if adaptive else (steps[name], limit_s)
                     of_type = [kind for kind in types if solver != RADAU or kind == "float64"]  # scipy has no other
-                    for found in _marches(problem, solver, of_type, knobs, limit):
+                    for found in _integrations(problem, solver, of_type, knobs, limit):
                         (given_up if isinstance(found, Row) else timed).append(found)
                 _finish(problem, timed, truth, rounds, once_above_s)
                 rows += [one.row for one in timed] + given_up
@@ -153,7 +153,7 @@ def measurements(
 
 
 def _forms(problem: Problem, types: tuple[str, ...], rates: tuple[int, ...]) -> list[_Timed]:
-    """The solutions without a march; one moment of each is computed untimed, which compiles kernels."""
+    """The solutions without time steps; one moment of each is computed untimed, which compiles kernels."""
     timed = []
     for form in problem.forms(types, rates):
         form.build()(problem.moments_s[0])
@@ -164,10 +164,10 @@ def _forms(problem: Problem, types: tuple[str, ...], rates: tuple[int, ...]) -> 
     return timed
 
 
-def _marches(
+def _integrations(
     problem: Problem, solver: str, types: Sequence[str], knobs: Sequence[float], limit_s: float
 ) -> Iterator[_Timed | Row]:
-    """The marches of a solver from the coarsest setting on, until one is given up; that one as a row alone."""
+    """The integrations by a solver from the coarsest setting on, until one is given up; that one as a row alone."""
     adaptive, hopeless = solver in ADAPTIVE, False
     for kind in types:
         expected = 0.0
@@ -176,7 +176,7 @@ def _marches(
             try:
                 if hopeless or expected > limit_s:
                     raise OverLimit
-                found = _timed(row, march(problem, solver, knob, getattr(torch, kind), limit_s))
+                found = _timed(row, integrate(problem, solver, knob, getattr(torch, kind), limit_s))
             except OverLimit:
                 row.given_up = f"over {limit_s:g} s"
             except AssertionError:  # torchdiffeq says so
@@ -213,8 +213,8 @@ def _finish(problem: Problem, timed: list[_Timed], truth: np.ndarray, rounds: in
     for one in timed:
         error = one.values[:, : len(truth)].double().numpy().T - truth
         one.row.us = 1e6 * one.seconds / (count * len(moments))
-        marched = one.row.solver in NAMES  # up to each frame anew
-        one.row.us_alone = one.row.us * (sum(moments) / moments[-1] if marched else 1.0)
+        stepped = one.row.solver in NAMES  # up to each frame anew
+        one.row.us_alone = one.row.us * (sum(moments) / moments[-1] if stepped else 1.0)
         finite = np.isfinite(error).all()
         one.row.worst_k = float(np.abs(error).max()) if finite else math.inf
         one.row.rms_k = float(np.sqrt(np.mean(error**2))) if finite else math.inf

@@ -151,9 +151,9 @@ def solve(
         RuntimeError: no convergence at the finest level.
     """
     scale = np.array([excess_k, flux_w_m2])
-    coarse, previous = march(materials, waveform, duration_s, cells=8, steps=8), None
+    coarse, previous = integrate(materials, waveform, duration_s, cells=8, steps=8), None
     for level in range(1, _LEVELS + 1):
-        fine = march(materials, waveform, duration_s, cells=8 * 2**level, steps=8 * 2**level)
+        fine = integrate(materials, waveform, duration_s, cells=8 * 2**level, steps=8 * 2**level)
         extrapolated = Responses(
             coarse.times_s,
             (4.0 * fine.surface[::2] - coarse.surface) / 3.0,
@@ -168,7 +168,9 @@ def solve(
     raise RuntimeError(f"conduction did not converge: still changing by {error:.2g} K, tolerance {tolerance:.2g} K")
 
 
-def march(materials: Sequence[Material], waveform: Waveform, duration_s: float, cells: int, steps: int) -> Responses:
+def integrate(
+    materials: Sequence[Material], waveform: Waveform, duration_s: float, cells: int, steps: int
+) -> Responses:
     """Responses on one grid: ``cells`` volumes in depth, ``steps`` steps in the first piece between two knots of the
     waveform and half as many in the later ones.
 

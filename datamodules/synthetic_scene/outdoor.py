@@ -19,7 +19,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     History,
     OutdoorMaterial,
     Slab,
-    march,
+    integrate,
     solve,
 )
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
@@ -129,7 +129,7 @@ class Sky:
         warm_c, swing_k: mean and half the range of the day's air temperature.
         dew_point_c: moisture of the air.
         cloud: added to the share of the sky that clouds take; -1 clears it, 1 closes it.
-        wind_factor, wind_added: what becomes of the breeze, in m/s.
+        wind_factor, wind_added: what becomes of the wind, in m/s.
     """
 
     warm_c: float = 18.0
@@ -229,8 +229,10 @@ def _series(sky: Sky, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     air = sky.warm_c + sky.swing_k * (day + second_harmonic) + 1.2 * drift("air", (31.0, 9.0, 3.7)) + times_s / DAY_S
     dew_point = sky.dew_point_c + 1.5 * drift("moisture", (40.0, 11.0))
     humidity = np.clip(100.0 * _vapour_hpa(dew_point) / _vapour_hpa(air), 5.0, 100.0)
-    breeze = 2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
-    wind = np.clip(breeze, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
+    wind_m_s = (
+        2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
+    )
+    wind = np.clip(wind_m_s, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
     cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
     return air, wind, humidity, 1.0 - 0.75 * cover**3.4
 
@@ -407,7 +409,7 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
             normals.append(normal)
     before = forcing_of(outdoor_weather("fair", -_BEFORE_S, 0.0), np.array(normals))
     # How the surfaces got to their state at midnight need not be converged: it defines the start.
-    midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
+    midnight = integrate(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
     return solve(slabs, forcing_of(outdoor_weather(weather), np.array(normals)), midnight)
 
 

@@ -138,9 +138,9 @@ def solve(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, 
     Raises:
         RuntimeError: no convergence at the finest level.
     """
-    coarse = march(slabs, forcing, start_k, cells=16, steps=4)
+    coarse = integrate(slabs, forcing, start_k, cells=16, steps=4)
     for level in range(1, _LEVELS + 1):
-        fine = march(slabs, forcing, start_k, cells=16 * 2**level, steps=4 * 2**level)
+        fine = integrate(slabs, forcing, start_k, cells=16 * 2**level, steps=4 * 2**level)
         surface = (4.0 * fine.surface_k[::2] - coarse.surface_k) / 3.0
         error = float(np.abs(fine.surface_k[::2] - surface).max())
         if error <= tolerance_k:
@@ -149,7 +149,7 @@ def solve(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, 
     raise RuntimeError(f"outdoor heat did not converge: still changing by {error:.2g} K, tolerance {tolerance_k:.2g} K")
 
 
-def march(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, cells: int, steps: int) -> History:
+def integrate(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, cells: int, steps: int) -> History:
     """The history on one grid: ``cells`` intervals in depth, ``steps`` steps (a multiple of four) between two samples.
 
     All slabs are advanced at once: their tridiagonal systems laid end to end form one tridiagonal system.

@@ -1,4 +1,4 @@
-"""The nouns that every room of heatsplat shares: cameras, views, scenes, ranges and what a renderer returns.
+"""The nouns that every package of heatsplat shares: cameras, views, scenes, ranges and what a renderer returns.
 
 Conventions, once for all of them (docs/conventions.md has the page):
 

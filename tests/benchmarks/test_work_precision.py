@@ -42,7 +42,7 @@ def test_ours_follows_the_weather_with_and_without_fourth_powers():
     rows = measured(only=list(steps), solvers=["ETD2"], steps=steps, types=["float32"], gaussians=16)
     bounds = {"thin": 1e-3, "weather_linear": 1e-4, "weather_full": 2e-2}
     for problem, bound in bounds.items():
-        assert worst(rows, problem, "balance, marched kernel", "float32")[0] < bound
+        assert worst(rows, problem, "balance, time-stepped kernel", "float32")[0] < bound
     assert worst(rows, "weather_linear", "rate table", "float32")[0] < 1e-3
     assert worst(rows, "weather_full", "rate table", "float32")[0] > 1e-2  # it is linear, the problem is not
     coarse, fine = worst(rows, "weather_full", "ETD2", "float32")

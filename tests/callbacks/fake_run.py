@@ -82,7 +82,7 @@ class Emitter(torch.nn.Module):
 class FakeModule(pl.LightningModule):
     """Learns the wall's value; keeps every promise that callbacks rely on."""
 
-    def __init__(self, scene, output_dir, recipe=None, poison=None):
+    def __init__(self, scene, output_dir, config=None, poison=None):
         super().__init__()
         generator = generator_for(0, 0, "splats")
         tensors = {
@@ -91,7 +91,7 @@ class FakeModule(pl.LightningModule):
             "quats": torch.ones(300, 4),
         }
         self.splats = Splats(tensors | {"opacity_logits": torch.zeros(300, 1)})
-        self.scene, self.output_dir, self.recipe = scene, Path(output_dir), recipe or {}
+        self.scene, self.output_dir, self.config = scene, Path(output_dir), config or {}
         self.thermal, self.sensor = Emitter(), SensorChain()
         self.modality = "thermal" if scene.train[0].thermal is not None else "rgb"
         self.channels = scene.train[0].image(self.modality).shape[-1]

@@ -29,7 +29,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     Forcing,
     OutdoorMaterial,
     Slab,
-    march,
+    integrate,
     solve,
 )
 from scipy.integrate import solve_ivp
@@ -104,7 +104,7 @@ def test_without_long_waves_it_is_the_linear_conduction_of_the_other_solver():
 def test_its_grids_converge_far_below_the_noise_of_the_camera():
     slabs = [Slab(surface.material, surface.absorbs.level, 0) for surface in YARD]
     coarse = solve(slabs, day(UP), 288.0)
-    fine = march(slabs, day(UP), 288.0, cells=64, steps=24)
+    fine = integrate(slabs, day(UP), 288.0, cells=64, steps=24)
     assert coarse.error_k < 0.05
     moments = np.linspace(3600.0, DAY_S, 200)
     assert np.abs(coarse.at(moments) - fine.at(moments)).max() < 0.01
@@ -114,7 +114,7 @@ def test_heat_is_conserved():
     """What a slab holds is what it held plus what passed its surface; the integral is done here, not in the solver."""
     slabs = [Slab(surface.material, 0.6, 0) for surface in YARD]
     forcing = day(SOUTH_WALL)
-    history = march(slabs, forcing, 288.0, cells=40, steps=12)
+    history = integrate(slabs, forcing, 288.0, cells=40, steps=12)
     t, surface = history.times_s, history.surface_k
     wind, air = np.interp(t, forcing.times_s, forcing.wind_m_s), np.interp(t, forcing.times_s, forcing.air_k)
     sunlight, waves = (np.interp(t, forcing.times_s, s[:, 0]) for s in (forcing.sunlight_w_m2, forcing.long_waves_w_m2))
@@ -135,7 +135,7 @@ def test_shades_between_the_solved_ones_are_interpolated_to_a_hundredth_of_the_n
     assert meadow.absorptivity.max() - meadow.absorptivity.min() > 0.05
     slabs = [Slab(YARD[0].material, float(a), 0) for a in meadow.absorptivity]
     before = forcing_of(outdoor_weather("fair", -0.5 * DAY_S, 0.0), np.array([UP]))
-    midnight = march(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
+    midnight = integrate(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
     direct = solve(slabs, forcing_of(outdoor_weather("fair"), np.array([UP])), midnight)
     moments = torch.linspace(0.0, 2 * DAY_S, 97, dtype=torch.float64)
     found = scene.celsius(meadow, moments).numpy().T

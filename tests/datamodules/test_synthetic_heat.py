@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from heatsplat.datamodules.synthetic_scene import presets
-from heatsplat.datamodules.synthetic_scene.heat import CONSTANT, Material, Waveform, march, periodic, solve
+from heatsplat.datamodules.synthetic_scene.heat import CONSTANT, Material, Waveform, integrate, periodic, solve
 from scipy.special import erfcx
 
 DURATION_S = 1800.0
@@ -119,7 +119,7 @@ def _between(responses) -> tuple[np.ndarray, np.ndarray]:
 def test_convergence_is_of_second_order():
     times = np.linspace(30.0, DURATION_S, 50)
     truth = np.stack([np.stack([cooled(m, times), heated(m, LAMP, times)], axis=1) for m in MATERIALS], axis=1)
-    errors = [np.abs(march(MATERIALS, LAMP, DURATION_S, n, n).at(times) - truth).max(axis=0) for n in (32, 64, 128)]
+    errors = [np.abs(integrate(MATERIALS, LAMP, DURATION_S, n, n).at(times) - truth).max(axis=0) for n in (32, 64, 128)]
     orders = np.log2(np.stack(errors[:-1]) / np.stack(errors[1:]))
     assert orders.min() > 1.8
     assert np.median(orders) < 2.4  # not by accident of an error that is rounding already
@@ -151,7 +151,7 @@ def test_periodic_source_has_its_width_at_half_height():
 def test_bad_input_is_named():
     with pytest.raises(ValueError, match="depth_m > 0, got 0"):
         Material(1.0, 1e6, 0.0, 10.0)
-    responses = march([presets.WOOD], CONSTANT, 100.0, 8, 8)
+    responses = integrate([presets.WOOD], CONSTANT, 100.0, 8, 8)
     with pytest.raises(ValueError, match="solved for 0 .. 100 s of this scene; asked for -1 .. 5 s"):
         responses.at(np.array([-1.0, 5.0]))
     with pytest.raises(RuntimeError, match="did not converge"):

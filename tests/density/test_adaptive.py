@@ -1,4 +1,4 @@
-"""The standard recipe: who grows, who goes, when, and never beyond the cap."""
+"""The standard strategy: who grows, who goes, when, and never beyond the cap."""
 
 import pytest
 import torch

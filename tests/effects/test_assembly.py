@@ -39,12 +39,12 @@ def verdicts(*on, **settings):
     }
 
 
-def recipe(*on, **settings):
-    return assembly.recipe(verdicts(*on, **settings), config("method=auto")["effects"])
+def assembled(*on, **settings):
+    return assembly.assemble(verdicts(*on, **settings), config("method=auto")["effects"])
 
 
 def test_nothing_on_is_3dgs_seen_by_a_perfect_camera():
-    found = recipe()
+    found = assembled()
     assert found["thermal"]["state"] == config("method=3dgs")["thermal"] and found["loss"] == {}
     assert found["thermal"]["parts"] == {} and found["thermal"]["companion"] is None and found["sensor"]["parts"] == {}
 
@@ -59,52 +59,52 @@ def test_nothing_on_is_3dgs_seen_by_a_perfect_camera():
     ],
 )
 def test_each_selection_has_its_state(on, state, expected):
-    found = recipe(*on)["thermal"]["state"]
+    found = assembled(*on)["thermal"]["state"]
     assert found["_target_"].endswith(f".{state}") and {key: found.get(key) for key in expected} == expected
 
 
 def test_a_state_is_open_ended_where_parts_follow_and_only_there():
-    assert recipe("relaxation")["thermal"]["state"]["clip"] == "straight_through"
-    assert recipe("relaxation", "reflection")["thermal"]["state"]["clip"] == "none"
-    assert recipe("attenuation")["thermal"]["state"]["floor"] is False
+    assert assembled("relaxation")["thermal"]["state"]["clip"] == "straight_through"
+    assert assembled("relaxation", "reflection")["thermal"]["state"]["clip"] == "none"
+    assert assembled("attenuation")["thermal"]["state"]["floor"] is False
 
 
 def test_conduction_wraps_the_state():
-    found = recipe("relaxation", "conduction")["thermal"]["state"]
+    found = assembled("relaxation", "conduction")["thermal"]["state"]
     assert found["_target_"].endswith(".Conducting")
-    assert found["state"] == recipe("relaxation")["thermal"]["state"]
+    assert found["state"] == assembled("relaxation")["thermal"]["state"]
 
 
 @pytest.mark.parametrize("name", ON_THE_WAY)
-def test_a_part_stands_in_the_recipe_exactly_when_its_effect_is_on(name):
-    everything = recipe(*assembly.NAMES)["thermal"]["parts"]
+def test_a_part_stands_in_the_configuration_exactly_when_its_effect_is_on(name):
+    everything = assembled(*assembly.NAMES)["thermal"]["parts"]
     assert list(everything) == ["view_dependence", "reflection", "attenuation"]
-    assert list(recipe(name)["thermal"]["parts"]) == [name]
+    assert list(assembled(name)["thermal"]["parts"]) == [name]
 
 
 def test_light_meets_the_camera_in_order_and_pattern_and_falloff_are_two_effects_of_one_part():
-    assert list(recipe(*assembly.NAMES)["sensor"]["parts"]) == [
+    assert list(assembled(*assembly.NAMES)["sensor"]["parts"]) == [
         "point_spread",
         "calibration",
         "frame_offset",
         "agc",
         "tone",
     ]
-    pattern, falloff = (recipe(name)["sensor"]["parts"]["calibration"] for name in ("fixed_pattern", "vignetting"))
+    pattern, falloff = (assembled(name)["sensor"]["parts"]["calibration"] for name in ("fixed_pattern", "vignetting"))
     assert pattern["vignetting_max"] == 0 < pattern["gain_max"] and pattern["bias_max"] > 0
     assert falloff["vignetting_max"] > 0 == falloff["gain_max"] == falloff["bias_max"]
 
 
 def test_thermal_opacity_brings_the_colour_image_and_its_loss():
-    found = recipe("thermal_opacity")
+    found = assembled("thermal_opacity")
     assert found["thermal"]["companion"]["modality"] == "rgb" and set(found["loss"]) == {"rgb"}
 
 
 def test_what_evidence_found_is_where_parts_start():
-    found = recipe("relaxation", "harmonic_source", harmonic_source={"frequencies": 7})
+    found = assembled("relaxation", "harmonic_source", harmonic_source={"frequencies": 7})
     assert found["thermal"]["state"]["frequencies"] == 7
     with pytest.raises(SceneError, match="the evidence on attenuation sets 'colour'"):
-        recipe("attenuation", attenuation={"colour": 1})
+        assembled("attenuation", attenuation={"colour": 1})
 
 
 def test_what_is_set_by_hand_wins_over_the_evidence():
@@ -118,7 +118,7 @@ def test_what_is_set_by_hand_wins_over_the_evidence():
         attenuation={"depth": 0.3, "moments": 0},
         harmonic_source={"frequencies": 7},
     )
-    thermal = assembly.recipe(on, by_hand["effects"])["thermal"]
+    thermal = assembly.assemble(on, by_hand["effects"])["thermal"]
     assert thermal["parts"]["attenuation"]["moments"] == 8 and thermal["parts"]["attenuation"]["depth"] == 0.3
     assert thermal["state"]["frequencies"] == 5
 
@@ -140,21 +140,21 @@ def test_a_papers_effects_are_a_selection(paper):
 def test_the_selection_of_etgs_is_etgs():
     chosen = config("method=auto", "effects=etgs")
     on = verdicts(*assembly.explicit(chosen["effects"]), harmonic_source={"frequencies": 6})
-    found = assembly.recipe(on, chosen["effects"])
+    found = assembly.assemble(on, chosen["effects"])
     assert found["thermal"]["state"] == config("method=etgs")["thermal"]
     assert found["thermal"]["parts"] == found["sensor"]["parts"] == found["loss"] == {}
 
 
 def test_the_selection_of_supirgs_has_its_camera():
     chosen = config("method=auto", "effects=supirgs")
-    found = assembly.recipe(verdicts(*assembly.explicit(chosen["effects"])), chosen["effects"])
+    found = assembly.assemble(verdicts(*assembly.explicit(chosen["effects"])), chosen["effects"])
     own = config("method=supirgs")["sensor"]["parts"]
     assert found["sensor"]["parts"] == {name: part for name, part in own.items() if part is not None}
 
 
 def test_every_selection_of_one_effect_can_be_built():
     for name in assembly.NAMES:
-        found = recipe(*{name, EFFECTS[name].stands_on or name})
+        found = assembled(*{name, EFFECTS[name].stands_on or name})
         thermal, sensor = build(found["thermal"]), build(found["sensor"])
         assert thermal.modality == "thermal" and len(sensor.parts) == (name in SENSOR)
         simulated = set(sensor.effects())
@@ -162,7 +162,7 @@ def test_every_selection_of_one_effect_can_be_built():
 
 
 def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
-    thermal = build(recipe(*set(assembly.NAMES) - {"solar", "radiation", "convection"})["thermal"])
+    thermal = build(assembled(*set(assembly.NAMES) - {"solar", "radiation", "convection"})["thermal"])
     assert set(thermal.effects()) <= set(assembly.NAMES)
     assert {"relaxation", "conduction", *ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
 
@@ -217,7 +217,7 @@ def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
 
 
 def test_the_log_tells_verdict_statistic_price_and_reason():
-    told = assembly.told(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
+    told = assembly.verdicts_as_dicts(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
     head, *rows = assembly.lines(told)
     assert head.split() == ["effect", "statistic", "ms/step", "numbers", "reason"] and len(rows) == len(assembly.NAMES)
     of = {row.split()[0]: row.split() for row in rows}

@@ -65,7 +65,7 @@ def test_a_file_adds_an_effect(tilt):
     found = assembly.reconciled(verdicts)
     assert not found["agc"].on and found["agc"].reason == "a tilt excludes gains"
     templates = PARTS | {"states": {"static": {}}, "parts": {}, "clip": "none"}
-    assert assembly.recipe(found, templates)["sensor"]["parts"] == {
+    assert assembly.assemble(found, templates)["sensor"]["parts"] == {
         "tilt": {"_target_": "Tilt", "start": 0.5, "lr": 0.1}
     }
 

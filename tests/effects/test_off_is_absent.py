@@ -1,6 +1,6 @@
 """Off is absent, for every effect: no parameter, no buffer, no operator, and the very image of a model that never had it.
 
-Each effect is switched off on a ground of others through ``assembly.recipe``. Beside it stands a model of the plain classes,
+Each effect is switched off on a ground of others through ``assembly.assemble``. Beside it stands a model of the plain classes,
 put together here by hand. What both hold, what torch records of a forward and backward pass from heat to recorded image,
 the image and all gradients must be the same. With the effect on, the same comparison must fail.
 """
@@ -85,7 +85,7 @@ def drawn(name, shape):
 
 
 class Built:
-    """What a recipe of assembly builds."""
+    """What assembly builds."""
 
     def __init__(self, found):
         self.thermal, self.sensor = build(found["thermal"]), build(found["sensor"])
@@ -342,14 +342,14 @@ def templates():
     return OmegaConf.to_container(plain, resolve=True)["effects"]
 
 
-def recipe(*on):
+def assembled(*on):
     verdicts = {name: Verdict(name, name in on, None, None, "as the test says") for name in assembly.NAMES}
-    return assembly.recipe(verdicts, templates())
+    return assembly.assemble(verdicts, templates())
 
 
 @cache
 def switched_off(name):
-    return Run(Built(recipe(*CASES[name].others)))
+    return Run(Built(assembled(*CASES[name].others)))
 
 
 @cache
@@ -359,7 +359,7 @@ def by_hand(name):
 
 @cache
 def switched_on(name):
-    return Run(Built(recipe(*CASES[name].others, name)))
+    return Run(Built(assembled(*CASES[name].others, name)))
 
 
 def traced(run, trace):
@@ -417,8 +417,8 @@ def test_with_it_on_all_of_that_differs(name):
     assert on.operators - off.operators
     shown, without = on.shown, off.shown
     if name == "thermal_opacity":  # the visible image beside the thermal one, each with opacities of its own
-        assert shown.shape[2] == without.shape[2] + 3 and recipe(*CASES[name].others)["loss"] == {}
-        assert len(on.model.opacities) == 2 and set(recipe(name)["loss"]) == {"rgb"}
+        assert shown.shape[2] == without.shape[2] + 3 and assembled(*CASES[name].others)["loss"] == {}
+        assert len(on.model.opacities) == 2 and set(assembled(name)["loss"]) == {"rgb"}
     else:
         assert (shown - without).abs().max() > 1e-3
 
@@ -533,8 +533,8 @@ def written_out(model, splats, query, off):
 
     def exchange():  # with the air, in the mean of the record
         if radiates and windy:
-            return (1 - share) * (1 + wind * climate.breeze_mean)
-        return 1 - share if radiates else 1 + wind * climate.breeze_mean
+            return (1 - share) * (1 + wind * climate.wind_anomaly_mean)
+        return 1 - share if radiates else 1 + wind * climate.wind_anomaly_mean
 
     def balance(values, beam, mean):
         take = {name: values[..., j] for name, j in climate.columns.items()}

@@ -58,10 +58,10 @@ def configured(*overrides):
     return composition.compose([*TINY, "method=3dgs", "max_steps=8", *overrides])
 
 
-def stored(folder, name, step, recipe):
+def stored(folder, name, step, config):
     (folder / "checkpoints").mkdir(exist_ok=True)
     path = folder / "checkpoints" / name
-    torch.save({"global_step": step, "heatsplat": {"recipe": recipe, "schedule": {"end": 8.0}}}, path)
+    torch.save({"global_step": step, "heatsplat": {"config": config, "schedule": {"end": 8.0}}}, path)
     os.utime(path, (step, step))
 
 

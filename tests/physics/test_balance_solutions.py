@@ -49,7 +49,7 @@ def test_corrected_physics_is_exact_to_20_millikelvin_from_sheet_metal_to_wet_gr
     surface = bodies(wind=True)
     truth = solved(climate.drivers, surface, MOMENTS)
     assert truth.max() - truth.min() > 40  # the weather does heat
-    assert (course(climate.marched_temperature, surface) - truth).abs().max() < 0.02
+    assert (course(climate.stepped_temperature, surface) - truth).abs().max() < 0.02
     linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
     assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
     assert linear[3] < 1.0
@@ -59,11 +59,11 @@ def test_both_agree_where_nothing_is_nonlinear():
     climate = Climate(replace(drivers(wind=False), sky=None, around=None))
     surface = bodies(wind=False)._replace(share=None)
     torch.testing.assert_close(
-        course(climate.marched_temperature, surface), course(climate.linear_temperature, surface), atol=3e-3, rtol=0
+        course(climate.stepped_temperature, surface), course(climate.linear_temperature, surface), atol=3e-3, rtol=0
     )
 
 
-@pytest.mark.parametrize("solution", ["linear_temperature", "marched_temperature"])
+@pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
     leaves = [x.clone().requires_grad_() for x in surface]
@@ -93,7 +93,7 @@ OFF = {  # what a balance is without, and the same said by numbers to the balanc
 
 
 @pytest.mark.parametrize("name", OFF)
-def test_the_march_without_an_effect_is_that_with_its_parameter_at_zero_and_has_no_column_of_it(name, monkeypatch):
+def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_has_no_column_of_it(name, monkeypatch):
     gone, zeroed = OFF[name]
     if name == "normals":  # the beam, which a surface without a normal does not see, is then in the light
         climate = Climate(replace(drivers(), beams=None))
@@ -108,7 +108,7 @@ def test_the_march_without_an_effect_is_that_with_its_parameter_at_zero_and_has_
     found = []
     for surface in (whole._replace(**gone), whole._replace(**zeros)):
         leaves = [None if x is None else x.clone().requires_grad_() for x in surface]
-        x = climate.marched_temperature(Surface(*leaves), 40_000.0)
+        x = climate.stepped_temperature(Surface(*leaves), 40_000.0)
         x.sum().backward()
         found.append((x.detach(), leaves))
     assert columns == [8 - sum(3 if key == "normals" else 1 for key in gone), 8]
@@ -132,7 +132,7 @@ def test_only_ratios_are_parameters_and_a_night_separates_convection_from_radiat
     level = tensor(0, 0, 1).expand(2, 3)
     surface = Surface(tensor(0, 0), -tensor(60, 60).log(), tensor(50, 50), tensor(0.2, 0.7), None, level)
     still = Climate(drivers(wind=False))
-    x = still.marched_temperature(surface, 4 * 3600.0)
+    x = still.stepped_temperature(surface, 4 * 3600.0)
     air, sky = still.drivers.air[24], still.drivers.sky[24]
     rest = (1 - surface.share) * (air - x) + surface.share * (sky - power_excess(x, still.drivers.reference_k))
     assert rest.abs().max() < 0.2
@@ -167,7 +167,7 @@ def test_extreme_bodies_stay_finite_in_float32():
         sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
         wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
     )
-    for solution in (climate.linear_temperature, climate.marched_temperature):
+    for solution in (climate.linear_temperature, climate.stepped_temperature):
         leaves = [x.clone().requires_grad_() for x in surface]
         x = solution(Surface(*leaves), 130_000.0)
         assert x.isfinite().all()

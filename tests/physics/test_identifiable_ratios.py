@@ -36,7 +36,7 @@ def modelled(climate: Climate, raw: torch.Tensor) -> tuple[torch.Tensor, torch.T
     values, slopes = [], []
     for moment in MOMENTS.tolist():
         leaf = raw.clone().requires_grad_()
-        x = climate.marched_temperature(surface(leaf), moment)
+        x = climate.stepped_temperature(surface(leaf), moment)
         slopes.append(torch.autograd.grad(x.sum(), leaf)[0])
         values.append(x.detach())
     return torch.stack(values, 1), torch.stack(slopes, 1)

@@ -34,7 +34,7 @@ def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Driv
     diffuse = 0.1 * height.clamp(min=0).sqrt() * (1 + clouds)
     reference = float(air.mean())
     sky = sky_temperature_k(air, torch.full_like(air, 60.0), "brutsaert")
-    breeze = (3 + 1.5 * drift).clamp(min=0)
+    wind_m_s = (3 + 1.5 * drift).clamp(min=0)
     return Drivers(
         times,
         reference,
@@ -43,7 +43,7 @@ def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Driv
         power_excess(air - reference, reference),
         diffuse,
         direct[:, None] * sun,
-        breeze / breeze.mean() - 1 if wind else None,
+        wind_m_s / wind_m_s.mean() - 1 if wind else None,
         UP,
     )
 
@@ -61,8 +61,8 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     light = view * given.light.numpy()[:, None] + (given.beams @ surface.normals.T).clamp(min=0).numpy()
     sky = view * given.sky.numpy()[:, None] + (1 - view) * given.around.numpy()[:, None]
     forcing, air = sun * light + share * sky, given.air.numpy()
-    breeze = np.zeros_like(air) if given.breeze is None else given.breeze.numpy()
-    calm = np.trapezoid(breeze, times) / (times[-1] - times[0])
+    anomaly = np.zeros_like(air) if given.wind_anomaly is None else given.wind_anomaly.numpy()
+    calm = np.trapezoid(anomaly, times) / (times[-1] - times[0])
     mean = None if about is None else about.numpy()
 
     def radiated(x):
@@ -79,17 +79,17 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             return series[k] * (1 - part) + series[k + 1] * part
 
         def slope(t, x, now=now):
-            a, b, f = now(air, t), now(breeze, t), now(forcing, t)
+            a, b, f = now(air, t), now(anomaly, t), now(forcing, t)
             if mean is None:
                 return rate * (f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x))
             steep = (1 + mean / reference) ** 3
-            convected = (1 + wind * calm) * (a - x) + wind * (now(breeze * air, t) - calm * a - (b - calm) * mean)
+            convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
             return rate * (f + (1 - share) * convected - share * (radiated(mean) + steep * (x - mean)))
 
         def jacobian(t, x, now=now):
             if mean is None:
                 steep = (1 + x / reference) ** 3
-                return np.diag(-rate * ((1 - share) * (1 + wind * now(breeze, t)) + share * steep))
+                return np.diag(-rate * ((1 - share) * (1 + wind * now(anomaly, t)) + share * steep))
             return np.diag(-rate * ((1 - share) * (1 + wind * calm) + share * (1 + mean / reference) ** 3))
 
         step = (end - begin) / 4

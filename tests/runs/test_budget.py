@@ -355,12 +355,12 @@ def test_a_budget_needs_the_clock_of_the_costs():
         a_clock().on_train_start(trainer, None)
 
 
-def left_by(folder: Path, recipe: dict, step: int, end: float) -> dict:
+def left_by(folder: Path, config: dict, step: int, end: float) -> dict:
     """The configuration of a run in a folder with one checkpoint, of a run whose schedule ends at ``end``."""
     (folder / "checkpoints").mkdir(parents=True)
-    stored = {"recipe": recipe, "schedule": {"end": end}}
+    stored = {"config": config, "schedule": {"end": end}}
     torch.save({"global_step": step, "heatsplat": stored}, folder / "checkpoints" / "last.ckpt")
-    return resumed(recipe, folder)
+    return resumed(config, folder)
 
 
 def test_a_run_that_was_stretched_or_shrunk_goes_on_until_its_schedule_ends(tmp_path):
@@ -384,9 +384,9 @@ def test_a_denser_scene_has_new_points_between_neighbours():
 
 
 def budget_run(folder: Path, *overrides: str):
-    """(module, recipe) of a whole run."""
+    """(module, config) of a whole run."""
     module, _ = running.run(folder, "method=etgs", *running.TINY, "callbacks.metrics.lpips_net=null", *overrides)
-    return module, module.recipe
+    return module, module.config
 
 
 class Died(Exception):

@@ -59,7 +59,7 @@ def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(traine
 
 def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
     folder, config, _ = trained
-    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")["heatsplat"]["recipe"]
+    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")["heatsplat"]["config"]
     assert differences(config | {"threads": 1, "test": False, "ckpt": "any"}, stored) == []
     assert differences(config | {"optim": config["optim"] | {"means": 1.0}}, stored) == ["optim.means"]
 

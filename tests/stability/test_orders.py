@@ -69,7 +69,7 @@ def test_rate_grid():
     assert order([129, 257, 513, 1025], rate_grid_error) == pytest.approx(4.0, abs=0.3)
 
 
-def marched(samples: int, share: float) -> torch.Tensor:
+def stepped(samples: int, share: float) -> torch.Tensor:
     """Temperatures by steps between samples of one smooth day, its drivers given at so many samples."""
     times = torch.linspace(0, 86400, samples, dtype=DOUBLE)
     air = 10 * torch.sin(times * 2 * math.pi / 86400)
@@ -77,13 +77,13 @@ def marched(samples: int, share: float) -> torch.Tensor:
     rate = torch.tensor([3e-5, 1e-4], dtype=DOUBLE)
     one = torch.ones_like(rate)
     surface = Surface(60 * one, rate.log(), 0 * one, share * one)
-    return climate.marched_temperature(surface, 86400.0)
+    return climate.stepped_temperature(surface, 86400.0)
 
 
 def test_weather_between_samples():
     """Drivers are taken as linear between samples: the second order in their spacing."""
-    fine = marched(6145, 0.5)
-    assert order([24, 48, 96, 192], lambda n: (marched(n + 1, 0.5) - fine).abs().max().item()) == pytest.approx(
+    fine = stepped(6145, 0.5)
+    assert order([24, 48, 96, 192], lambda n: (stepped(n + 1, 0.5) - fine).abs().max().item()) == pytest.approx(
         2.0, abs=0.25
     )
 
@@ -97,7 +97,7 @@ def step_error(parts: int) -> float:
         climate = Climate(Drivers(times, 288.0, level, sky=level))
         one = torch.ones(1, dtype=DOUBLE)
         # Four intervals and more are one substep each, so that their number is that of the steps.
-        return climate.marched_temperature(Surface(120 * one, math.log(8e-5) * one, 0 * one, one), 4000.0)
+        return climate.stepped_temperature(Surface(120 * one, math.log(8e-5) * one, 0 * one, one), 4000.0)
 
     return (solved(parts) - solved(800)).abs().item()
 

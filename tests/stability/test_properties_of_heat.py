@@ -161,7 +161,7 @@ def test_a_stiff_balance_neither_rings_nor_leaves_the_range_of_what_drives_it(ra
     climate = Climate(Drivers(moments, 288.0, air, sky=None if share is None else air))
     leaves = [torch.tensor([x], dtype=torch.float64).requires_grad_() for x in (start, math.log(rate), 0.0)]
     radiating = None if share is None else torch.tensor([share], dtype=torch.float64).requires_grad_()
-    found = climate.marched_temperature(Surface(*leaves, radiating), moments[-1].item())
+    found = climate.stepped_temperature(Surface(*leaves, radiating), moments[-1].item())
     found.sum().backward()
     low, high = min(start, -20.0), max(start, 30.0)
     assert low - 2.0 <= found.item() <= high + 2.0

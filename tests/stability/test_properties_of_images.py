@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from draws import generator, logarithmic, seeds
-from fire import camera
+from extreme_inputs import camera
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

@@ -78,12 +78,12 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
     module, trainer = run(tmp_path / "whole", *overrides)
     last = tmp_path / "whole" / "checkpoints" / "last.ckpt"
     stored = load_checkpoint(last)
-    recipe = stored["heatsplat"]["recipe"]
-    assert "states" not in recipe["effects"] and recipe["thermal"] == recipe["module"]["thermal"]
-    restored = build(recipe["module"], output_dir=str(tmp_path))
-    restored.recipe = recipe
+    config = stored["heatsplat"]["config"]
+    assert "states" not in config["effects"] and config["thermal"] == config["module"]["thermal"]
+    restored = build(config["module"], output_dir=str(tmp_path))
+    restored.config = config
     frame = module.scene.test.frames[0]
-    assert torch.equal(restore(restored, build(recipe["data"]), stored).predict(frame), module.predict(frame))
+    assert torch.equal(restore(restored, build(config["data"]), stored).predict(frame), module.predict(frame))
     assert len(scene_says) == 1
     half = tmp_path / "whole" / "checkpoints" / "step_000006.ckpt"
     second, _ = run(tmp_path / "resumed", *overrides, f"ckpt={half}")

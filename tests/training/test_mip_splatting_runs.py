@@ -52,7 +52,7 @@ def test_a_restored_checkpoint_shows_the_same_image(whole, tmp_path):
     module, _, folder = whole
     plain = compose([*SHORT])
     fresh = build(plain["module"], output_dir=str(tmp_path))
-    fresh.recipe = plain
+    fresh.config = plain
     restore(fresh, build(plain["data"]), load_checkpoint(folder / "checkpoints" / "last.ckpt"))
     frame = module.scene.test.frames[0]
     assert torch.equal(fresh.predict(frame), module.predict(frame))

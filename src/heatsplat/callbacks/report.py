@@ -60,7 +60,7 @@ class Report(pl.Callback):
 
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         writer = board(module)
-        if writer is not None and module.recipe.get("verdicts"):
+        if writer is not None and module.config.get("verdicts"):
             table = effects_table(describe_effects(module))
             writer.add_text("effects", "\n".join(table), trainer.global_step)
 
@@ -81,7 +81,7 @@ class Report(pl.Callback):
         if trainer.logger is not None:
             scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
             finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
-            trainer.logger.log_hyperparams(hyperparameters(module.recipe), finite)
+            trainer.logger.log_hyperparams(hyperparameters(module.config), finite)
         if self.show:
             show(results, folder, shown[0] if shown else None)
 
@@ -92,10 +92,10 @@ class Report(pl.Callback):
 def describe_run(trainer: pl.Trainer, module: pl.LightningModule) -> dict[str, Any]:
     """What was run, for metrics.json."""
     return {
-        "method": module.recipe.get("name"),
+        "method": module.config.get("name"),
         "scene": module.scene.name,
         "modality": module.modality,
-        "seed": module.recipe.get("seed"),
+        "seed": module.config.get("seed"),
         "steps": trainer.global_step or None,
         "thermal_model": type(module.thermal).__name__,
         "multiply_adds_per_gaussian": module.thermal.cost,
@@ -129,7 +129,7 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
     it adds to this many Gaussians ("parameters") and what a step of training costs more ("ms_per_step").
     """
     simulated = module.thermal.effects() | module.sensor.effects()
-    verdicts = module.recipe.get("verdicts")
+    verdicts = module.config.get("verdicts")
     if not verdicts:
         return {name: {"on": True} | settings for name, settings in simulated.items()}
     described = {}

@@ -1,4 +1,4 @@
-"""Adaptive density control, the standard recipe of 3D Gaussian Splatting (Kerbl et al. 2023, section 5), with a cap."""
+"""Adaptive density control, the standard strategy of 3D Gaussian Splatting (Kerbl et al. 2023, section 5), with a cap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From verdicts to a recipe: the configuration that simulates exactly the effects that are on."""
+"""From verdicts to a configuration: the one that simulates exactly the effects that are on."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
     return {other: replace(verdict, on=verdict.on and other not in gone) for other, verdict in verdicts.items()}
 
 
-def recipe(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def assemble(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """ "thermal", "sensor" and further terms of the "loss" as plain containers, of the effects that are on.
 
     Args:
@@ -212,7 +212,7 @@ def asked(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def changed(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
-    """Keys of what was asked for (``asked``) that differ between a configuration and a run's recipe.
+    """Keys of what was asked for (``asked``) that differ between a configuration and that of an earlier run.
 
     Whole numbers do not count where "max_steps" differs: many are shares of it.
     """
@@ -236,8 +236,8 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
 
     Args:
         config: as composed.
-        parts: of ``recipe``, or the configuration of an earlier run.
-        verdicts: as ``told`` puts them.
+        parts: of ``assemble``, or the configuration of an earlier run.
+        verdicts: as ``verdicts_as_dicts`` puts them.
     """
     thermal, sensor = deepcopy(parts["thermal"]), deepcopy(parts["sensor"])
     terms = parts["loss"].get("terms", parts["loss"])  # an earlier run has all of its loss
@@ -254,13 +254,13 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
     }
 
 
-def told(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def verdicts_as_dicts(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Verdicts as plain containers, with what the effects add where that was measured (``runs.prices``)."""
     return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
 
 
 def lines(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A table for the log of what ``told`` says: effect, verdict, statistic and threshold, price, reason."""
+    """A table for the log of what ``verdicts_as_dicts`` says: effect, verdict, statistic and threshold, price, reason."""
     rows = [("effect", "", "statistic", "ms/step", "numbers", "reason")]
     for name, verdict in verdicts.items():
         measured = verdict["statistic"] is not None

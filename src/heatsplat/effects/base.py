@@ -1,8 +1,8 @@
 """Physical effects: what each is, what speaks for it in a scene, what simulates it, and the verdict on it.
 
-Each effect is one file in ``heatsplat.effects.physical``; ``heatsplat.effects.catalogue`` lists them. ``decide`` there looks
-at a scene and returns a verdict on each; ``heatsplat.effects.assembly`` turns verdicts into a recipe that simulates exactly
-what is on.
+Each effect is one file in ``heatsplat.effects.physical``; ``heatsplat.effects.catalogue`` lists them. ``decide`` there
+looks at a scene and returns a verdict on each; ``heatsplat.effects.assembly`` turns verdicts into a configuration that
+simulates exactly what is on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 STAGES = ("state", "emission", "path", "visibility", "sensor")  # in the order in which heat meets them
 WISHES = ("on", "off", "auto")
-# Where a part stands in a recipe -> where its settings stand in the group "effects" of a configuration.
+# Where a part stands in a configuration -> where its settings stand in the group "effects" of a configuration.
 SLOTS = {
     "state": ("states",),  # the last one that is called for
     "around_state": ("states",),  # takes the state as its own "state"
@@ -51,7 +51,7 @@ class Part:
     """What simulates an effect.
 
     Args:
-        slot: where it stands in a recipe, one of SLOTS.
+        slot: where it stands in a configuration, one of SLOTS.
         name: of its settings in conf/effects/shared/parts.yaml. Effects may share a part.
         off: settings that leave this effect out where another one calls for the part.
     """
@@ -75,7 +75,7 @@ class Effect:
         null: the null hypothesis that its evidence tests.
         threshold: it is on where the statistic exceeds this. In each file stands what the statistic is on synthetic recordings
             (18 scenes: five recordings of size tiny of each, and six scenes of size demo) without the effect and with it.
-        adds: what it adds to a recipe: parameters and operations, in a sentence.
+        adds: what it adds to a run: parameters and operations, in a sentence.
         evidence: what the training data of a scene say about it.
         part: what simulates it.
         term: what it is in the joint fit, None where it has no part in that.
@@ -110,7 +110,7 @@ class Verdict:
         on: whether it is simulated.
         statistic, threshold: of its evidence; None where it was forced or nothing could be measured.
         reason: in a sentence.
-        settings: what it starts from, handed to the recipe.
+        settings: what it starts from, handed to the configuration.
     """
 
     name: str

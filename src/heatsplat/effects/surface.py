@@ -10,13 +10,13 @@ from heatsplat.contracts import evenly_spread
 from heatsplat.effects.observations import MAX_IN_FRONT, Observations
 
 NEIGHBOURS = 8
-FEWEST = 12  # points below which no surface can be told
+MIN_POINTS = 12  # points below which no surface can be told
 
 
 def normals(obs: Observations) -> Tensor | None:
     """Unit normals [P, 3] at the tracks' points, towards the cameras, of planes through the nearest scene points."""
     tracks, points = obs.tracks, obs.scene.points.double()
-    if tracks is None or obs.still or len(points) < FEWEST:
+    if tracks is None or obs.still or len(points) < MIN_POINTS:
         return None
     points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
     near = torch.cdist(tracks.points, points).topk(min(NEIGHBOURS + 1, len(points)), largest=False).indices

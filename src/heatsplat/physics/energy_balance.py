@@ -18,7 +18,7 @@ and in kelvin above the reference, x = T - R, with w(x) = (T⁴ - R⁴) / (4 R³
 
 ``linear_temperature`` replaces w by its tangent at the surface's own mean temperature and v b x by v b times that mean,
 which leaves one rate per surface and so the response tables (responses.py, sunlight.py): its cost does not depend on the
-record. ``marched_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
+record. ``stepped_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
 
 **Convention:** kelvin above the reference, kW/m², seconds; every driver is linear between its samples.
 """
@@ -37,7 +37,7 @@ from heatsplat.physics.responses import ResponseTable, driver_means, grid_positi
 from heatsplat.physics.sunlight import SunlightTable
 
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
-LEAST_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
+MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
 
 
@@ -73,7 +73,7 @@ class Drivers:
         around: s of what a tilted surface sees instead of sky, or None where all lie level.
         light: sunlight on a level surface without that of ``beams``, or None.
         beams: [T, 3] direction towards the sun times its strength, or None.
-        breeze: wind / mean wind - 1, or None.
+        wind_anomaly: wind / mean wind - 1, or None.
         up: [3], or None where all surfaces lie level.
     """
 
@@ -84,7 +84,7 @@ class Drivers:
     around: Tensor | None = None
     light: Tensor | None = None
     beams: Tensor | None = None
-    breeze: Tensor | None = None
+    wind_anomaly: Tensor | None = None
     up: Tensor | None = None
 
 
@@ -101,10 +101,10 @@ class Climate:
         self.drivers = drivers
         zero = torch.zeros_like(drivers.air)
         columns = {"air": drivers.air, "light": drivers.light, "sky": drivers.sky, "around": drivers.around}
-        self.breeze_mean = 0.0
-        if drivers.breeze is not None:
-            self.breeze_mean = float(driver_means(drivers.times_s, drivers.breeze))
-            gusts = drivers.breeze - self.breeze_mean
+        self.wind_anomaly_mean = 0.0
+        if drivers.wind_anomaly is not None:
+            self.wind_anomaly_mean = float(driver_means(drivers.times_s, drivers.wind_anomaly))
+            gusts = drivers.wind_anomaly - self.wind_anomaly_mean
             columns |= {"gusts": gusts, "gusts_air": gusts * drivers.air}
         columns = {name: series for name, series in columns.items() if series is not None}
         self.columns = {name: j for j, name in enumerate(columns)}
@@ -113,7 +113,7 @@ class Climate:
         self.means = driver_means(drivers.times_s, series).float()
         self.beam = None if drivers.beams is None else SunlightTable(drivers.times_s, drivers.beams)
         rows = [columns.get(name, zero) for name in ("air", "sky", "around", "light")]
-        rows += [zero if drivers.breeze is None else drivers.breeze]
+        rows += [zero if drivers.wind_anomaly is None else drivers.wind_anomaly]
         rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
         self.rows = torch.stack(rows).contiguous()
 
@@ -148,7 +148,7 @@ class Climate:
         calm = None if surface.share is None else 1 - surface.share
         if surface.wind is None:
             return calm
-        windy = 1 + surface.wind * self.breeze_mean
+        windy = 1 + surface.wind * self.wind_anomaly_mean
         return windy if calm is None else calm * windy
 
     def mean_temperature(self, surface: Surface) -> Tensor:
@@ -167,7 +167,7 @@ class Climate:
             slope = stiffness.detach() + surface.share.detach() * (1 + x.detach() / self.drivers.reference_k) ** 3
             radiated = surface.share * power_excess(x, self.drivers.reference_k)
             rest = self.forcing(surface, means, beam, 0.0) - stiffness * x - radiated
-            return (x + rest / slope.clamp(min=LEAST_STIFFNESS)).clamp(-HALF_RANGE_K, HALF_RANGE_K)
+            return (x + rest / slope.clamp(min=MIN_STIFFNESS)).clamp(-HALF_RANGE_K, HALF_RANGE_K)
 
         with torch.no_grad():
             x = surface.share * 0.0
@@ -182,7 +182,7 @@ class Climate:
         if surface.share is not None:
             steep = (1 + mean / self.drivers.reference_k) ** 3
             constant = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
-            stiffness = (stiffness + surface.share * steep).clamp(min=LEAST_STIFFNESS)
+            stiffness = (stiffness + surface.share * steep).clamp(min=MIN_STIFFNESS)
         log_rate = surface.log_rate if stiffness is None else surface.log_rate + stiffness.log()
         settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
         beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
@@ -192,17 +192,17 @@ class Climate:
             forced = forced + constant * (1 - kept)
         return surface.start * kept + (forced if stiffness is None else forced / stiffness)
 
-    def marched_temperature(self, surface: Surface, time_s: float) -> Tensor:
+    def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers."""
         absent = [value is None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
         columns = [surface.start, surface.log_rate, surface.share, surface.sun, surface.wind]
         parameters = torch.stack([column for column in columns if column is not None], dim=1)
         if surface.normals is not None:
             parameters = torch.cat((parameters, surface.normals), dim=1)
-        return _March.apply(parameters, kernels.Balance(*(not gone for gone in absent)), self, time_s)
+        return _Stepped.apply(parameters, kernels.Balance(*(not gone for gone in absent)), self, time_s)
 
 
-class _March(torch.autograd.Function):
+class _Stepped(torch.autograd.Function):
     """The kernel on the CPU, which gives derivatives along with values."""
 
     @staticmethod

@@ -12,7 +12,7 @@ from typing import Any
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.checks import checked
-from heatsplat.runs.resume import checkpoints_in, differences, recipe_of
+from heatsplat.runs.resume import checkpoints_in, differences, stored_config
 
 try:
     import fcntl
@@ -61,7 +61,7 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     if not (folder / METRICS_FILE).exists():
         return None
     _, newest = next(checkpoints_in(folder), (None, {}))
-    changed = differences(checked(config), recipe_of(newest)) if recipe_of(newest) else []
+    changed = differences(checked(config), stored_config(newest)) if stored_config(newest) else []
     if changed:
         raise OccupiedError(
             f"{folder} holds the results of a run with other settings ({', '.join(changed)}): give another folder with "

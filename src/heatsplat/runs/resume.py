@@ -32,9 +32,9 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         SceneError: the checkpoint that was given is none, or of a run with another budget or other effects.
     """
     if config["ckpt"] is not None:
-        return _continued(config, recipe_of(load_checkpoint(config["ckpt"])))
+        return _continued(config, stored_config(load_checkpoint(config["ckpt"])))
     for path, checkpoint in checkpoints_in(output_dir):
-        stored = recipe_of(checkpoint)
+        stored = stored_config(checkpoint)
         changed = differences(config, stored)
         if changed:
             log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
@@ -96,9 +96,9 @@ def completed(config: dict[str, Any], composed: Mapping[str, Any]) -> dict[str, 
     }
 
 
-def recipe_of(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of the run that wrote a checkpoint; empty where none of ours did."""
-    return checkpoint.get(CHECKPOINT_KEY, {}).get("recipe", {})
+    return checkpoint.get(CHECKPOINT_KEY, {}).get("config", {})
 
 
 def _differing(key: str, one: Any, other: Any) -> Iterator[str]:

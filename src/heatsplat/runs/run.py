@@ -98,7 +98,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
 def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
     """The training module that a configuration describes, which takes it into its checkpoints."""
     module = build(config["module"], output_dir=str(output_dir))
-    module.recipe = config  # set, not passed: Hydra would build every part in it once more
+    module.config = config  # set, not passed: Hydra would build every part in it once more
     return module
 
 
@@ -198,7 +198,7 @@ def load(
     loaded = load_checkpoint(checkpoint)
     if CHECKPOINT_KEY not in loaded:
         raise SceneError(f"{checkpoint} was not written by heatsplat")
-    config = loaded[CHECKPOINT_KEY]["recipe"]
+    config = loaded[CHECKPOINT_KEY]["config"]
     changed = {key: value for key, value in (data or {}).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())

@@ -28,7 +28,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     if config["effects"]["price"]:
 
         def maker(chosen: Mapping[str, Verdict]) -> Callable[[], Any]:
-            return lambda: build(filled(config | {"verdicts": assembly.told(chosen, {})})["module"])
+            return lambda: build(filled(config | {"verdicts": assembly.verdicts_as_dicts(chosen, {})})["module"])
 
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
@@ -36,7 +36,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
         costs = prices(
             maker(verdicts), leaving, scene, config["max_steps"], device_of(config["trainer"]["accelerator"])
         )
-    found = assembly.told(verdicts, costs)
+    found = assembly.verdicts_as_dicts(verdicts, costs)
     for line in assembly.lines(found):
         log.info("%s", line)
     return config | {"verdicts": found}
@@ -61,4 +61,4 @@ def filled(config: dict[str, Any]) -> dict[str, Any]:
     verdicts = {
         name: Verdict(**{key: said[key] for key in names if key in said}) for name, said in config["verdicts"].items()
     }
-    return assembly.filled(config, assembly.recipe(verdicts, config["effects"]), config["verdicts"])
+    return assembly.filled(config, assembly.assemble(verdicts, config["effects"]), config["verdicts"])

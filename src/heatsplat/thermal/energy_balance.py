@@ -161,7 +161,7 @@ class EnergyBalance(ThermalModel):
         if drivers.sky is not None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
-        if drivers.breeze is not None:
+        if drivers.wind_anomaly is not None:
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         return tensors
 
@@ -219,7 +219,7 @@ class EnergyBalance(ThermalModel):
         surface = self._surface(splats, query)
         if self.solution == "linear":
             return self.climate.linear_temperature(surface, query.time_s)
-        return self.climate.marched_temperature(surface, query.time_s)
+        return self.climate.stepped_temperature(surface, query.time_s)
 
     def _surface(self, splats: Splats, query: Query) -> Surface:
         def bounded(name: str, low: float, high: float) -> Tensor:
@@ -232,7 +232,7 @@ class EnergyBalance(ThermalModel):
             log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
             share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
-            wind=bounded("raw_wind", *WIND_LIMITS) if drivers.breeze is not None else None,
+            wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
             normals=self._normals(splats, query) if drivers.up is not None else None,
         )
 
@@ -280,7 +280,7 @@ class EnergyBalance(ThermalModel):
         if self._wind and self.mean_wind > 0:
             if weather.wind_m_s is None:
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
-            parts["breeze"] = weather.wind_m_s / self.mean_wind - 1
+            parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
             effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"

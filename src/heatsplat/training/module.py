@@ -35,7 +35,7 @@ class SplatTraining(pl.LightningModule):
 
     Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
     ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, ``schedule`` (how far the run is, and when it ends),
-    ``density_change`` (what density control did in the last step, None for nothing), and ``recipe``, the resolved
+    ``density_change`` (what density control did in the last step, None for nothing), and ``config``, the resolved
     configuration as plain containers: it travels in the checkpoint, so that a checkpoint and its data are enough to evaluate
     or render.
 
@@ -87,7 +87,7 @@ class SplatTraining(pl.LightningModule):
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
         self.seed, self.output_dir = seed, Path(output_dir)
-        self.recipe: dict[str, Any] = {}
+        self.config: dict[str, Any] = {}
         self.modality = thermal.modality
         self.supersample = supersample
         if dtype not in ("float32", "float64"):
@@ -327,7 +327,7 @@ class SplatTraining(pl.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {
-            "recipe": self.recipe,
+            "config": self.config,
             "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
@@ -335,7 +335,7 @@ class SplatTraining(pl.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
         weights = checkpoint["state_dict"]
-        check_same_recipe(self, checkpoint)
+        check_same_method(self, checkpoint)
         self.splats.resize(weights["splats.raw.means"].shape[0])
         for name, buffer in list(self.named_buffers()):
             stored = weights.get(name)
@@ -352,12 +352,12 @@ def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = 
     return Query(ids, frame.camera, frame.time_s, frame.frame_id, geometry)
 
 
-def check_same_recipe(module: SplatTraining, checkpoint: dict[str, Any]) -> None:
+def check_same_method(module: SplatTraining, checkpoint: dict[str, Any]) -> None:
     """Raises SceneError when a checkpoint was written by another method than ``module`` trains."""
     if CHECKPOINT_KEY not in checkpoint:
         raise SceneError("the checkpoint was not written by heatsplat: it holds no 'heatsplat' entry")
-    stored = checkpoint[CHECKPOINT_KEY]["recipe"].get("name")
-    here = module.recipe.get("name")
+    stored = checkpoint[CHECKPOINT_KEY]["config"].get("name")
+    here = module.config.get("name")
     names = {f"splats.raw.{name}" for name in module.splats.names}
     found = {name for name in checkpoint["state_dict"] if name.startswith("splats.raw.")}
     if stored != here or names != found:

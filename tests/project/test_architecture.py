@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "heatsplat"
 
-# Room -> rooms of heatsplat that it may import. Rooms are folders, or single files at the top of the package.
+# Package -> packages of heatsplat that it may import. Packages are folders, or single files at the top of heatsplat.
 ALLOWED = {
     "contracts": set(),
     "physics": {"contracts", "kernels"},
@@ -50,7 +50,7 @@ def sources() -> list[Path]:
     return sorted([*PACKAGE.rglob("*.py"), *(ROOT / "datamodules").rglob("*.py")])
 
 
-def room_of(path: Path) -> str:
+def package_of(path: Path) -> str:
     if PACKAGE not in path.parents:
         return "datamodules"
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -73,21 +73,21 @@ def imports_of(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_rooms_import_only_what_they_may(path):
-    room = room_of(path)
-    if room == "__init__":
+def test_packages_import_only_what_they_may(path):
+    package = package_of(path)
+    if package == "__init__":
         return
-    assert room in ALLOWED, f"{path} is in no known room; give it one in docs/architecture.md and here"
+    assert package in ALLOWED, f"{path} is in no known package; give it one in docs/architecture.md and here"
     for name in imports_of(path):
         parts = name.split(".")
         if parts[:2] == ["heatsplat", "datamodules"]:
-            assert room == "datamodules", f"{path} imports {name}: only configurations name data modules"
+            assert package == "datamodules", f"{path} imports {name}: only configurations name data modules"
         assert parts[0] != "benchmarks", f"{path} imports {name}: the package never imports what stands beside it"
-        if parts[0] != "heatsplat" or len(parts) == 1 or room == parts[1]:
+        if parts[0] != "heatsplat" or len(parts) == 1 or package == parts[1]:
             continue
         other = parts[1] if (PACKAGE / parts[1]).exists() or (PACKAGE / f"{parts[1]}.py").exists() else "heatsplat"
-        assert other in ALLOWED[room], f"{path} imports {name}: {room} may import {sorted(ALLOWED[room])}"
-        if room == "training" and other in BASES_ONLY:
+        assert other in ALLOWED[package], f"{path} imports {name}: {package} may import {sorted(ALLOWED[package])}"
+        if package == "training" and other in BASES_ONLY:
             assert parts[2] in BASES_ONLY[other], f"{path} imports {name}: training knows no variant by name"
 
 

@@ -64,7 +64,7 @@ def sound(frames: int = FRAMES) -> SceneData:
     views = [View(frame, picture(frame.time_s), picture(0.0).expand(-1, -1, 3).clone()) for frame in names]
     points = torch.rand(POINTS, 3, generator=generator_for(0, 0, "points")) * 1.6 - 0.8
     return SceneData(
-        name="fire", train=view_set(views), val=view_set(views[:1]), test=view_set(views[-1:]), points=points,
+        name="extreme", train=view_set(views), val=view_set(views[:1]), test=view_set(views[-1:]), points=points,
         point_colors=torch.full((POINTS, 3), 0.5), thermal_range=ThermalRange(10.0, 30.0), ambient_c=15.0,
         metres_per_unit=1.0, weather=weather, labels=torch.arange(POINTS) % 3, point_features=torch.rand(
             POINTS, 4, generator=generator_for(0, 0, "features")
@@ -115,7 +115,7 @@ def train(scene: SceneData, plain: dict[str, Any], output_dir: Path):
         callbacks=[*build_callbacks(kept, output_dir), shown],
     )  # fmt: skip
     module = build(plain["module"], output_dir=str(output_dir))
-    module.recipe = plain
+    module.config = plain
     fit(module, Given(scene), trainer, test=False)
     return module, shown
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from fire import SPAN_S, STEPS, camera, checkpoints, everywhere, plain_config, sound, train, with_views
+from extreme_inputs import SPAN_S, STEPS, camera, checkpoints, everywhere, plain_config, sound, train, with_views
 from helpers import ALL_METHODS
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
@@ -20,7 +20,7 @@ CAUSE = (FloatingPointError, SceneError, RuntimeError)
 
 
 @dataclass(frozen=True)
-class Fire:
+class Case:
     """What breaks a training, and how it may end.
 
     Args:
@@ -89,25 +89,25 @@ def resets(plain: dict[str, Any]) -> dict[str, Any]:
     return everywhere(plain, lambda key, number: {"reset_every": 60, "every": 30}.get(key, number))
 
 
-FIRES = {
-    "nothing wrong": Fire(),
-    "constant temperature": Fire(flat),
-    "two frames": Fire(lambda: sound(2)),
-    "duplicate timestamps": Fire(lambda: at_times(0.0, 0.0, 500.0, 500.0, SPAN_S, SPAN_S)),
-    "one moment": Fire(lambda: at_times(0.0, 0.0, 0.0)),
-    "one saturated frame": Fire(lambda: one_frame(1.0), learns=1.0),  # no cloud explains it beside the others
-    "a masked frame of NaN": Fire(lambda: one_frame(math.nan, masked=True)),
-    "a frame of NaN": Fire(lambda: one_frame(math.nan), error=r"NaN.*frame_2\.png", must_stop=True),
-    "a single Gaussian": Fire(change=one_gaussian, learns=None),
-    "learning rates a hundred times too high": Fire(
+CASES = {
+    "nothing wrong": Case(),
+    "constant temperature": Case(flat),
+    "two frames": Case(lambda: sound(2)),
+    "duplicate timestamps": Case(lambda: at_times(0.0, 0.0, 500.0, 500.0, SPAN_S, SPAN_S)),
+    "one moment": Case(lambda: at_times(0.0, 0.0, 0.0)),
+    "one saturated frame": Case(lambda: one_frame(1.0), learns=1.0),  # no cloud explains it beside the others
+    "a masked frame of NaN": Case(lambda: one_frame(math.nan, masked=True)),
+    "a frame of NaN": Case(lambda: one_frame(math.nan), error=r"NaN.*frame_2\.png", must_stop=True),
+    "a single Gaussian": Case(change=one_gaussian, learns=None),
+    "learning rates a hundred times too high": Case(
         change=hundredfold, learns=None, error="would remove all|NaN|infinite"
     ),
-    "opacity resets with views of nothing": Fire(one_view_of_nothing, resets, learns=None),
-    "a range of a nanokelvin": Fire(
+    "opacity resets with views of nothing": Case(one_view_of_nothing, resets, learns=None),
+    "a range of a nanokelvin": Case(
         lambda: replace(sound(), thermal_range=ThermalRange(15.0, 15.0 + 1e-9)),
         error="is 1e-09 K wide.*computes in kelvin",
     ),
-    "a range of a hundredth of a kelvin": Fire(
+    "a range of a hundredth of a kelvin": Case(
         lambda: replace(sound(), thermal_range=ThermalRange(15.0, 15.01001)), learns=0.8
     ),
 }
@@ -120,10 +120,10 @@ def threads():
     prepare_machine(before)
 
 
-@pytest.mark.parametrize("fire", FIRES)
+@pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("method", ALL_METHODS)
-def test_a_run_learns_or_says_what_is_wrong(method, fire, tmp_path):
-    case = FIRES[fire]
+def test_a_run_learns_or_says_what_is_wrong(method, name, tmp_path):
+    case = CASES[name]
     plain = case.change(plain_config(tmp_path, method))
     try:
         module, shown = train(case.scene(), plain, tmp_path)
@@ -137,8 +137,8 @@ def test_a_run_learns_or_says_what_is_wrong(method, fire, tmp_path):
         if case.learns is not None:
             assert shown.after < case.learns * shown.before
         assert "last.ckpt" in checkpoints(tmp_path)
-    for name, tensors in checkpoints(tmp_path).items():
-        assert [key for key, value in tensors.items() if not value.isfinite().all()] == [], name
+    for file, tensors in checkpoints(tmp_path).items():
+        assert [key for key, value in tensors.items() if not value.isfinite().all()] == [], file
 
 
 def test_equal_bounds_are_refused_by_name():

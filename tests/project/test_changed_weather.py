@@ -42,7 +42,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
 
     data = Yard()
     module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict)
-    stored = {CHECKPOINT_KEY: {"recipe": {"module": {}, "data": {}}}}
+    stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
     monkeypatch.setattr(run, "build", lambda settings: data)
@@ -83,7 +83,7 @@ def test_without_a_record_frames_keep_what_they_had():
 
 
 def test_a_data_set_without_weather_refuses_the_choice(monkeypatch):
-    stored = {CHECKPOINT_KEY: {"recipe": {"data": {"root": "x"}, "module": {}}}}
+    stored = {CHECKPOINT_KEY: {"config": {"data": {"root": "x"}, "module": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     config = compose(["ckpt=any.ckpt", "data.weather=windy"], "evaluate")
     with pytest.raises(
