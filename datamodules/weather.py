@@ -20,6 +20,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 import torch
 from heatsplat.datamodules.assemble import on_clock, weather_of
+from heatsplat.datamodules.side_files import finite, read_table, shortened
 from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
@@ -198,8 +199,15 @@ def site_of(notes: Mapping[str, Any]) -> Site | None:
     """The site that a record's notes name, or None."""
     if notes.get("latitude") is None or notes.get("longitude") is None:
         return None
-    axes = {key: tuple(map(float, notes[key])) for key in ("up", "north") if notes.get(key) is not None}
-    return Site(float(notes["latitude"]), float(notes["longitude"]), float(notes.get("altitude_m") or 0.0), **axes)
+    place = (finite(notes.get(key) or 0.0, key) for key in ("latitude", "longitude", "altitude_m"))
+    axes = {key: _axis(notes[key], key) for key in ("up", "north") if notes.get(key) is not None}
+    return Site(*place, **axes)
+
+
+def _axis(values: Any, key: str) -> tuple[float, ...]:
+    if isinstance(values, str) or not isinstance(values, Sequence):
+        raise SceneError(f"{key} is {shortened(values)}, three numbers are needed")
+    return tuple(finite(value, key) for value in values)
 
 
 def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
@@ -210,7 +218,7 @@ def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
     """
     try:
         return float(text)
-    except ValueError:
+    except (ValueError, TypeError, OverflowError):
         pass
     try:
         moment = datetime.fromisoformat(str(text).strip())
@@ -270,15 +278,10 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
     """Times [T] and columns [T] (NaN where missing) of a table in our units, unsorted, and notes."""
     if not path.is_file():
         raise SceneError(f"there is no weather table {path}")
-    lines = [
-        (number, line)
-        for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if len(lines) < 3:
+    table = read_table(path)
+    if len(table.rows) < 2:
         raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
-    delimiter = max(",;\t|", key=lines[0][1].count)
-    header = next(csv.reader([lines[0][1]], delimiter=delimiter))
+    header = table.columns
     plain = [_plain(name) for name in header]
     time_at = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
     if time_at is None:
@@ -306,18 +309,15 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
         raise SceneError(f"{path} has none of the columns {', '.join(WEATHER_COLUMNS)}; it has {', '.join(header)}")
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
-    for number, line in lines[1:]:
-        cells = next(csv.reader([line], delimiter=delimiter))
-        if len(cells) < len(header):
-            raise SceneError(f"{path}, line {number}: {len(cells)} cells for {len(header)} columns")
-        times.append(utc_seconds(cells[time_at].strip(), own_zone, f"{path}, line {number}"))
+    for number, cells in table.rows:
+        times.append(utc_seconds(table.pointed(cells[time_at]), own_zone, f"{path}, line {number}"))
         for name, (position, (scale, offset)) in wanted.items():
-            cell = cells[position].strip()
+            cell = cells[position]
             if cell.lower() in MISSING:
                 values[name].append(np.nan)
                 continue
             try:
-                values[name].append(scale * float(cell if delimiter == "," else cell.replace(",", ".")) + offset)
+                values[name].append(scale * table.number(cell) + offset)
             except ValueError as error:
                 raise SceneError(
                     f"{path}, line {number}: {cell!r} in column {header[position]} is no number"
