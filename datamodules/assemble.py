@@ -7,6 +7,7 @@ same for all of them. A scene that never was on disk goes the same way: ``read``
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import (
     PSEUDO_COLOUR_LEVELS,
     colour_levels,
@@ -27,6 +29,8 @@ from heatsplat.datamodules.formats.images import (
     undistorted_mask,
 )
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.poses import MAX_COORDINATE, checked_pose
+from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
 from torch import Tensor
 
@@ -46,6 +50,8 @@ from heatsplat.contracts import (
 log = logging.getLogger(__name__)
 
 MAX_VAL_VIEWS = 8
+# Seconds: three hundred centuries, more than any clock of a recording counts.
+MAX_TIME_S = 1e12
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,9 @@ class RawFrame:
     subset: str | None = None
     environment: Environment | None = None
 
+    def __post_init__(self) -> None:
+        checked_pose(self.viewmat, f"viewmat of frame {self.name}")
+
 
 @dataclass(frozen=True)
 class Counts:
@@ -84,8 +93,11 @@ class Counts:
     offset_c: float
 
     def __post_init__(self) -> None:
-        if self.scale <= 0:
-            raise SceneError(f"data.raw_scale must be positive (°C per count), got {self.scale}")
+        if not (0 < self.scale < math.inf and math.isfinite(self.offset_c)):
+            raise SceneError(
+                f"data.raw_scale must be positive (°C per count), got {self.scale}, and data.raw_offset_c finite, got "
+                f"{self.offset_c}"
+            )
 
 
 CELSIUS = Counts(scale=1.0, offset_c=0.0)
@@ -177,6 +189,13 @@ def build_scene(
     if thermal_channels not in (1, 3):
         raise SceneError(f"data.thermal_channels must be 1 or 3, got {thermal_channels}")
 
+    if ambient_c is not None:
+        ambient_c = celsius(ambient_c, f"ambient_c of scene {name}")
+    if metres_per_unit is not None:
+        metres_per_unit = finite(metres_per_unit, f"metres_per_unit of scene {name}")
+        if not metres_per_unit > 0:
+            raise SceneError(f"metres_per_unit of scene {name} is {metres_per_unit}; metres of one unit, above 0")
+
     frames, times, time_notes = _in_order(frames)
     notes |= time_notes
     order = list(range(len(frames)))
@@ -193,11 +212,20 @@ def build_scene(
     if left_out := len(frames) - len(set(train) | set(test)):
         notes["split_left_out"] = f"{left_out} frames are in neither list and are not used"
 
-    kept = np.isfinite(np.asarray(points, dtype=np.float64).reshape(-1, 3)).all(axis=1)
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    kept = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     labels = _of_points("labels", labels, kept)
     point_features = _of_points("point_features", point_features, kept)
-    points, point_colors, point_notes = _checked_points(name, points, point_colors)
-    notes |= point_notes
+    point_colors = _of_points("point_colors", point_colors, kept)
+    points = points[kept]
+    notes["points"] = len(points)
+    if len(points) < len(kept):
+        notes["points_dropped"] = f"{len(kept) - len(points)} points with NaN, infinite or absurdly large coordinates"
+    if len(points) < 4:
+        raise SceneError(
+            f"scene {name} has {len(points)} finite points, at least 4 are needed to start from; "
+            "check points3D in the sparse model"
+        )
     if weather is not None:
         if times is None:
             raise SceneError(f"scene {name} has weather, but its frames have no times: which weather belongs to which?")
@@ -212,10 +240,8 @@ def build_scene(
     with ThreadPoolExecutor() as pool:  # decoding takes most of the time and leaves Python alone
         prepare = partial(_prepare, downscale=downscale, channels=thermal_channels, alpha_mask=alpha_mask)
         prepared = dict(zip(used, pool.map(prepare, [frames[i] for i in used]), strict=True))
-    kinds = {p.thermal.dtype.kind for p in prepared.values()}
-    if len(kinds) > 1:
-        raise SceneError(f"scene {name} mixes float images (°C) with integer images; convert them to one kind")
-    if kinds == {"f"} and counts is None:
+    _check_equals({frames[i].name: p for i, p in prepared.items()})
+    if prepared[used[0]].thermal.dtype.kind == "f" and counts is None:
         counts = CELSIUS
         notes["encoding"] = "float pixels are temperatures in °C"
     if counts and thermal_range is None:
@@ -345,17 +371,21 @@ def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool)
     if pixels.ndim == 3 and (channels == 1 or pixels.dtype.kind == "f"):
         pixels = to_grey(pixels)
     if pixels.dtype.kind == "f":
-        finite = np.isfinite(pixels)
-        found["nan"] = int(finite.size - finite.sum())
+        known = (pixels >= MIN_CELSIUS) & (pixels <= MAX_CELSIUS)
+        found["nan"] = int(known.size - known.sum())
         if found["nan"]:
-            if not finite.any():
-                raise SceneError(f"image {frame.name} holds no finite pixel; remove it from the scene")
+            if not known.any():
+                raise SceneError(
+                    f"image {frame.name} holds no finite pixel that is a temperature in °C; remove it from the scene"
+                )
             # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
-            pixels = np.where(finite, pixels, np.median(pixels[finite]))
-            mask = finite if mask is None else mask & finite
+            pixels = np.where(known, pixels, np.median(pixels[known]))
+            mask = known if mask is None else mask & known
     rgb = None
     if frame.read_rgb is not None:
-        rgb, _ = split_alpha(frame.read_rgb())
+        rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
+        if rgb.dtype.kind == "f":
+            raise SceneError(f"the visible image of {frame.name} is {rgb.dtype}; save it with 8 or 16 bits")
         rgb = rgb if rgb.ndim == 3 else np.repeat(rgb[..., None], 3, axis=2)
         found["rgb_resized"] = rgb.shape[:2] != (height, width)
         rgb = resized(rgb, width, height)
@@ -394,8 +424,11 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
         return sorted(frames, key=lambda f: f.name), None, notes
     frames = sorted(frames, key=lambda f: (f.time_s, f.name))
     times = [float(f.time_s) for f in frames]
-    if not np.isfinite(times).all():
-        raise SceneError(f"frame {frames[int(np.argmin(np.isfinite(times)))].name} has a time that is no finite number")
+    for frame, time in zip(frames, times, strict=True):
+        if not abs(time) < MAX_TIME_S:
+            raise SceneError(
+                f"frame {frame.name} has a time that is no finite number of seconds, or absurdly large: {time}"
+            )
     notes = {"duration_s": times[-1] - times[0]}
     if repeated := len(times) - len(set(times)):
         notes["duplicate_times"] = f"{repeated} frames share their time with another one; all are kept"
@@ -403,21 +436,31 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
     return frames, times, notes
 
 
-def _checked_points(
-    name: str, points: np.ndarray, colors: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
-    """Finite points [P, 3] float64 with their colours. Raises SceneError when fewer than 4 are left."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    finite = np.isfinite(points).all(axis=1)
-    notes: dict[str, Any] = {"points": int(finite.sum())}
-    if not finite.all():
-        notes["points_dropped"] = f"{int((~finite).sum())} points with NaN or infinite coordinates"
-    if finite.sum() < 4:
+def _check_equals(prepared: Mapping[str, _Prepared]) -> None:
+    """Raises SceneError for an image of another type than the others, or another size than those of its camera."""
+    cameras: dict[Any, list[tuple[str, _Prepared]]] = {}
+    for name, p in prepared.items():
+        lens = p.lens
+        seen = (lens.fx / lens.width, lens.fy / lens.height, lens.cx / lens.width, lens.cy / lens.height)
+        cameras.setdefault((tuple(np.round(seen, 9)), lens.distortion, lens.model), []).append((name, p))
+    types = Counter(p.found["type"] for p in prepared.values())
+    (most, count), *others = types.most_common()
+    if others:
+        odd = next(name for name, p in prepared.items() if p.found["type"] != most)
+        kinds = "float images (°C) with integer images" if "float32" in types else "bit depths"
         raise SceneError(
-            f"scene {name} has {int(finite.sum())} finite points, at least 4 are needed to start from; "
-            "check points3D in the sparse model"
+            f"image {odd} is {prepared[odd].found['type']}, {count} others are {most}: the scene mixes {kinds}; convert "
+            "them to one kind"
         )
-    return points[finite], None if colors is None else np.asarray(colors)[finite], notes
+    for frames in cameras.values():
+        sizes = Counter(p.found["size"] for _, p in frames)
+        most, count = sizes.most_common(1)[0]
+        for name, p in frames:
+            size = p.found["size"]
+            if size != most and count >= 3 and (sizes[size] == 1 or p.found["rescaled"]):
+                raise SceneError(
+                    f"image {name} is {size}, but {count} others of the same camera are {most}; copy or export it again"
+                )
 
 
 def _origin_of(frames: Sequence[RawFrame], points: np.ndarray) -> np.ndarray:
@@ -484,8 +527,8 @@ def _image_notes(prepared: Mapping[int, _Prepared], downscale: float) -> dict[st
     if distorted := sum(f["distorted"] for f in found):
         notes["distortion"] = f"{distorted} images undistorted onto a pinhole of the same focal length"
     if nan := sum(f["nan"] for f in found):
-        notes["nan_pixels"] = f"{nan} pixels are NaN or infinite and masked"
-        log.warning("%d pixels are NaN or infinite and masked", nan)
+        notes["nan_pixels"] = f"{nan} pixels are NaN, infinite or below absolute zero and masked"
+        log.warning("%d pixels are NaN, infinite or below absolute zero and masked", nan)
     if rgb := sum(f["rgb_resized"] for f in found):
         notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:

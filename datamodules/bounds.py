@@ -2,41 +2,46 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from heatsplat.datamodules.side_files import finite, json_object
+
 from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.physics.units import KELVIN_AT_0_C
+
+BOUNDS_FILE = "temperature_bounds.json"
+# °C that a camera can read: from absolute zero to beyond any thermal camera.
+MIN_CELSIUS, MAX_CELSIUS = -KELVIN_AT_0_C, 10_000.0
 
 
-def read_json(path: Path) -> Any:
-    """Content of a JSON file. Raises SceneError naming it when it cannot be parsed."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path} is not readable JSON: {error}") from error
+def celsius(value: Any, where: str) -> float:
+    """A temperature in °C. Raises SceneError naming ``where`` when it is no number, or below absolute zero."""
+    number = finite(value, where, "a number in °C")
+    if not MIN_CELSIUS <= number <= MAX_CELSIUS:
+        raise SceneError(f"{where} is {number:g} °C; temperatures lie between {MIN_CELSIUS} and {MAX_CELSIUS:g} °C")
+    return number
 
 
-def number_in(values: dict[str, Any], key: str, path: Path) -> float:
-    """The number under ``key``. Raises SceneError naming file and key when it is missing or no number."""
+def celsius_in(values: Mapping[str, Any], key: str, path: Path) -> float:
+    """The temperature under ``key``. Raises SceneError naming file and key when it is missing or none."""
     if key not in values:
         raise SceneError(f"{path} has no key {key!r}; it has {', '.join(values) or 'none'}")
-    try:
-        return float(values[key])
-    except (TypeError, ValueError) as error:
-        raise SceneError(f"{path}: {key!r} is {values[key]!r}, a number in °C is needed") from error
+    return celsius(values[key], f"{path}: {key!r}")
 
 
-def range_in(path: Path, low: float, high: float, swap: bool = False) -> tuple[ThermalRange, bool]:
+def range_in(source: Path | str, low: float, high: float, swap: bool = False) -> tuple[ThermalRange, bool]:
     """The range of two bounds in °C, and whether they had to be swapped.
 
     Raises:
-        SceneError: the bounds are equal, or swapped and ``swap`` is False.
+        SceneError: the bounds are equal or no temperatures, or swapped while ``swap`` is False; ``source`` is named.
     """
+    low, high = celsius(low, f"{source}: the minimum"), celsius(high, f"{source}: the maximum")
     if low == high:
-        raise SceneError(f"{path}: minimum and maximum are both {low} °C; bounds must differ")
+        raise SceneError(f"{source}: minimum and maximum are both {low} °C; bounds must differ")
     if low > high and not swap:
-        raise SceneError(f"{path}: the minimum {low} °C lies above the maximum {high} °C; swap the two")
+        raise SceneError(f"{source}: the minimum {low} °C lies above the maximum {high} °C; swap the two")
     return ThermalRange(min(low, high), max(low, high)), low > high
 
 
@@ -46,7 +51,7 @@ def read_bounds(path: Path, swap: bool = False) -> tuple[ThermalRange, bool]:
     Raises:
         SceneError: unreadable file, missing key, equal bounds, or swapped ones while ``swap`` is False.
     """
-    values = read_json(path)
-    low = number_in(values, "absolute_min_temperature", path)
-    high = number_in(values, "absolute_max_temperature", path)
+    values = json_object(path)
+    low = celsius_in(values, "absolute_min_temperature", path)
+    high = celsius_in(values, "absolute_max_temperature", path)
     return range_in(path, low, high, swap)

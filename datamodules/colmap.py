@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
-from heatsplat.datamodules.bounds import read_bounds
+from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
-
-BOUNDS_FILE = "temperature_bounds.json"
 
 
 class Colmap(SceneDataModule):
@@ -149,7 +147,7 @@ class Colmap(SceneDataModule):
 
     def _bounds(self, folder: Path) -> tuple[ThermalRange | None, str]:
         if self.bounds_c is not None:
-            return ThermalRange(float(self.bounds_c[0]), float(self.bounds_c[1])), "data.bounds_c"
+            return range_in("data.bounds_c", *self.bounds_c)[0], "data.bounds_c"
         file = folder / BOUNDS_FILE
         return (read_bounds(file)[0], file.name) if file.is_file() else (None, "")
 

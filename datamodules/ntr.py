@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.bounds import range_in
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.points import obj_vertices, random_points
+from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.surroundings import OutdoorDataModule
 from heatsplat.datamodules.weather import utc_seconds
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.contracts import SceneData, SceneError
 
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 
@@ -52,7 +54,7 @@ class NTR(OutdoorDataModule):
         **shared: Any,
     ) -> None:
         super().__init__(split=split, alpha_mask=alpha_mask, **shared)
-        self.bounds = ThermalRange(min_c, max_c)
+        self.bounds, _ = range_in("data.min_c and data.max_c", min_c, max_c)
         self.ambient_c = ambient_c
         self.random_points = random_points
         self.metres_per_unit = metres_per_unit
@@ -65,7 +67,10 @@ class NTR(OutdoorDataModule):
         folder = self.scene_folder(is_scene, " and ".join(FILES.values()))
 
         def describe(frame: dict[str, Any], file: str) -> dict[str, Any]:
-            return {"time_s": None if frame.get("time") is None else self.start_s + float(frame["time"])}
+            time = frame.get("time")
+            return {
+                "time_s": None if time is None else self.start_s + finite(time, f"{file}: time", "a number of seconds")
+            }
 
         frames, missing = listed_frames(self, folder, describe)
         notes: dict[str, Any] = {

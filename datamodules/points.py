@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
 from heatsplat.contracts import SceneError
 from heatsplat.training.rng import generator_for
@@ -42,7 +42,7 @@ def random_points(viewmats: Sequence[np.ndarray], count: int, seed: int) -> np.n
 def obj_vertices(path: Path) -> np.ndarray:
     """Vertices [P, 3] float64 of a Wavefront .obj file. Raises SceneError when a vertex line is damaged."""
     vertices = []
-    with path.open() as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             if line.startswith("v "):
                 try:
@@ -58,9 +58,11 @@ def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         vertex = PlyData.read(str(path))["vertex"]
         points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        names = vertex.data.dtype.names
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+        colours = None
+        if {"red", "green", "blue"} <= set(vertex.data.dtype.names):
+            colours = np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1).astype(np.float64) / 255.0
+    except Exception as error:  # the reader has many of its own, and MemoryError for a count that is no count
         raise SceneError(f"{path} is no readable point cloud: {error}") from error
-    if not {"red", "green", "blue"} <= set(names):
-        return points, None
-    return points, np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1).astype(np.float64) / 255.0
+    if colours is not None and not ((colours >= 0) & (colours <= 1)).all():
+        raise SceneError(f"{path}: red, green and blue must lie between 0 and 255")
+    return points, colours

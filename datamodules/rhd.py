@@ -9,10 +9,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
-from heatsplat.datamodules.bounds import number_in, range_in, read_json
+from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.side_files import json_object
 from heatsplat.datamodules.timestamps import seconds_of_day, unrolled_midnight
 
 from heatsplat.contracts import SceneData, ThermalRange
@@ -118,10 +119,10 @@ def _times(files: list[str]) -> tuple[dict[str, float] | None, dict[str, Any]]:
 def _info(folder: Path) -> tuple[ThermalRange, float, dict[str, Any]]:
     """Bounds, ambient temperature in °C, and notes on what had to be assumed."""
     path = next((p for p in (folder / "info.json", folder.parent / "info.json") if p.is_file()), folder / "info.json")
-    info = read_json(path) if path.is_file() else {}
-    ambient_c = number_in(info, "T_env", path) if "T_env" in info else DEFAULT_AMBIENT_C
-    low = number_in(info, "min_value", path) if "min_value" in info else ambient_c - DEFAULT_MARGIN_K
-    high = number_in(info, "max_value", path) if "max_value" in info else ambient_c + DEFAULT_MARGIN_K
+    info = json_object(path) if path.is_file() else {}
+    ambient_c = celsius_in(info, "T_env", path) if "T_env" in info else DEFAULT_AMBIENT_C
+    low = celsius_in(info, "min_value", path) if "min_value" in info else ambient_c - DEFAULT_MARGIN_K
+    high = celsius_in(info, "max_value", path) if "max_value" in info else ambient_c + DEFAULT_MARGIN_K
     bounds, _ = range_in(path, low, high)
     notes: dict[str, Any] = {"bounds_source": path.name, "ambient_source": path.name}
     if missing := [key for key in ("T_env", "min_value", "max_value") if key not in info]:

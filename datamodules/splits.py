@@ -5,10 +5,11 @@ Positions index the frames as they were passed. ``order`` lists positions in tim
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+
+from heatsplat.datamodules.side_files import json_object, read_text, shortened
 
 from heatsplat.contracts import SceneError
 
@@ -98,13 +99,18 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
     """
     if not path.is_file():
         raise SceneError(f"data.split_file: there is no file {path}")
-    text = path.read_text()
     if path.suffix.lower() == ".json":
-        lists = json.loads(text)
+        lists = json_object(path)
         if "test" not in lists:
             raise SceneError(f'data.split_file: {path} holds no list "test"; it has {", ".join(lists) or "nothing"}')
-    else:
-        lists = {"test": [line.strip() for line in text.splitlines() if line.strip()]}
+        for key in {"train", "test"} & set(lists):
+            if not isinstance(lists[key], list) or not all(isinstance(name, str) for name in lists[key]):
+                raise SceneError(
+                    f'data.split_file: "{key}" in {path} is {shortened(lists[key])}, a list of names is needed'
+                )
+    else:  # Excel may have put names into quotes, and separators behind them
+        lines = (line.strip().rstrip(",;\t").strip('"') for line in read_text(path).splitlines())
+        lists = {"test": [line for line in lines if line]}
     known: dict[str, int] = {}
     for i, name in enumerate(names):
         for key in (name, PurePosixPath(name).name, PurePosixPath(name).stem):

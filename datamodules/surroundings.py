@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.side_files import finite, mapping
 from heatsplat.datamodules.weather import make_weather, read_weather, site_of
 
 from heatsplat.contracts import WEATHER_COLUMNS, Environment, SceneError, Weather
@@ -108,6 +109,7 @@ class OutdoorDataModule(SceneDataModule):
 
 def environment_of(values: Mapping[str, Any] | None, where: str) -> Environment | None:
     """Weather values of one frame, or None without any. Raises SceneError naming ``where`` for a name it does not know."""
+    values = mapping(values, f"{where}: env")
     if not values:
         return None
     if unknown := set(values) - set(WEATHER_COLUMNS):
@@ -115,7 +117,9 @@ def environment_of(values: Mapping[str, Any] | None, where: str) -> Environment 
             f"{where}: env has {', '.join(sorted(unknown))}, which is none of {', '.join(WEATHER_COLUMNS)} (units are in "
             "the names)"
         )
-    return Environment(**{name: None if value is None else float(value) for name, value in values.items()})
+    return Environment(
+        **{name: None if value is None else finite(value, f"{where}: env {name}") for name, value in values.items()}
+    )
 
 
 def _optional(folder: Path, name: str | None, default: str, key: str) -> Path | None:
@@ -136,8 +140,10 @@ def _array(folder: Path, name: str | None, default: str, key: str, axes: int) ->
         return None
     try:
         values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, MemoryError) as error:
         raise SceneError(f"data.{key}: {path} is no readable .npy file: {error}") from error
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+        raise SceneError(f"data.{key}: {path} holds no table of numbers; save one array with numpy.save")
     if values.ndim != axes or not np.isfinite(values).all():
         shape = "[P]" if axes == 1 else "[P, D]"
         raise SceneError(

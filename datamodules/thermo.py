@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from heatsplat.datamodules.base import RawFrame
-from heatsplat.datamodules.bounds import number_in, range_in, read_json
+from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.ntr import FILES, listed_frames, mesh_points
+from heatsplat.datamodules.side_files import finite, json_object, mapping, shortened
 from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
 from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.datamodules.weather import utc_seconds
@@ -73,8 +74,8 @@ class Thermo(OutdoorDataModule):
         looked_for = f"{META_FILE} with {' and '.join(FILES.values())} or sparse/0"
         folder = self.scene_folder(is_scene, looked_for)
         path = folder / META_FILE
-        meta = read_json(path)
-        bounds = {k: number_in(meta, k, path) if own is None else float(own) for k, own in self.bounds_c.items()}
+        meta = json_object(path)
+        bounds = {k: celsius_in(meta, k, path) if own is None else own for k, own in self.bounds_c.items()}
         frames, scene, notes = self._posed(folder, meta)
         if self.test_period is not None:
             frames = self._by_period(frames)
@@ -91,16 +92,12 @@ class Thermo(OutdoorDataModule):
             notes["metres_per_unit"] = (
                 "unknown: methods with areas refuse the scene until data.metres_per_unit is given"
             )
-        elif not float(metres) > 0:
-            raise SceneError(
-                f"{path}: metres_per_unit is {metres}; metres that a unit of the world stands for, above 0"
-            )
         return self.finish(
             folder.name,
             frames,
             thermal_range=range_in(path, bounds["min_value"], bounds["max_value"])[0],
-            ambient_c=None if ambient_c is None else float(ambient_c),
-            metres_per_unit=None if metres is None else float(metres),
+            ambient_c=ambient_c,
+            metres_per_unit=metres,
             notes={"layout": "our convention for Thermo, which is not published", **notes},
             **scene,
             **surroundings,
@@ -141,22 +138,26 @@ class Thermo(OutdoorDataModule):
 
     def _described(self, meta: Mapping[str, Any], entry: Mapping[str, Any], file: str) -> dict[str, Any]:
         """Time, weather and subset of a frame, from its own entry or from meta.json's."""
-        listed = meta.get("frames", {})
+        listed = mapping(meta.get("frames"), f"{META_FILE}: 'frames'")
         also = next(
             (listed[key] for key in (file, Path(file).with_suffix("").as_posix(), stem_of(file)) if key in listed), {}
         )
-        known = {**also, **entry}
         where = f"{META_FILE}, frame {file}"
+        known = {**mapping(also, where), **entry}
         time = None
         if known.get("utc") is not None:
             time = utc_seconds(known["utc"], self.surroundings.zone, where)
         elif known.get("time") is not None:
             start = meta.get("start_utc")
-            time = float(known["time"]) + (
+            time = finite(known["time"], f"{where}: 'time'", "a number of seconds") + (
                 0.0 if start is None else utc_seconds(start, self.surroundings.zone, f"{META_FILE}, start_utc")
             )
         result: dict[str, Any] = {"time_s": time, "environment": environment_of(known.get("env"), where)}
-        return {**result, "subset": known["split"]} if "split" in known else result
+        if "split" not in known:
+            return result
+        if known["split"] not in ("train", "test", None):
+            raise SceneError(f"{where}: split is {shortened(known['split'])}; train, test or null is needed")
+        return {**result, "subset": known["split"]}
 
     def _by_period(self, frames: Sequence[RawFrame]) -> list[RawFrame]:
         """The frames, those within ``test_period`` as test and all others as training frames."""

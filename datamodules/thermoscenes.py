@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
-from heatsplat.datamodules.bounds import read_bounds
+from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.points import ply_points, random_points
 from heatsplat.datamodules.rgbt_scenes import is_paired, paired_frames
+from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.timestamps import stem_of
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
-BOUNDS_FILE = "temperature_bounds.json"
 VISIBLE_FOLDERS = ("images", "rgb", "msx")
 
 
@@ -134,8 +134,8 @@ class ThermoScenes(SceneDataModule):
                 return model.points @ turn[:3, :3].T + turn[:3, 3], model.colors, f"{place} (COLMAP), applied_transform"
             rejected = f"; the model in {model.folder} is not used: its cameras lie up to {apart:.3g} units elsewhere"
         ply = transforms.values.get("ply_file_path")
-        if ply and (folder / ply).is_file():
-            points, colors = ply_points(folder / ply)
+        if ply and (folder / str(ply)).is_file():
+            points, colors = ply_points(folder / str(ply))
             return points, colors, f"{ply}{rejected}"
         points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
         return points, None, f"{len(points)} random points in the cube that the cameras look at{rejected}"
@@ -163,8 +163,10 @@ def _listed_subsets(transforms: Transforms) -> dict[str, str]:
     """Subset by file stem, from the lists that a transforms file may have (train_filenames, ...)."""
     subsets: dict[str, str] = {}
     for key, subset in (("train", "train"), ("val", "test"), ("eval", "test"), ("test", "test")):
-        for name in transforms.values.get(f"{key}_filenames", ()):
-            subsets[stem_of(name)] = subset
+        listed = transforms.values.get(f"{key}_filenames") or []
+        if not isinstance(listed, list):
+            raise SceneError(f"{transforms.path}: {key}_filenames is {shortened(listed)}, a list of names is needed")
+        subsets |= {stem_of(str(name)): subset for name in listed}
     return subsets
 
 

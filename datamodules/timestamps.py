@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
+
+from heatsplat.datamodules.side_files import read_table
 
 from heatsplat.contracts import SceneError
 from heatsplat.physics.units import DAY_S
@@ -50,7 +51,10 @@ def unrolled_midnight(times_s: Sequence[float]) -> tuple[list[float], bool]:
 def dji_time(name: str) -> float | None:
     """Seconds of a DJI name such as DJI_20240806173449_0008_T.JPG (whole seconds, the camera's clock), or None."""
     match = DJI_NAME.search(PurePosixPath(name).name)
-    return _seconds_since_1970(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
+    try:
+        return _seconds_since_1970(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
+    except ValueError:  # fourteen digits that are no date
+        return None
 
 
 def time_by_pattern(name: str, regex: str, form: str | None) -> float:
@@ -80,31 +84,38 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     """Seconds by file stem from a table; the time column holds seconds or ISO 8601 date-times.
 
     Raises:
-        SceneError: no such file or column, or a cell that is neither.
+        SceneError: no such file or column, a cell that is neither, or two times of one file.
     """
     if not path.is_file():
         raise SceneError(f"data.time_csv: there is no file {path}")
-    with path.open(newline="") as file:
-        rows = csv.DictReader(file)
-        columns = rows.fieldnames or []
-        for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
-            if column not in columns:
-                raise SceneError(f"data.{key}={column}: {path} has no such column; it has {', '.join(columns)}")
-        times: dict[str, float] = {}
-        for number, row in enumerate(rows, start=2):
-            cell = row[time_column] or ""
-            try:
-                seconds = float(cell)
-            except ValueError:
-                try:
-                    seconds = _seconds_since_1970(datetime.fromisoformat(cell.strip()))
-                except ValueError as error:
-                    raise SceneError(
-                        f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
-                        "such as 2024-08-06T15:35:05.376"
-                    ) from error
-            times[stem_of(row[name_column])] = seconds
+    table = read_table(path)
+    for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
+        if column not in table.columns:
+            raise SceneError(f"data.{key}={column}: {path} has no such column; it has {', '.join(table.columns)}")
+    name_at, time_at = table.columns.index(name_column), table.columns.index(time_column)
+    times: dict[str, float] = {}
+    for number, row in table.rows:
+        cell, stem = row[time_at], stem_of(row[name_at])
+        try:
+            seconds = _seconds_of(table.pointed(cell))
+        except ValueError as error:
+            raise SceneError(
+                f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
+                "such as 2024-08-06T15:35:05.376"
+            ) from error
+        if times.setdefault(stem, seconds) != seconds:
+            raise SceneError(
+                f"{path}, line {number}: {row[name_at]} has another time in a line above; keep one of them"
+            )
     return times
+
+
+def _seconds_of(text: str) -> float:
+    """Seconds, or those of an ISO date-time since 1970. Raises ValueError for anything else."""
+    try:
+        return float(text)
+    except ValueError:
+        return _seconds_since_1970(datetime.fromisoformat(text))
 
 
 def stem_of(name: str) -> str:

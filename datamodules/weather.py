@@ -11,7 +11,6 @@ import csv
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
@@ -21,6 +20,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 import torch
 from heatsplat.datamodules.assemble import on_clock, weather_of
+from heatsplat.datamodules.side_files import finite, read_table, shortened
 from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
@@ -199,8 +199,15 @@ def site_of(notes: Mapping[str, Any]) -> Site | None:
     """The site that a record's notes name, or None."""
     if notes.get("latitude") is None or notes.get("longitude") is None:
         return None
-    axes = {key: tuple(map(float, notes[key])) for key in ("up", "north") if notes.get(key) is not None}
-    return Site(float(notes["latitude"]), float(notes["longitude"]), float(notes.get("altitude_m") or 0.0), **axes)
+    place = (finite(notes.get(key) or 0.0, key) for key in ("latitude", "longitude", "altitude_m"))
+    axes = {key: _axis(notes[key], key) for key in ("up", "north") if notes.get(key) is not None}
+    return Site(*place, **axes)
+
+
+def _axis(values: Any, key: str) -> tuple[float, ...]:
+    if isinstance(values, str) or not isinstance(values, Sequence):
+        raise SceneError(f"{key} is {shortened(values)}, three numbers are needed")
+    return tuple(finite(value, key) for value in values)
 
 
 def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
@@ -211,7 +218,7 @@ def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
     """
     try:
         return float(text)
-    except ValueError:
+    except (ValueError, TypeError, OverflowError):
         pass
     try:
         moment = datetime.fromisoformat(str(text).strip())
@@ -267,30 +274,14 @@ def _quantity(plain: str) -> tuple[str, tuple[float, float]] | None:
     return None
 
 
-def _text(path: Path) -> str:
-    """The text of a file in UTF-8 or in one of the encodings that Excel saves tables in."""
-    content = path.read_bytes()
-    encodings = ("utf-16",) if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252")
-    for encoding in encodings:
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding)
-    raise SceneError(f"{path} is no text; save the table as CSV in UTF-8")
-
-
 def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
     """Times [T] and columns [T] (NaN where missing) of a table in our units, unsorted, and notes."""
     if not path.is_file():
         raise SceneError(f"there is no weather table {path}")
-    lines = [
-        (number, line)
-        for number, line in enumerate(_text(path).splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith(("#", "sep="))  # "sep=;" is Excel's first line
-    ]
-    if len(lines) < 3:
+    table = read_table(path)
+    if len(table.rows) < 2:
         raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
-    delimiter = max(",;\t|", key=lines[0][1].count)
-    rows = csv.reader([line for _, line in lines], delimiter=delimiter)
-    header = next(rows)
+    header = table.columns
     plain = [_plain(name) for name in header]
     time_at = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
     if time_at is None:
@@ -318,20 +309,20 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
         raise SceneError(f"{path} has none of the columns {', '.join(WEATHER_COLUMNS)}; it has {', '.join(header)}")
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
-    for row in rows:
-        number = lines[rows.line_num - 1][0]
-        if len(row) < len(header):
-            raise SceneError(f"{path}, line {number}: {len(row)} cells for {len(header)} columns")
-        cells = [cell.strip() if delimiter == "," else cell.strip().replace(",", ".") for cell in row]
-        where = f"{path}, line {number}, column {header[time_at]}"
-        times.append(utc_seconds(cells[time_at], own_zone, where))
+    for number, cells in table.rows:
+        times.append(
+            utc_seconds(table.pointed(cells[time_at]), own_zone, f"{path}, line {number}, column {header[time_at]}")
+        )
         for name, (position, (scale, offset)) in wanted.items():
             cell = cells[position]
+            if cell.lower() in MISSING:
+                values[name].append(np.nan)
+                continue
             try:
-                values[name].append(np.nan if cell.lower() in MISSING else scale * float(cell) + offset)
+                values[name].append(scale * table.number(cell) + offset)
             except ValueError as error:
                 raise SceneError(
-                    f"{path}, line {number}: {row[position]!r} in column {header[position]} is no number"
+                    f"{path}, line {number}: {cell!r} in column {header[position]} is no number"
                 ) from error
     seconds = np.array(times)
     kinds = set((seconds >= FIRST_EPOCH_S).tolist())

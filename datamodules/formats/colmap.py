@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2  # noqa: F401, I001
 import numpy as np
 import pycolmap
+from heatsplat.datamodules.formats.colmap_records import check_records
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 from heatsplat.contracts import SceneError
@@ -59,12 +60,7 @@ def read_model(scene: Path) -> SparseModel:
             "Reconstruct the scene with COLMAP first, or point data.root and data.scene at the folder above sparse/."
         )
     suffix = "bin" if (folder / "cameras.bin").is_file() else "txt"
-    for part in ("cameras", "images", "points3D"):
-        file = folder / f"{part}.{suffix}"
-        if not file.is_file():
-            raise SceneError(f"sparse model {folder} has no {file.name}; copy or export it again")
-        if file.stat().st_size == 0:  # pycolmap ends the process on it
-            raise SceneError(f"sparse model {folder}: {file.name} is empty (0 bytes); copy or export it again")
+    check_records(folder, suffix)
     try:
         model = pycolmap.Reconstruction(str(folder))
     except Exception as error:

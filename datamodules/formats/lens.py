@@ -26,6 +26,8 @@ MODELS = {
 }
 _POLYNOMIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("k1", "k2", "k3", "k4")
+# What no camera exceeds: pixels of a side, focal length in image sides, and the principal point's way from the centre.
+MAX_PIXELS, MAX_FOCAL, MAX_SHIFT = 100_000, 1e4, 10.0
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,24 @@ class Lens:
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        width, height = self.width, self.height
+        if not (0 < width <= MAX_PIXELS and 0 < height <= MAX_PIXELS):
+            raise SceneError(
+                f"camera {self.model} is {width} x {height}; both must lie between 1 and {MAX_PIXELS} pixels"
+            )
         if not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
             raise SceneError(
                 f"camera {self.model} has impossible parameters: {numbers}; focal lengths must be positive"
+            )
+        if not (
+            1e-2 < self.fx / width < MAX_FOCAL
+            and 1e-2 < self.fy / height < MAX_FOCAL
+            and abs(self.cx / width - 0.5) < MAX_SHIFT
+            and abs(self.cy / height - 0.5) < MAX_SHIFT
+        ):
+            raise SceneError(
+                f"camera {self.model} of {width} x {height} pixels has impossible parameters: {numbers}; focal length and "
+                "principal point are pixels of that image"
             )
 
     @classmethod

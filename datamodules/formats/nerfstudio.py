@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from heatsplat.datamodules.bounds import read_json
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
+from heatsplat.datamodules.poses import checked_pose
+from heatsplat.datamodules.side_files import finite, json_object, shortened
 
 from heatsplat.contracts import SceneError
 
@@ -35,20 +36,15 @@ class Transforms:
     @property
     def applied_transform(self) -> np.ndarray:
         """What was done to COLMAP's world to get this one [4, 4]; the identity where the file does not say."""
-        matrix = np.eye(4)
-        given = np.array(self.values.get("applied_transform", matrix[:3]), dtype=np.float64)
-        if given.shape not in ((3, 4), (4, 4)):
-            raise SceneError(f"{self.path}: applied_transform must be 3x4 or 4x4, got {given.shape}")
-        matrix[:3] = given[:3]
-        return matrix
+        return checked_pose(self.values.get("applied_transform", np.eye(4)), f"{self.path}: applied_transform")
 
 
 def read_transforms(path: Path) -> Transforms:
     """A transforms file. Raises SceneError naming file and key when frames are missing or incomplete."""
-    values = read_json(path)
-    if not isinstance(values, dict) or not values.get("frames"):
-        raise SceneError(f"{path} has no frames (key 'frames')")
-    frames = values.pop("frames")
+    values = json_object(path)
+    frames = values.pop("frames", None)
+    if not frames or not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise SceneError(f"{path} has no frames: key 'frames' is {shortened(frames)}, a list of {{...}} is needed")
     for i, frame in enumerate(frames):
         for key in ("file_path", "transform_matrix"):
             if key not in frame:
@@ -65,15 +61,9 @@ def viewmat_of(transforms: Transforms, frame: dict[str, Any], opengl: bool) -> n
         opengl: True when camera axes are OpenGL's (x right, y up, z back), False when they are OpenCV's already.
 
     Raises:
-        SceneError: the matrix is not 4x4, not finite or singular.
+        SceneError: the matrix is no pose; it is named with its file and frame (``poses.checked_pose``).
     """
-    c2w = np.array(frame["transform_matrix"], dtype=np.float64)
-    if c2w.shape == (3, 4):
-        c2w = np.vstack([c2w, [0.0, 0.0, 0.0, 1.0]])
-    if c2w.shape != (4, 4) or not np.isfinite(c2w).all() or abs(np.linalg.det(c2w[:3, :3])) < 1e-6:
-        raise SceneError(
-            f"{transforms.path}: transform_matrix of {frame['file_path']} is no camera pose (4x4, invertible)"
-        )
+    c2w = checked_pose(frame["transform_matrix"], f"{transforms.path}: transform_matrix of {frame['file_path']}")
     if opengl:
         c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])
     return np.linalg.inv(c2w)
@@ -96,14 +86,20 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
     source = f"{transforms.path}, {frame['file_path']}"
     if model not in MODELS:
         lens_of(model, (), 0, 0, source)  # raises, naming the supported models
-    width, height = (int(values["w"]), int(values["h"])) if "w" in values and "h" in values else size()
+
+    def number(key: str, default: float = 0.0) -> float:
+        return finite(values.get(key, default), f"{source}: {key}")
+
+    width, height = (int(number("w")), int(number("h"))) if "w" in values and "h" in values else size()
     if "fl_x" in values:
-        fx = float(values["fl_x"])
+        fx = number("fl_x")
     elif "camera_angle_x" in values:
-        fx = 0.5 * width / math.tan(0.5 * float(values["camera_angle_x"]))
+        angle = number("camera_angle_x")
+        if not 0 < angle < math.pi:
+            raise SceneError(f"{source}: camera_angle_x is {angle:g}, the field of view in radians (0 to pi) is needed")
+        fx = 0.5 * width / math.tan(0.5 * angle)
     else:
         raise SceneError(f"{source}: no focal length; fl_x or camera_angle_x is needed")
-    fy = float(values.get("fl_y", fx))
-    known = {"f": fx, "fx": fx, "fy": fy, "cx": values.get("cx", width / 2), "cy": values.get("cy", height / 2)}
-    params = [float(known.get(key, values.get(key, 0.0))) for key in MODELS[model].split()]
+    known = {"f": fx, "fx": fx, "fy": number("fl_y", fx), "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
+    params = [known[key] if key in known else number(key) for key in MODELS[model].split()]
     return lens_of(model, params, width, height, source)

@@ -213,14 +213,17 @@ def test_a_model_that_misses_a_file_names_it(tmp_path):
     with pytest.raises(SceneError, match=r"points3D.bin is empty \(0 bytes\)"):
         read_model(tmp_path)
     (folder / "points3D.bin").unlink()
-    with pytest.raises(SceneError, match="has no points3D.bin; copy or export it again"):
+    with pytest.raises(SceneError, match="has no points3D.bin; copy the model or export"):
         read_model(tmp_path)
 
 
 def test_a_damaged_model_is_named(tmp_path):
     folder = find_model(write_colmap(tmp_path, names(9)))
     (folder / "images.bin").write_bytes((folder / "images.bin").read_bytes()[:60])
-    with pytest.raises(SceneError, match="sparse model .*sparse/0 is damaged"):
+    with pytest.raises(
+        SceneError,
+        match="images.bin is cut short or damaged: it announces 9 records, and its 60 bytes end before number 1 is",
+    ):
         read_model(tmp_path)
 
 

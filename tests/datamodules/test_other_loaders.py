@@ -165,7 +165,7 @@ def test_ntr_transparent_pixels_do_not_count(tmp_path):
 def test_ntr_bounds_are_options(tmp_path):
     scene = loaded(NTR, write_ntr(tmp_path), min_c=-20.0, max_c=20.0, ambient_c=None)
     assert scene.thermal_range.min_c == -20 and scene.ambient_c is None
-    with pytest.raises(SceneError, match="thermal range 50.0 .. 10.0"):
+    with pytest.raises(SceneError, match="data.min_c and data.max_c: the minimum 50.0 °C lies above"):
         NTR(min_c=50.0, max_c=10.0)
 
 

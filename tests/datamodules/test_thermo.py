@@ -122,7 +122,7 @@ def test_options_win_over_what_the_scene_says(yard):
     assert scene.weather.sun[noon, 0] < -0.3  # in the south, which is -x now
     with pytest.raises(SceneError, match="W/m² of sunlight at .* below the horizon of -30, 9. Check the time zone"):
         loaded(yard, latitude=-30.0)
-    with pytest.raises(SceneError, match="metres_per_unit is -1"):
+    with pytest.raises(SceneError, match="metres_per_unit of scene yard is -1"):
         loaded(yard, metres_per_unit=-1.0)
 
 

@@ -199,7 +199,7 @@ def test_the_paired_layout_is_read_too(tmp_path):
     ("change", "message"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR is not supported"),
-        ({"applied_transform": [[1, 0], [0, 1]]}, "applied_transform must be 3x4 or 4x4"),
+        ({"applied_transform": [[1, 0], [0, 1]]}, "applied_transform is no pose: it is \\[2, 2\\], 4x4"),
         ({"frames": []}, "has no frames"),
         ({"frames": [{"file_path": "a.png"}]}, "frame 0 has no key 'transform_matrix'; it has file_path"),
     ],
@@ -215,7 +215,7 @@ def test_bad_transforms_are_refused(tmp_path, change, message):
 @pytest.mark.parametrize("matrix", [np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)])
 def test_matrices_that_are_no_poses_are_refused(tmp_path, matrix):
     transforms = read_transforms(write_thermoscenes(tmp_path, STEMS) / "transforms_thermal.json")
-    with pytest.raises(SceneError, match="transform_matrix of x is no camera pose"):
+    with pytest.raises(SceneError, match="transform_matrix of x is no pose"):
         viewmat_of(transforms, {"file_path": "x", "transform_matrix": matrix.tolist()}, opengl=True)
 
 

@@ -1,0 +1,121 @@
+"""Small files beside the images, as people and their programs write them: JSON, tables, lists of names.
+
+Text is UTF-8 with or without a byte order mark, UTF-16 with one, or else Windows' own encoding (Excel writes all four).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from heatsplat.contracts import SceneError
+
+
+def read_text(path: Path) -> str:
+    """Content of a text file. Raises SceneError when it cannot be read."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error.strerror}") from error
+    marked = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    for encoding in ["utf-16"] if marked else ["utf-8-sig", "cp1252"]:
+        try:
+            return data.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise SceneError(f"{path} is no text file; save it as UTF-8")
+
+
+def read_json(path: Path) -> Any:
+    """Content of a JSON file. Raises SceneError naming it when it cannot be parsed."""
+    try:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path} is not readable JSON: {error}") from error
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """Content of a JSON file that holds keys and values. Raises SceneError when it holds anything else."""
+    return mapping(read_json(path), str(path))
+
+
+def mapping(values: Any, where: str) -> dict[str, Any]:
+    """Keys and values, none for None. Raises SceneError naming ``where`` for anything else."""
+    if not isinstance(values, dict | None):
+        raise SceneError(f"{where} must hold keys and values in braces {{...}}, it holds {shortened(values)}")
+    return values or {}
+
+
+def finite(value: Any, where: str, what: str = "a number") -> float:
+    """A number, which may stand in quotes, with a point or a comma. Raises SceneError, naming ``where``, for all else."""
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        number = float(value.replace(",", ".") if isinstance(value, str) else value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SceneError(f"{where} is {shortened(value)}, {what} is needed") from error
+    if not math.isfinite(number):
+        raise SceneError(f"{where} is {number}, {what} is needed")
+    return number
+
+
+def shortened(value: Any, most: int = 60) -> str:
+    """``repr`` of a value for messages, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= most else text[:most] + "..."
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: names of its columns, and each row as (number of its line, one cell per column)."""
+
+    path: Path
+    columns: list[str]
+    rows: list[tuple[int, list[str]]]
+    decimal_comma: bool
+
+    def number(self, cell: str) -> float:
+        """The number in a cell. Raises ValueError when it is none."""
+        return float(self.pointed(cell))
+
+    def pointed(self, cell: str) -> str:
+        """The cell with a decimal point."""
+        return cell.replace(",", ".") if self.decimal_comma else cell
+
+
+def read_table(path: Path) -> Table:
+    """A table with a line of column names.
+
+    **Convention:** columns are separated by comma, semicolon, tab or bar, whichever the first line has most of; only
+    where they are not separated by commas may a number have a decimal comma. Lines that begin with #, empty ones, and
+    Excel's line "sep=;" are skipped.
+
+    Raises:
+        SceneError: it cannot be read, or a row has fewer cells than there are columns; the message names the line.
+    """
+    lines = [
+        (number, line)
+        for number, line in enumerate(read_text(path).splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#") and not re.fullmatch(r"\s*sep=.\s*", line)
+    ]
+    if not lines:
+        raise SceneError(f"{path} is empty; a line of column names and rows below it are needed")
+    delimiter = max(",;\t|", key=lines[0][1].count)
+
+    def cells(line: str) -> list[str]:
+        try:
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+        except csv.Error as error:
+            raise SceneError(f"{path}: {shortened(line)} is no row of a table ({error})") from error
+
+    columns = cells(lines[0][1])
+    rows = [(number, row) for number, line in lines[1:] if any(row := cells(line))]
+    for number, row in rows:
+        if len(row) < len(columns):
+            raise SceneError(f"{path}, line {number}: {len(row)} cells for {len(columns)} columns")
+    return Table(path, columns, rows, decimal_comma=delimiter != ",")
