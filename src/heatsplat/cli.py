@@ -225,7 +225,7 @@ def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     from heatsplat.training.session import prepare_machine
 
     prepare_machine(config["threads"])
-    trained = load(config["ckpt"], config["data"], output_dir=output_dir)
+    trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
     trainer = build_trainer(trained.config["trainer"] | {"accelerator": config["accelerator"]}, config, output_dir)
     trainer.test(trained.module, datamodule=trained.data, verbose=False)
     return trained.module.results.test.get("psnr")
@@ -245,7 +245,9 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     if config["unseen"] not in UNSEEN:
         raise SceneError(f"unseen must be one of {', '.join(UNSEEN)}, got '{config['unseen']}'")
     prepare_machine(config["threads"])
-    trained = load(config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir)
+    trained = load(
+        config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
+    )
     frames = plan(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
     keep = config["unseen"] == "keep"
     images = (

@@ -13,7 +13,7 @@ from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
 from heatsplat.runs.folder import OccupiedError, locked
 from heatsplat.runs.resume import differences
-from heatsplat.training.session import load_checkpoint
+from heatsplat.training.checkpoints import load_checkpoint
 
 QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "trainer.limit_test_batches=1")
 QUICK = (*QUICK, "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", "callbacks.statistics=null")

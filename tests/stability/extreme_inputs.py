@@ -16,8 +16,9 @@ from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet, Weather
 from heatsplat.geometry.projection import look_at
 from heatsplat.runs.run import build_callbacks
+from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.rng import generator_for
-from heatsplat.training.session import fit, load_checkpoint, prepare_machine
+from heatsplat.training.session import fit, prepare_machine
 
 WIDTH, HEIGHT, FRAMES, POINTS, STEPS = 24, 20, 6, 80, 300
 SPAN_S = 1000.0

@@ -86,7 +86,7 @@ def test_every_table_is_planned_and_composes(path, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_every_row_of_every_table_composes_as_a_recipe_of_its_own(path, tmp_path):
+def test_every_row_of_every_table_composes_as_a_stored_config_its_own(path, tmp_path):
     name = path.stem.removeprefix("table_")
     plan = plan_of(name, everything(tmp_path, name), have=ALL_METHODS)
     first = {run.row: run for run in reversed(plan.runs)}

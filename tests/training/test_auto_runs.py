@@ -15,7 +15,8 @@ from heatsplat.effects.base import Verdict
 from heatsplat.io.results import RunResults
 from heatsplat.runs.checks import checked
 from heatsplat.runs.resume import resumed
-from heatsplat.training.session import load_checkpoint, restore
+from heatsplat.training.checkpoints import load_checkpoint
+from heatsplat.training.session import restore
 
 SHORT = (*TINY, "max_steps=12", "density=fixed", "trainer.val_check_interval=12", "trainer.limit_test_batches=1")
 PRESENT = ("relaxation", "frame_offset")

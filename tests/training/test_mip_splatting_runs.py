@@ -10,7 +10,8 @@ from heatsplat.density.ops import Cloud
 from heatsplat.geometry.smoothing import sampling_intervals
 from heatsplat.renderers.smoothing import SamplingFilter
 from heatsplat.splats import Splats
-from heatsplat.training.session import load_checkpoint, restore
+from heatsplat.training.checkpoints import load_checkpoint
+from heatsplat.training.session import restore
 
 SHORT = (
     *TINY,

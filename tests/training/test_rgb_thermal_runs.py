@@ -10,8 +10,8 @@ from running import TINY, run
 from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
 from heatsplat.runs.stepping import Stepper
+from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.init import ABSENT
-from heatsplat.training.session import load_checkpoint
 
 SHORT = (
     *TINY,

@@ -8,7 +8,7 @@ import torch
 from running import TINY, run
 
 from heatsplat.contracts import SceneError
-from heatsplat.training.session import load_checkpoint
+from heatsplat.training.checkpoints import load_checkpoint
 
 SHORT = (
     *TINY,

@@ -121,13 +121,16 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def write_atomically(path: str | Path, text: str) -> None:
-    """Writes a text file through a temporary one beside it, and makes its folder."""
+def write_atomically(path: str | Path, content: str | bytes | memoryview) -> None:
+    """Writes a file through a temporary one beside it, which is on the disk before it gets the name; makes its folder."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        temporary.write_text(text, encoding="utf-8")
+        with temporary.open("wb") as file:
+            file.write(content.encode("utf-8") if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -9,8 +9,9 @@ from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
+from heatsplat.runs.recipe import known
+from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
-from heatsplat.training.session import load_checkpoint
 
 log = logging.getLogger("heatsplat")
 
@@ -39,7 +40,7 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         if changed:
             log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
             break
-        config = config | {key: stored[key] for key in ("verdicts", "budget") if key in stored}
+        config = config | _measured(stored, path, "verdicts", "budget")
         if checkpoint["global_step"] < planned_end(checkpoint):
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return config | {"ckpt": str(path)}
@@ -98,7 +99,14 @@ def completed(config: dict[str, Any], composed: Mapping[str, Any]) -> dict[str, 
 
 def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of the run that wrote a checkpoint; empty where none of ours did."""
-    return checkpoint.get(CHECKPOINT_KEY, {}).get("config", {})
+    own = checkpoint.get(CHECKPOINT_KEY)
+    config = own.get("config") if isinstance(own, dict) else None
+    return config if isinstance(config, dict) else {}
+
+
+def _measured(stored: Mapping[str, Any], path: Path | str, *keys: str) -> dict[str, Any]:
+    """What an earlier run found out, of which the parts of this one will be built."""
+    return known({key: stored[key] for key in keys if key in stored}, path)
 
 
 def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
@@ -117,9 +125,8 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
             raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
         if plan["asked_s"] != asked:
             raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
-        config = config | {"budget": plan}
-    if "scene" in stored:
-        config = config | {"scene": stored["scene"]}
+        config = config | _measured(stored, ckpt, "budget")
+    config = config | _measured(stored, ckpt, "scene")
     if "verdicts" in stored and assembly.chooses(config):
         changed = assembly.changed(config, stored)
         if changed:
@@ -127,5 +134,5 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
                 f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "
                 "without ckpt"
             )
-        config = config | {"verdicts": stored["verdicts"]}
+        config = config | _measured(stored, ckpt, "verdicts")
     return config

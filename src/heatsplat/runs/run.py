@@ -6,7 +6,8 @@ A configuration is a dict of plain containers, and every step of ``begin`` retur
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -23,11 +24,13 @@ from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
 from heatsplat.runs.folder import locked, results_in
-from heatsplat.runs.resume import completed, on_scene, resumed
+from heatsplat.runs.recipe import known
+from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings
-from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
-from heatsplat.training.session import fit, load_checkpoint, prepare_machine, restore
+from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
+from heatsplat.training.module import SplatTraining
+from heatsplat.training.session import fit, prepare_machine, restore
 
 log = logging.getLogger("heatsplat")
 
@@ -106,7 +109,8 @@ def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], outpu
     """The trainer of a configuration, with the callbacks and the logger of ``watching``, which write into the run's folder."""
     logger = watching["logger"] and build({**watching["logger"], "save_dir": str(output_dir)})
     callbacks = build_callbacks(watching["callbacks"], output_dir)
-    return build(dict(trainer), callbacks=callbacks, logger=logger, default_root_dir=str(output_dir))
+    places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
+    return build(dict(trainer), callbacks=callbacks, logger=logger, **places)
 
 
 def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]:
@@ -180,6 +184,7 @@ def load(
     weather: Path | str | None = None,
     weather_zone: str | None = None,
     output_dir: Path | str = ".",
+    trust: Sequence[str] = (),
 ) -> Trained:
     """The trained scene of a checkpoint.
 
@@ -189,22 +194,25 @@ def load(
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
+        trust: classes of yours that the checkpoint may name, fully dotted (``runs.recipe.known``).
 
     Raises:
-        SceneError: there is no checkpoint of a run, or its method or data set has no weather to change.
+        SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no
+            weather to change.
     """
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
     loaded = load_checkpoint(checkpoint)
-    if CHECKPOINT_KEY not in loaded:
+    config = known(stored_config(loaded), checkpoint, trust)
+    if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
-    config = loaded[CHECKPOINT_KEY]["config"]
     changed = {key: value for key, value in (data or {}).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
     if "weather" in changed and "weather" not in config["data"]:
         raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
-    module = build_module(config, Path(output_dir))
+    with _told_of(checkpoint):
+        module = build_module(config, Path(output_dir))
     if weather is not None and "weather" not in module.thermal.needs:
         raise SceneError(
             f"weather={weather} changes nothing: {type(module.thermal).__name__} does not use weather. Train a method that "
@@ -213,5 +221,20 @@ def load(
     scene_data = build(config["data"] | changed)
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
-    restore(module, scene_data, loaded)
+    with _told_of(checkpoint):
+        restore(module, scene_data, loaded)
     return Trained(config, module, scene_data, loaded)
+
+
+@contextmanager
+def _told_of(checkpoint: Path | str) -> Iterator[None]:
+    """Errors of building from a checkpoint, in which anything may stand, name it."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{checkpoint}: {error}") from error
+    except Exception as error:
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise SceneError(
+            f"{checkpoint} does not fit this heatsplat ({said}): it is of another version, or not as heatsplat wrote it"
+        ) from error

@@ -7,7 +7,6 @@ import signal
 import sys
 import warnings
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
@@ -78,18 +77,6 @@ class StopOnInterrupt(pl.Callback):
             signal.signal(signal.SIGINT, before)
 
 
-def load_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The checkpoint as a dict of tensors and plain containers. Raises SceneError when there is none at ``path``."""
-    path = Path(path)
-    if not path.is_file():
-        there = sorted(str(p) for p in path.parent.glob("*.ckpt")) or sorted(str(p) for p in path.rglob("*.ckpt"))
-        raise SceneError(f"no checkpoint at {path}" + (f"; there are: {', '.join(there)}" if there else ""))
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise SceneError(f"{path} is not a checkpoint that can be read: {error}") from error
-
-
 def fit(
     module: SplatTraining,
     data: pl.LightningDataModule,
@@ -98,8 +85,6 @@ def fit(
     test: bool = True,
 ) -> RunResults:
     """Trains, then tests; what was measured. After Ctrl-C the process ends with code 130 and says how to go on."""
-    if ckpt is not None:
-        load_checkpoint(ckpt)
     stop = next(callback for callback in trainer.callbacks if isinstance(callback, StopOnInterrupt))
     with stop.listening():
         trainer.fit(module, datamodule=data, ckpt_path=ckpt)
@@ -114,9 +99,18 @@ def fit(
 
 
 def restore(module: SplatTraining, data: pl.LightningDataModule, checkpoint: dict[str, Any]) -> SplatTraining:
-    """The module with the weights of a checkpoint, ready to predict views of the data module's scene."""
+    """The module with the weights of a checkpoint, ready to predict views of the data module's scene.
+
+    Raises:
+        SceneError: the weights are not finite, or the scene lacks what the module needs.
+    """
     data.setup("test")
     module.attach(data.scene)
     module.on_load_checkpoint(checkpoint)
     module.load_state_dict(checkpoint["state_dict"])
+    broken = [name for name, parameter in module.named_parameters() if not bool(parameter.isfinite().all())]
+    if broken:
+        raise SceneError(
+            f"the checkpoint holds NaN or infinite values in {', '.join(broken)}; heatsplat writes no such file"
+        )
     return module.eval()
