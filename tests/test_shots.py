@@ -11,17 +11,17 @@ from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import View, ViewSet
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import beyond_record, develop, plan, sightings
+from heatsplat.shots import beyond_record, shot_frames, sightings, write_shot
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
     scene = make_scene()
-    frames = plan(scene, "view", 0.0, 0, 1)
+    frames = shot_frames(scene, "view", 0.0, 0, 1)
     height, width = frames[0].camera.height, frames[0].camera.width
     seen = torch.ones(height, width, dtype=torch.bool)
     seen[0] = False
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        develop([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
+        write_shot([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
     values = read_temperature(next(tmp_path.glob("tiff/*.tiff")))
     assert np.isnan(values[0]).all()
     assert np.allclose(values[1:], scene.thermal_range.to_celsius(0.5))
@@ -32,10 +32,10 @@ def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
 
 def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
     scene = make_scene()
-    frames = plan(scene, "view", 0.0, 0, 1)
+    frames = shot_frames(scene, "view", 0.0, 0, 1)
     camera = frames[0].camera
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        develop([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
+        write_shot([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
     assert np.isfinite(read_temperature(next(tmp_path.glob("tiff/*.tiff")))).all()
     assert "no training view" not in caplog.text
 

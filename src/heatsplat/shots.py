@@ -24,7 +24,7 @@ log = logging.getLogger("heatsplat")
 TRAJECTORIES = ("orbit", "path", "test", "train", "view")
 
 
-def plan(
+def shot_frames(
     scene: SceneData,
     trajectory: str = "orbit",
     time: float | Sequence[float] | None = None,
@@ -132,7 +132,7 @@ def beyond_record(scene: SceneData, time_s: float | None) -> float:
     return max(min(times) - time_s, time_s - max(times), 0.0)
 
 
-def develop(
+def write_shot(
     images: Iterable[tuple[Tensor, Tensor | None]],
     frames: Sequence[Frame],
     scene: SceneData,
