@@ -24,8 +24,8 @@ from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
 from heatsplat.runs.folder import locked, results_in
-from heatsplat.runs.recipe import known
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
+from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
@@ -194,7 +194,7 @@ def load(
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
-        trust: classes of yours that the checkpoint may name, fully dotted (``runs.recipe.known``).
+        trust: classes of yours that the checkpoint may name, fully dotted (``runs.trust.trusted``).
 
     Raises:
         SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no
@@ -203,7 +203,7 @@ def load(
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
     loaded = load_checkpoint(checkpoint)
-    config = known(stored_config(loaded), checkpoint, trust)
+    config = trusted(stored_config(loaded), checkpoint, trust)
     if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
     changed = {key: value for key, value in (data or {}).items() if value is not None}
