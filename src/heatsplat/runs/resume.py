@@ -127,8 +127,8 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
             raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
         config = config | _measured(stored, ckpt, "budget")
     config = config | _measured(stored, ckpt, "scene")
-    if "verdicts" in stored and assembly.chooses(config):
-        changed = assembly.changed(config, stored)
+    if "verdicts" in stored and assembly.chooses_effects(config):
+        changed = assembly.changed_keys(config, stored)
         if changed:
             raise SceneError(
                 f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "
