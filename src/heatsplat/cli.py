@@ -239,7 +239,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.contracts import SceneError
     from heatsplat.runs.run import UNSEEN, load
-    from heatsplat.shots import shot_frames, write_shot
+    from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
     from heatsplat.training.session import prepare_machine
 
     if config["unseen"] not in UNSEEN:
@@ -249,6 +249,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
     )
     frames = shot_frames(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
+    warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
     keep = config["unseen"] == "keep"
     images = (
         (trained.module.predict(frame).cpu(), None if keep else trained.seen(frame))

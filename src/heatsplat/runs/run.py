@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,7 @@ from heatsplat.runs.folder import locked, results_in
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
-from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.module import SplatTraining
 from heatsplat.training.session import fit, prepare_machine, restore
@@ -137,6 +137,7 @@ class Trained:
     module: SplatTraining
     data: Any
     checkpoint: dict[str, Any]
+    _warned: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     @property
     def scene(self) -> SceneData:
@@ -145,6 +146,8 @@ class Trained:
 
     def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
         """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
+
+        The first moment beyond the training record is warned of: it is a prediction.
 
         Args:
             camera: where from; a frame of the scene (``scene.test.frames[0]``) has a camera and a time of its own.
@@ -159,6 +162,8 @@ class Trained:
             raise ValueError(f"unseen must be one of {', '.join(UNSEEN)}, got '{unseen}'")
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
+        if not self._warned and warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record):
+            self._warned.add("beyond the record")
         image = self.module.predict(frame)[..., 0].cpu()
         image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
         return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
