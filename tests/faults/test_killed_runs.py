@@ -19,7 +19,7 @@ SHORT = (
     "method=3dgs", "data.size=tiny", "data.downscale=4", "max_steps=8", "threads=1", "callbacks.images=null",
     "callbacks.probes=null", "callbacks.costs.fps_repeats=1", "callbacks.costs.warmup_steps=1", "callbacks.statistics=null",
     "callbacks.metrics.lpips_net=null", "trainer.val_check_interval=4", "callbacks.report.show=false",
-    "callbacks.progress.enabled=false", "logger=null",
+    "callbacks.progress.enabled=false",
 )  # fmt: skip
 
 
@@ -38,7 +38,7 @@ class KillAfter(pl.Callback):
 
 @pytest.fixture(scope="module")
 def config():
-    return composition.compose(SHORT)
+    return composition.compose(SHORT) | {"logger": None}
 
 
 def found_in(folder):
