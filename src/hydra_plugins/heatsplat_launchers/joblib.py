@@ -37,8 +37,10 @@ def end_with(launcher: int) -> None:
     def watch() -> None:
         while os.getppid() == launcher:
             time.sleep(1.0)
-        os.kill(os.getpid(), signal.SIGTERM)  # as a batch system does: the job stops after its step (cli.stoppable)
-        time.sleep(GRACE_S)
+        end = time.monotonic() + GRACE_S
+        while time.monotonic() < end:  # the first stops the job after its step (cli.stoppable), the last this process
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1.0)
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()
