@@ -9,7 +9,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
-from heatsplat.runs.recipe import known
+from heatsplat.runs.vocabulary import known
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
 

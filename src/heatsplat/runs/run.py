@@ -24,9 +24,9 @@ from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
 from heatsplat.runs.folder import locked, results_in
-from heatsplat.runs.recipe import known
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.verdicts import decided, filled
+from heatsplat.runs.vocabulary import known
 from heatsplat.shots import at_time, first_free_id, sightings
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.module import SplatTraining
@@ -194,7 +194,7 @@ def load(
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
-        trust: classes of yours that the checkpoint may name, fully dotted (``runs.recipe.known``).
+        trust: classes of yours that the checkpoint may name, fully dotted (``runs.vocabulary.known``).
 
     Raises:
         SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no

@@ -13,7 +13,7 @@ from heatsplat.contracts import SceneError
 
 ENTRY_POINTS = "heatsplat.parts"  # under which an installed package registers its classes: mine = my_package.heat:Mine
 COMMANDS = {"study", "launcher", "hydra", "callbacks", "logger"}  # groups of which nothing is built from a checkpoint
-NOT_BUILT = {"callbacks", "logger", "overrides", "composed"}  # entries of a recipe of which nothing is
+NOT_BUILT = {"callbacks", "logger", "overrides", "composed"}  # entries of a configuration of which nothing is
 TARGET = re.compile(r"""_target_:\s*["']?([\w.]+)""")
 
 
@@ -24,35 +24,35 @@ def vocabulary() -> set[str]:
     return own | {entry.value.replace(":", ".") for entry in entry_points(group=ENTRY_POINTS)}
 
 
-def known(recipe: Any, path: Path | str, trust: Collection[str] = ()) -> dict[str, Any]:
-    """The recipe of a checkpoint without what nothing is built of, once nothing in it can run code but known parts.
+def known(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[str, Any]:
+    """The configuration in a checkpoint without what nothing is built of, once nothing in it can run code but known parts.
 
     A part is known if heatsplat's configurations name it, an installed package registers it under the entry points
     "heatsplat.parts", or it is in ``trust``. Functions are only taken as they are (``_partial_``), never called.
 
     Args:
-        recipe: as the checkpoint holds it.
+        config: as the checkpoint holds it.
         path: of the checkpoint, for messages.
         trust: further classes, fully dotted.
 
     Raises:
-        SceneError: the recipe holds anything else: another ``_target_`` or key of Hydra's, an interpolation, or what is no
+        SceneError: the configuration holds anything else: another ``_target_`` or key of Hydra's, an interpolation, or what is no
             plain value. Nothing was imported or built by then.
     """
-    if not isinstance(recipe, dict):
-        raise SceneError(f"{path} holds no recipe to build from; is it a checkpoint of heatsplat?")
-    kept = {key: value for key, value in recipe.items() if key not in NOT_BUILT}
+    if not isinstance(config, dict):
+        raise SceneError(f"{path} holds no configuration to build from; is it a checkpoint of heatsplat?")
+    kept = {key: value for key, value in config.items() if key not in NOT_BUILT}
     try:
         found = next(_foreign(kept, "", vocabulary() | set(trust)), None)
     except RecursionError:
-        found = "its recipe contains itself"
+        found = "its configuration contains itself"
     if found is not None:
         raise SceneError(f"{path} is not built, for {found}")
     return kept
 
 
 def _foreign(value: Any, key: str, allowed: Collection[str]) -> Iterator[str]:
-    """What is wrong with a value of a recipe and all in it, in words."""
+    """What is wrong with a value of a configuration and all in it, in words."""
     if isinstance(value, Mapping):
         target = value.get("_target_")
         if "_target_" in value and not (isinstance(target, str) and target in allowed):

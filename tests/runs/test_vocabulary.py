@@ -9,7 +9,7 @@ from running import TINY
 
 from heatsplat import composition
 from heatsplat.contracts import SceneError
-from heatsplat.runs import recipe, run
+from heatsplat.runs import run, vocabulary
 from heatsplat.runs.resume import resumed
 from heatsplat.training.checkpoints import load_checkpoint
 
@@ -53,7 +53,7 @@ def test_nothing_foreign_is_built(composed, tmp_path, monkeypatch, name, place):
         run.load(stored(tmp_path, bad))
 
 
-def test_a_recipe_that_contains_itself_is_refused(composed, tmp_path):
+def test_a_configuration_that_contains_itself_is_refused(composed, tmp_path):
     bad = dict(composed)
     bad["data"] = {"root": bad}
     with pytest.raises(SceneError, match="contains itself"):
@@ -75,23 +75,23 @@ def test_what_an_earlier_run_measured_brings_no_code(tmp_path, here):
 @pytest.mark.parametrize("method", ALL_METHODS)
 def test_every_method_may_be_built_from_its_checkpoint(method):
     config = composition.compose(["data.size=tiny", f"method={method}"])
-    known = recipe.known(config, "own.ckpt")
+    known = vocabulary.known(config, "own.ckpt")
     assert known["module"] == config["module"] and "callbacks" not in known
 
 
 def test_classes_of_registered_packages_and_those_that_the_user_names_may_be_built(composed, tmp_path, monkeypatch):
     own = composed | {"thermal": {"_target_": "my_package.heat.Mine"}}
     with pytest.raises(SceneError, match=r"trust=\[my_package\.heat\.Mine\]"):
-        recipe.known(own, "own.ckpt")
-    assert recipe.known(own, "own.ckpt", ["my_package.heat.Mine"])
+        vocabulary.known(own, "own.ckpt")
+    assert vocabulary.known(own, "own.ckpt", ["my_package.heat.Mine"])
 
     class Entry:
         value = "my_package.heat:Mine"
 
-    monkeypatch.setattr(recipe, "entry_points", lambda group: [Entry] if group == "heatsplat.parts" else [])
-    assert recipe.known(own, "own.ckpt")
+    monkeypatch.setattr(vocabulary, "entry_points", lambda group: [Entry] if group == "heatsplat.parts" else [])
+    assert vocabulary.known(own, "own.ckpt")
     with pytest.raises(SceneError, match=r"my_package\.heat\.os\.system"):
-        recipe.known(own | {"data": {"_target_": "my_package.heat.os.system"}}, "own.ckpt")
+        vocabulary.known(own | {"data": {"_target_": "my_package.heat.os.system"}}, "own.ckpt")
 
 
 def test_a_refusal_to_load_gives_no_dangerous_advice(tmp_path):
