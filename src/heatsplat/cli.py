@@ -6,6 +6,7 @@ Only Hydra is imported before the configuration is composed, so that --help, --c
 from __future__ import annotations
 
 import difflib
+import errno
 import functools
 import logging
 import os
@@ -14,7 +15,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,9 @@ def stoppable() -> Iterator[None]:
         for number, listener in before.items():
             signal.signal(number, listener)
 
+
+# What a disk says that is full or may not be written to: the message names the file, and no traceback helps.
+NO_PLACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES}
 
 EXAMPLES = {
     "train": (
@@ -164,7 +168,8 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
         except Exception as error:
             cause = _expected(error)
             if not isinstance(cause, OccupiedError):
-                (output_dir / FAILED).write_text(traceback.format_exc())
+                with suppress(OSError):  # the disk may be full
+                    (output_dir / FAILED).write_text(traceback.format_exc())
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
             log.error("%s: %s", type(cause).__name__, cause)
@@ -175,10 +180,11 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
 
 def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> None:
     """Writes what was composed, as Hydra would before it is known whether the folder holds another run."""
-    folder.mkdir(exist_ok=True)
-    OmegaConf.save(config, folder / "config.yaml")
-    OmegaConf.save(OmegaConf.create({"hydra": hydra_config}), folder / "hydra.yaml")
-    OmegaConf.save(hydra_config.overrides.task, folder / "overrides.yaml")
+    from heatsplat.io.results import write_atomically
+
+    written = {"config": config, "hydra": {"hydra": hydra_config}, "overrides": hydra_config.overrides.task}
+    for name, content in written.items():
+        write_atomically(folder / f"{name}.yaml", OmegaConf.to_yaml(content))
 
 
 def _expected(error: BaseException) -> BaseException | None:
@@ -187,6 +193,8 @@ def _expected(error: BaseException) -> BaseException | None:
 
     while error is not None:
         if isinstance(error, SceneError | FileNotFoundError | ImportError | FloatingPointError):
+            return error
+        if isinstance(error, OSError) and error.errno in NO_PLACE:
             return error
         error = error.__cause__
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -21,6 +22,8 @@ from heatsplat.metrics import (
     mean_of_images,
     scene_threshold,
 )
+
+log = logging.getLogger("heatsplat")
 
 TEST_FILE = "test_per_image.csv"
 CURVE_COLUMNS = ("step", "train_seconds", "gaussians", *DEFINITIONS)
@@ -58,13 +61,14 @@ class QualityMetrics(pl.Callback):
         self._scorer = self._image_scorer = Scorer()
         self._companions: tuple[str, ...] = ()
         self._rows: list[dict[str, Any]] = []
+        self._empty = 0  # images that have one value everywhere
         self._no_lpips = "not asked for"
 
     # Scores of one image ---------------------------------------------------------------------------------------------
 
     def _begin(self, module: pl.LightningModule, lpips: bool, threshold: float | None = None) -> None:
         """Makes the scorer of one pass over views."""
-        self._rows = []
+        self._rows, self._empty = [], 0
         thermal_range = module.scene.thermal_range if module.modality == "thermal" else None
         network = None
         if lpips and self.lpips_net is not None:
@@ -80,7 +84,9 @@ class QualityMetrics(pl.Callback):
         view, prediction = outputs["view"], outputs["prediction"]
         frame = view.frame
         row = {"name": frame.name, "frame_id": frame.frame_id, "time_s": frame.time_s, "seconds": outputs["seconds"]}
-        row |= self._scorer(prediction, view.image(module.modality), view.mask)
+        target = view.image(module.modality)
+        row |= self._scorer(prediction, target, view.mask)
+        self._empty += bool((target == target.flatten()[0]).all())
         companions = outputs.get("companions", {})
         for modality, image in companions.items():
             scorer = self._scorer if modality == "clean" else self._image_scorer
@@ -147,6 +153,13 @@ class QualityMetrics(pl.Callback):
             return
         results.data["test_pixels_counted"] = mean_of_images(self._rows, "counted")
         results.data["test_pixels_saturated"] = mean_of_images(self._rows, "saturated")
+        if self._empty:
+            results.data["test_images_of_one_value"] = self._empty
+            log.warning(
+                "%d of %d test images have one value everywhere (black?): any model scores well on them, so their PSNR and SSIM "
+                "say nothing. Look at the images and at the thermal range",
+                self._empty, count,
+            )  # fmt: skip
         self._log(module, "test", results.test, trainer.global_step)
         write_csv(module.output_dir / TEST_FILE, self._rows)
 

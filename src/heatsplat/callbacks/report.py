@@ -70,7 +70,6 @@ class Report(pl.Callback):
         results.data = describe_data(module.scene, module.modality) | results.data
         results.effects = results.effects or describe_effects(module)
         results.versions = collect_versions()
-        results.write(folder / METRICS_FILE)
         curves = draw_curves(folder)
         pictures = sorted((folder / "renders" / "test").glob("*.png"))
         shown = [pictures[i] for i in evenly_spread(len(pictures), self.pictures)]
@@ -82,6 +81,7 @@ class Report(pl.Callback):
             scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
             finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
             trainer.logger.log_hyperparams(hyperparameters(module.config), finite)
+        results.write(folder / METRICS_FILE)  # last: it says that the run is over, and nothing of it is made again
         if self.show:
             show(results, folder, shown[0] if shown else None)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.studies.recorded import config_of, overrides_of
@@ -89,23 +88,29 @@ def _read(folder: Path) -> dict[str, Any]:
             results = RunResults.read(folder / METRICS_FILE)
         else:
             failed = reason_of(folder)
-    except (ValueError, OSError, yaml.YAMLError) as error:
+    except (ValueError, OSError) as error:
         failed = f"{error}. Delete the folder to run it again."
     run = {} if results is None else results.run
     found = {
         "folder": folder, "scene": str(run.get("scene", _scene(config))),
         "method": str(run.get("method", overrides.get("method"))),
         "row": named_row(overrides), "overrides": overrides, "failed": failed, "results": results,
-        "data": config.get("data") or {},
+        "data": _data(config),
     }  # fmt: skip
     return found if results is None else found | results.test | results.cost
 
 
 def _scene(config: Mapping[str, Any]) -> str:
     """The scene that a run was given; a method's own synthetic preset is a reference to another key."""
-    data = config.get("data") or {}
+    data = _data(config)
     scene = str(data.get("scene") or "+".join(data.get("scenes") or ()) or "?")
     return str(config.get(scene[2:-1], scene)) if scene.startswith("${") else scene
+
+
+def _data(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The options of the data; none where the file ends before them."""
+    data = config.get("data")
+    return data if isinstance(data, Mapping) else {}
 
 
 def reason_of(folder: Path) -> str:

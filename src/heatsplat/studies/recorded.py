@@ -1,4 +1,4 @@
-"""What Hydra wrote down of a run in the run's folder."""
+"""What Hydra wrote down of a run in the run's folder. A damaged file is a ValueError that names it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,19 @@ CONFIG = Path(".hydra") / "config.yaml"
 
 def overrides_of(place: Path) -> dict[str, str]:
     """What the command line said of the run in a folder: key -> value, as text; empty where nothing was written down."""
-    return dict(str(text).partition("=")[::2] for text in _read(place / OVERRIDES) or [])
+    return dict(str(text).partition("=")[::2] for text in _read(place / OVERRIDES, list))
 
 
 def config_of(place: Path) -> dict[str, Any]:
     """The configuration of the run in a folder, as composed; empty where none was written down."""
-    return _read(place / CONFIG) or {}
+    return _read(place / CONFIG, dict)
 
 
-def _read(path: Path) -> Any:
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else None
+def _read(path: Path, kind: type) -> Any:
+    try:
+        found = yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else None
+    except (yaml.YAMLError, ValueError) as error:  # of UTF-8, too
+        raise ValueError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    if found is not None and not isinstance(found, kind):
+        raise ValueError(f"{path} holds {type(found).__name__}, not {kind.__name__}")
+    return found or kind()

@@ -237,7 +237,11 @@ class HexPlane(Wrapper):
 
 
 def _sampled(planes: Tensor, places: Tensor) -> Tensor:
-    """Bilinear samples [3, C, n] of planes [3, C, H, W] at places [3, n, 1, 2] in [-1, 1], x before y; border beyond."""
+    """Bilinear samples [3, C, n] of planes [3, C, H, W] at places [3, n, 1, 2] in [-1, 1], x before y; border beyond.
+
+    A place that is NaN is taken for the middle: torch would read from anywhere in memory (``FiniteGuard`` names the NaN).
+    """
+    places = places.nan_to_num(nan=0.0)
     found = functional.grid_sample(planes, places, mode="bilinear", padding_mode="border", align_corners=True)
     return found[..., 0]
 

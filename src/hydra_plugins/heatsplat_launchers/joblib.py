@@ -1,9 +1,13 @@
 """Jobs side by side on this machine, each in a process of its own (joblib's loky)."""
 
+import os
+import signal
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from queue import SimpleQueue
+from threading import Thread
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
@@ -11,6 +15,8 @@ from hydra.core.utils import JobReturn
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute_contained, log
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+GRACE_S = 120.0  # seconds for a checkpoint, once the launcher is gone
 
 
 @dataclass
@@ -23,6 +29,21 @@ class JoblibConf:
 
 
 ConfigStore.instance().store(group="hydra/launcher", name="heatsplat_joblib", node=JoblibConf, provider="heatsplat")
+
+
+def end_with(launcher: int) -> None:
+    """Has this process end soon after the one that launched it, whatever killed that: its job writes a checkpoint first."""
+
+    def watch() -> None:
+        while os.getppid() == launcher:
+            time.sleep(1.0)
+        end = time.monotonic() + GRACE_S
+        while time.monotonic() < end:  # the first stops the job after its step (cli.stoppable), the last this process
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1.0)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
 
 
 class Joblib(JobLauncher):
@@ -60,7 +81,9 @@ class Joblib(JobLauncher):
             process = processes.get()
             try:
                 for _ in range(self.retries + 1):
-                    process = process or ProcessPoolExecutor(max_workers=1, env=environment)
+                    process = process or ProcessPoolExecutor(
+                        max_workers=1, env=environment, initializer=end_with, initargs=(os.getpid(),)
+                    )
                     try:
                         return process.submit(execute_contained, *self.arguments(job)).result()
                     except TerminatedWorkerError:
