@@ -42,7 +42,8 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
         return torch.full((8, 8, 1), 0.5)
 
     data = Yard()
-    module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict)
+    heat = SimpleNamespace(needs=frozenset(needs), beyond_record="nothing changes")
+    module = SimpleNamespace(thermal=heat, predict=predict)
     stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
