@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
-from heatsplat.datamodules.assemble import CELSIUS, Counts, RawFrame, build_scene
+from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.lowres import degraded
+from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import with_weather
 from torch.utils.data import DataLoader
@@ -25,7 +26,7 @@ from torch.utils.data import DataLoader
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
 
-__all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "SceneDataModule", "build_scene"]
+__all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "RawScene", "SceneDataModule", "SceneOptions", "build_scene"]
 
 log = logging.getLogger(__name__)
 
@@ -156,17 +157,9 @@ class SceneDataModule(pl.LightningDataModule, ABC):
     def finish(
         self, name: str, frames: Sequence[RawFrame], points: np.ndarray, split: SplitRule | None = None, **scene: Any
     ) -> SceneData:
-        """``build_scene`` with this module's options."""
-        return build_scene(
-            name,
-            frames,
-            points,
-            split=split or self.split,
-            downscale=self.downscale,
-            thermal_channels=self.thermal_channels,
-            alpha_mask=self.alpha_mask,
-            **scene,
-        )
+        """``build_scene`` of a ``RawScene`` with this module's options."""
+        options = SceneOptions(split or self.split, self.downscale, self.thermal_channels, self.alpha_mask)
+        return build_scene(RawScene(name, frames, points, **scene), options)
 
 
 def _read_mask(path: Path, white_counts: bool) -> np.ndarray:

@@ -38,7 +38,7 @@ class Surroundings:
     features: str | None
 
     def read(self, folder: Path, meta: Mapping[str, Any], frames: Sequence[RawFrame]) -> dict[str, Any]:
-        """Arguments of ``build_scene``: "weather", "labels" and "point_features", each None where there is none.
+        """Fields of ``RawScene``: "weather", "labels" and "point_features", each None where there is none.
 
         Args:
             folder: of the scene.

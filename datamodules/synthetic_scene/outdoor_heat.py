@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dgttrf, dgttrs
@@ -150,97 +151,123 @@ def solve(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, 
 
 
 def integrate(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, cells: int, steps: int) -> History:
-    """The history on one grid: ``cells`` intervals in depth, ``steps`` steps (a multiple of four) between two samples.
-
-    All slabs are advanced at once: their tridiagonal systems laid end to end form one tridiagonal system.
-    """
-    k, capacity, depth, emissivity, still, per_wind = (
-        np.array([getattr(slab.material, key) for slab in slabs])
-        for key in (
-            "conductivity",
-            "heat_capacity",
-            "depth_m",
-            "emissivity",
-            "convection_still",
-            "convection_per_wind",
-        )
-    )
-    absorptivity = np.array([slab.absorptivity for slab in slabs])
-    face = np.array([slab.face for slab in slabs])
-    nodes = cells + 1
-    x = np.linspace(0.0, 1.0, nodes) ** _DEPTH_GRADING * depth[:, None]
-    gaps = np.diff(x)
-    content = np.zeros((len(slabs), nodes))  # J/(m² K) of the volume about each node
-    content[:, :-1] += 0.5 * gaps
-    content[:, 1:] += 0.5 * gaps
-    content *= capacity[:, None]
-    between = k[:, None] / gaps
-    none = np.zeros((len(slabs), 1))
-    below = np.concatenate([between / content[:, 1:], none], axis=1).ravel()[:-1]
-    above = np.concatenate([between / content[:, :-1], none], axis=1).ravel()[:-1]
-    diagonal = (-(np.concatenate([between, none], axis=1) + np.concatenate([none, between], axis=1)) / content).ravel()
-    share = 1.0 / content[:, 0]
-
-    # Drivers of the surface: constant part of the flux, its convection coefficient, both at the samples of the forcing.
-    exchange = still + per_wind * forcing.wind_m_s[:, None]
-    incoming = absorptivity * forcing.sunlight_w_m2[:, face] + emissivity * forcing.long_waves_w_m2[:, face]
-    emitting = emissivity * STEFAN_BOLTZMANN
-
-    def rate(state: np.ndarray, flux: np.ndarray, h: np.ndarray, air: float) -> np.ndarray:
-        change = diagonal * state
-        change[1:] += below * state[:-1]
-        change[:-1] += above * state[1:]
-        surface = state[::nodes]
-        change[::nodes] += share * (flux + h * (air - surface) - emitting * surface**4)
-        return change
-
-    state = np.empty((len(slabs), nodes))
-    start = np.asarray(start_k, dtype=np.float64)
-    if start.ndim == 2:
-        old = np.linspace(0.0, 1.0, start.shape[1])
-        for row, values in zip(state, start, strict=True):
-            row[:] = np.interp(np.linspace(0.0, 1.0, nodes), old, values)
-    else:
-        state[:] = start
-    state = state.ravel()
-
-    samples = forcing.times_s
+    """The history on one grid: ``cells`` intervals in depth, ``steps`` steps (a multiple of four) between two samples."""
+    grid = _Grid(slabs, cells)
+    drivers, state, samples = grid.drivers(forcing), grid.start(start_k), forcing.times_s
     count = (len(samples) - 1) * steps + 1
     times, surfaces = np.empty(count), np.empty((count, len(slabs)))
-    now, step_of_factors = 0, None
+    now = 0
     for piece in range(len(samples) - 1):
         step = (samples[piece + 1] - samples[piece]) / steps
-        flux_slope = (incoming[piece + 1] - incoming[piece]) / (steps * step)
-        h_slope = (exchange[piece + 1] - exchange[piece]) / (steps * step)
-        air_slope = (forcing.air_k[piece + 1] - forcing.air_k[piece]) / (steps * step)
-        weight = _GAMMA * step
-        if step != step_of_factors:
-            *factors, failed = dgttrf(-weight * below, 1.0 - weight * diagonal, -weight * above)
-            if failed:
-                raise RuntimeError(f"outdoor heat: singular step of {step:g} s")
-            unit = np.zeros(state.size)
-            unit[::nodes] = 1.0
-            influence, step_of_factors = dgttrs(*factors, unit)[0], step
+        grid.factorise(step)
+        first, last = drivers[piece], drivers[piece + 1]
+        slope = _Drivers(*((b - a) / (steps * step) for a, b in zip(first, last, strict=True)))
         for inner in range(steps):
             passed = inner * step
-            flux, h = incoming[piece] + passed * flux_slope, exchange[piece] + passed * h_slope
-            air = forcing.air_k[piece] + passed * air_slope
-            change = rate(state, flux, h, air)
-            surface = state[::nodes]
-            times[now], surfaces[now] = samples[piece] + passed, surface
+            times[now], surfaces[now] = samples[piece] + passed, grid.surface(state)
             now += 1
-            # Of the matrix only the surface's own entry changes from step to step: Sherman and Morrison's formula.
-            own = weight * share * (h + 4.0 * emitting * surface**3)
-            own /= 1.0 + own * influence[::nodes]
-            drift = weight * share * (flux_slope + h_slope * (air - surface) + h * air_slope)
-            change[::nodes] += drift
-            first = dgttrs(*factors, change)[0]
-            first -= np.repeat(own * first[::nodes], nodes) * influence
-            ahead = rate(state + step * first, flux + step * flux_slope, h + step * h_slope, air + step * air_slope)
-            ahead -= 2.0 * first
-            ahead[::nodes] -= drift
-            second = dgttrs(*factors, ahead)[0]
-            second -= np.repeat(own * second[::nodes], nodes) * influence
-            state = state + step * (1.5 * first + 0.5 * second)
-    times[now], surfaces[now] = samples[-1], state[::nodes]
-    return History(times, surfaces, state.reshape(len(slabs), nodes))
+            state = grid.advanced(state, first.after(slope, passed), slope, step)
+    times[now], surfaces[now] = samples[-1], grid.surface(state)
+    return History(times, surfaces, state.reshape(len(slabs), cells + 1))
+
+
+class _Drivers(NamedTuple):
+    """What drives surfaces at a moment, or its change per second."""
+
+    flux: np.ndarray  # [m] that a surface takes up whatever its temperature
+    h: np.ndarray  # [m] convection coefficient
+    air_k: float
+
+    def after(self, slope: _Drivers, seconds: float) -> _Drivers:
+        return _Drivers(*(value + seconds * change for value, change in zip(self, slope, strict=True)))
+
+
+class _Grid:
+    """Slabs on ``cells`` intervals in depth, whose tridiagonal systems laid end to end form one tridiagonal system."""
+
+    def __init__(self, slabs: Sequence[Slab], cells: int) -> None:
+        def of_materials(key: str) -> np.ndarray:
+            return np.array([getattr(slab.material, key) for slab in slabs])
+
+        self.still, self.per_wind = of_materials("convection_still"), of_materials("convection_per_wind")
+        self.emissivity = of_materials("emissivity")
+        self.emitting = self.emissivity * STEFAN_BOLTZMANN
+        self.absorptivity = np.array([slab.absorptivity for slab in slabs])
+        self.face = np.array([slab.face for slab in slabs])
+        self.nodes, self.count = cells + 1, len(slabs)
+        x = np.linspace(0.0, 1.0, self.nodes) ** _DEPTH_GRADING * of_materials("depth_m")[:, None]
+        gaps = np.diff(x)
+        content = np.zeros((self.count, self.nodes))  # J/(m² K) of the volume about each node
+        content[:, :-1] += 0.5 * gaps
+        content[:, 1:] += 0.5 * gaps
+        content *= of_materials("heat_capacity")[:, None]
+        between = of_materials("conductivity")[:, None] / gaps
+        none = np.zeros((self.count, 1))
+        to_next, to_last = np.concatenate([between, none], axis=1), np.concatenate([none, between], axis=1)
+        self.below = np.concatenate([between / content[:, 1:], none], axis=1).ravel()[:-1]
+        self.above = np.concatenate([between / content[:, :-1], none], axis=1).ravel()[:-1]
+        self.diagonal = (-(to_next + to_last) / content).ravel()
+        self.share = 1.0 / content[:, 0]
+        self.factorised_s: float | None = None
+
+    def drivers(self, forcing: Forcing) -> list[_Drivers]:
+        """Those at the samples of the forcing."""
+        h = self.still + self.per_wind * forcing.wind_m_s[:, None]
+        taken = self.absorptivity * forcing.sunlight_w_m2[:, self.face]
+        flux = taken + self.emissivity * forcing.long_waves_w_m2[:, self.face]
+        return [_Drivers(*values) for values in zip(flux, h, forcing.air_k, strict=True)]
+
+    def start(self, start_k: np.ndarray | float) -> np.ndarray:
+        """Temperatures of all nodes [m * nodes], one slab after the other; ``start_k`` is that of ``solve``."""
+        start = np.asarray(start_k, dtype=np.float64)
+        if start.ndim < 2:
+            return np.full(self.count * self.nodes, start)
+        old, new = np.linspace(0.0, 1.0, start.shape[1]), np.linspace(0.0, 1.0, self.nodes)
+        return np.concatenate([np.interp(new, old, values) for values in start])
+
+    def surface(self, state: np.ndarray) -> np.ndarray:
+        """Temperatures of the surfaces [m], a view."""
+        return state[:: self.nodes]
+
+    def factorise(self, step: float) -> None:
+        """Prepares steps of so many seconds."""
+        if step == self.factorised_s:
+            return
+        weight = _GAMMA * step
+        *self._factors, failed = dgttrf(-weight * self.below, 1.0 - weight * self.diagonal, -weight * self.above)
+        if failed:
+            raise RuntimeError(f"outdoor heat: singular step of {step:g} s")
+        unit = np.zeros(self.diagonal.size)
+        self.surface(unit)[:] = 1.0
+        self._influence, self.factorised_s = dgttrs(*self._factors, unit)[0], step
+
+    def rate(self, state: np.ndarray, drivers: _Drivers) -> np.ndarray:
+        """K/s of all nodes."""
+        change = self.diagonal * state
+        change[1:] += self.below * state[:-1]
+        change[:-1] += self.above * state[1:]
+        surface = self.surface(state)
+        taken = drivers.flux + drivers.h * (drivers.air_k - surface) - self.emitting * surface**4
+        self.surface(change)[:] += self.share * taken
+        return change
+
+    def advanced(self, state: np.ndarray, drivers: _Drivers, slope: _Drivers, step: float) -> np.ndarray:
+        """The state a step later, by ROS2; steps as factorised."""
+        weight, surface = _GAMMA * step, self.surface(state)
+        # Of the matrix only the surface's own entry changes from step to step: Sherman and Morrison's formula.
+        own = weight * self.share * (drivers.h + 4.0 * self.emitting * surface**3)
+        own /= 1.0 + own * self.surface(self._influence)
+        drift = slope.flux + slope.h * (drivers.air_k - surface) + drivers.h * slope.air_k
+        drift *= weight * self.share
+        change = self.rate(state, drivers)
+        self.surface(change)[:] += drift
+        first = self._solved(change, own)
+        ahead = self.rate(state + step * first, drivers.after(slope, step))
+        ahead -= 2.0 * first
+        self.surface(ahead)[:] -= drift
+        return state + step * (1.5 * first + 0.5 * self._solved(ahead, own))
+
+    def _solved(self, right: np.ndarray, own: np.ndarray) -> np.ndarray:
+        found = dgttrs(*self._factors, right)[0]
+        found -= np.repeat(own * self.surface(found), self.nodes) * self._influence
+        return found

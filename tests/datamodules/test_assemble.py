@@ -3,7 +3,7 @@ import logging
 import numpy as np
 import pytest
 import torch
-from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, build_scene
+from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneOptions, build_scene
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.splits import SplitRule
 from layouts import FOCAL, HEIGHT, WIDTH, grey, points, viewmats
@@ -28,9 +28,13 @@ def frames_of(images, times=None, lens=LENS, center=(0, 0, 0), **fields):
     ]
 
 
-def scene_of(images, frames=None, split=EVERY_8TH, center=(0, 0, 0), times=None, **options):
-    frames = frames or frames_of(images, times, center=center)
-    return build_scene("s", frames, points(center=center), split=split, **options)
+def assembled(frames, xyz, split=EVERY_8TH, **given):
+    options = {key: given.pop(key) for key in ("downscale", "thermal_channels", "alpha_mask") if key in given}
+    return build_scene(RawScene("s", frames, xyz, **given), SceneOptions(split, **options))
+
+
+def scene_of(images, frames=None, center=(0, 0, 0), times=None, **given):
+    return assembled(frames or frames_of(images, times, center=center), points(center=center), **given)
 
 
 def test_time_starts_at_the_first_training_frame_and_frames_are_in_time_order():
@@ -231,13 +235,13 @@ def test_truth_is_asked_in_the_scene_s_own_clock_and_world():
 @pytest.mark.parametrize("count", [0, 3])
 def test_fewer_than_four_points_are_refused(count):
     with pytest.raises(SceneError, match=f"scene s has {count} finite points, at least 4"):
-        build_scene("s", frames_of([grey(i) for i in range(9)]), points()[:count], split=EVERY_8TH)
+        assembled(frames_of([grey(i) for i in range(9)]), points()[:count])
 
 
 def test_points_that_are_not_finite_are_dropped():
     xyz, colors = points(10), np.linspace(0, 1, 30).reshape(10, 3)
     xyz[2, 1], xyz[5, 0] = np.nan, np.inf
-    scene = build_scene("s", frames_of([grey(i) for i in range(9)]), xyz, split=EVERY_8TH, point_colors=colors)
+    scene = assembled(frames_of([grey(i) for i in range(9)]), xyz, point_colors=colors)
     assert scene.points.shape == (8, 3) and scene.point_colors.shape == (8, 3)
     np.testing.assert_allclose(scene.point_colors[2], colors[3], atol=1e-6)
     assert scene.notes["points_dropped"].startswith("2 points")
@@ -336,7 +340,7 @@ def test_doubles_are_celsius_too():
 
 def test_an_empty_scene_and_unknown_channels_are_refused():
     with pytest.raises(SceneError, match="scene s has no frames"):
-        build_scene("s", [], points(), split=EVERY_8TH)
+        assembled([], points())
     with pytest.raises(SceneError, match="data.thermal_channels must be 1 or 3, got 2"):
         scene_of([grey(i) for i in range(9)], thermal_channels=2)
 

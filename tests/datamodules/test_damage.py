@@ -5,13 +5,13 @@ import json
 import cv2
 import numpy as np
 import pytest
-from heatsplat.datamodules.assemble import Counts, RawFrame
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.colmap_records import check_records
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.poses import checked_pose
+from heatsplat.datamodules.raw_scene import Counts, RawFrame
 from heatsplat.datamodules.splits import by_list
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.timestamps import dji_time, times_from_csv

@@ -1,0 +1,190 @@
+"""Pixels on their final grid: one frame's files read, freed of distortion and downscaled; what a scene's have in common."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS
+from heatsplat.datamodules.formats.images import (
+    colour_levels,
+    resized,
+    resized_mask,
+    split_alpha,
+    to_grey,
+    undistorted,
+    undistorted_mask,
+)
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
+
+from heatsplat.contracts import SceneError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PreparedImage:
+    """Pixels of one frame on their final grid, in the stored type.
+
+    Args:
+        thermal, rgb, mask: of one size; None for what the frame lacks.
+        lens: without distortion, for that size.
+        found: what the files held, for the notes.
+        colour: grey levels by which the channels of the thermal image differ on average.
+    """
+
+    thermal: np.ndarray | None
+    rgb: np.ndarray | None
+    mask: np.ndarray | None
+    lens: Lens
+    found: dict[str, Any]
+    colour: float
+
+
+def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
+    """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them."""
+    read = frame.read or frame.read_rgb
+    if read is None:
+        raise SceneError(f"frame {frame.name} has neither a thermal nor a visible image")
+    pixels, alpha = split_alpha(_supported(read(), frame.name))
+    height, width = pixels.shape[:2]
+    if frame.read is None:
+        pixels = _three_channels(pixels, frame.name)
+    colour = colour_levels(pixels)
+    found = {
+        "size": f"{width}x{height}",
+        "type": str(pixels.dtype),
+        "channels": ("L" if pixels.ndim == 2 else "RGB") + ("A" if alpha is not None else ""),
+        "model": frame.lens.model,
+        "distorted": frame.lens.is_distorted,
+        "rescaled": (frame.lens.width, frame.lens.height) != (width, height),
+        "nan": 0,
+        "rgb_resized": False,
+    }
+    mask = alpha if options.alpha_mask else None
+    if frame.read_mask is not None:
+        given = frame.read_mask()
+        if given.shape != (height, width):
+            raise SceneError(
+                f"mask of {frame.name} is {given.shape[1]}x{given.shape[0]} but the image is {width}x{height}; "
+                "masks must have the size of the stored image"
+            )
+        mask = given if mask is None else mask & given
+    keeps_colour = frame.read is None or options.thermal_channels == 3
+    if pixels.ndim == 3 and (pixels.dtype.kind == "f" or not keeps_colour):
+        pixels = to_grey(pixels)
+    if pixels.dtype.kind == "f":
+        known = (pixels >= MIN_CELSIUS) & (pixels <= MAX_CELSIUS)
+        found["nan"] = int(known.size - known.sum())
+        if found["nan"]:
+            if not known.any():
+                raise SceneError(
+                    f"image {frame.name} holds no finite pixel that is a temperature in °C; remove it from the scene"
+                )
+            # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
+            pixels = np.where(known, pixels, np.median(pixels[known]))
+            mask = known if mask is None else mask & known
+    rgb = None
+    if frame.read is not None and frame.read_rgb is not None:
+        rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
+        rgb = _three_channels(rgb, frame.name)
+        found["rgb_resized"] = rgb.shape[:2] != (height, width)
+        rgb = resized(rgb, width, height)
+    lens = frame.lens.resized(width, height)
+    if lens.is_distorted:
+        pixels, mask = undistorted(pixels, lens), undistorted_mask(mask, lens)
+        rgb = None if rgb is None else undistorted(rgb, lens)
+    small = (max(1, round(width / options.downscale)), max(1, round(height / options.downscale)))
+    pixels = resized(pixels, *small)
+    rgb = None if rgb is None else np.ascontiguousarray(resized(rgb, *small))
+    mask = None if mask is None else resized_mask(mask, *small)
+    if mask is not None and mask.all():
+        mask = None
+    if frame.read is None:
+        return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
+    return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _three_channels(rgb: np.ndarray, name: str) -> np.ndarray:
+    """A visible image [H, W, 3] of integers. Raises SceneError naming its frame where it is of another type."""
+    if rgb.dtype.kind == "f":
+        raise SceneError(f"the visible image of {name} is {rgb.dtype}; save it with 8 or 16 bits")
+    return rgb if rgb.ndim == 3 else np.repeat(rgb[..., None], 3, axis=2)
+
+
+def _supported(pixels: np.ndarray, name: str) -> np.ndarray:
+    """The pixels as uint8, uint16 or float32. Raises SceneError for other types and shapes."""
+    pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels
+    grey_or_colour = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] in (3, 4))
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32) or not grey_or_colour or pixels.size == 0:
+        raise SceneError(
+            f"image {name} is {pixels.dtype} {list(pixels.shape)}; images are [H, W], [H, W, 3] or [H, W, 4] of uint8, "
+            "uint16 or float32 (°C)"
+        )
+    return pixels
+
+
+def check_equals(prepared: Mapping[str, PreparedImage]) -> None:
+    """Raises SceneError for an image of another type than the others, or another size than those of its camera."""
+    cameras: dict[Any, list[tuple[str, PreparedImage]]] = {}
+    for name, p in prepared.items():
+        lens = p.lens
+        seen = (lens.fx / lens.width, lens.fy / lens.height, lens.cx / lens.width, lens.cy / lens.height)
+        cameras.setdefault((tuple(np.round(seen, 9)), lens.distortion, lens.model), []).append((name, p))
+    types = Counter(p.found["type"] for p in prepared.values())
+    (most, count), *others = types.most_common()
+    if others:
+        odd = next(name for name, p in prepared.items() if p.found["type"] != most)
+        kinds = "float images (°C) with integer images" if "float32" in types else "bit depths"
+        raise SceneError(
+            f"image {odd} is {prepared[odd].found['type']}, {count} others are {most}: the scene mixes {kinds}; convert "
+            "them to one kind"
+        )
+    for frames in cameras.values():
+        sizes = Counter(p.found["size"] for _, p in frames)
+        most, count = sizes.most_common(1)[0]
+        for name, p in frames:
+            size = p.found["size"]
+            if size != most and count >= 3 and (sizes[size] == 1 or p.found["rescaled"]):
+                raise SceneError(
+                    f"image {name} is {size}, but {count} others of the same camera are {most}; copy or export it again"
+                )
+
+
+def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict[str, Any]:
+    """What the images of a scene have in common and where they differ."""
+    found = [p.found for p in prepared.values()]
+
+    def tally(key: str) -> str:
+        counted = Counter(str(f[key]) for f in found)
+        return next(iter(counted)) if len(counted) == 1 else ", ".join(f"{k} ({n})" for k, n in counted.items())
+
+    grids = Counter(f"{p.lens.width}x{p.lens.height}" for p in prepared.values())
+    notes: dict[str, Any] = {
+        "image_size": tally("size"),
+        "pixel_type": tally("type"),
+        "channels": tally("channels"),
+        "camera_model": tally("model"),
+        "downscale": downscale,
+        "grid": ", ".join(grids),
+    }
+    if rescaled := sum(f["rescaled"] for f in found):
+        notes["intrinsics_rescaled"] = (
+            f"{rescaled} images differ in size from their camera; intrinsics follow the image"
+        )
+    if distorted := sum(f["distorted"] for f in found):
+        notes["distortion"] = f"{distorted} images undistorted onto a pinhole of the same focal length"
+    if nan := sum(f["nan"] for f in found):
+        notes["nan_pixels"] = f"{nan} pixels are NaN, infinite or below absolute zero and masked"
+        log.warning("%d pixels are NaN, infinite or below absolute zero and masked", nan)
+    if rgb := sum(f["rgb_resized"] for f in found):
+        notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
+    if masked := [p.mask for p in prepared.values() if p.mask is not None]:
+        share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
+        notes["masked_fraction"] = share
+    return notes
