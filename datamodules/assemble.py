@@ -94,13 +94,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     train, test, val = _split(frames, options.split, notes)
     first_s = times[train[0]] if times else None
     raw = _with_finite_points(raw, notes)
-    if raw.weather is not None:
-        if times is None:
-            raise SceneError(
-                f"scene {raw.name} has weather, but its frames have no times: which weather belongs to which?"
-            )
-        raw = replace(raw, weather=on_clock(raw.weather, first_s))
-        notes |= {f"weather_{key}": value for key, value in raw.weather.notes.items()}
+    raw = _with_weather_since(raw, first_s, notes)
     origin = _origin_of(frames, raw.points)
     if origin.any():
         notes["origin"] = origin.tolist()
@@ -123,11 +117,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     if raw.counts:
         notes["clipped_fraction"] = _clipped_fraction(list(stored.values()))
     bounds = raw.thermal_range
-    notes["thermal_range_c"] = (
-        "none: image values are no temperatures, and errors in °C are undefined"
-        if bounds is None
-        else [bounds.min_c, bounds.max_c]
-    )
+    unknown = "none: image values are no temperatures, and errors in °C are undefined"
+    notes["thermal_range_c"] = unknown if bounds is None else [bounds.min_c, bounds.max_c]
 
     def views(positions: Sequence[int]) -> ViewSet:
         items = [stored[i] for i in positions]
@@ -219,6 +210,17 @@ def _with_finite_points(raw: RawScene, notes: dict[str, Any]) -> RawScene:
             "check points3D in the sparse model"
         )
     return replace(raw, points=points, **rows)
+
+
+def _with_weather_since(raw: RawScene, first_s: float | None, notes: dict[str, Any]) -> RawScene:
+    """The scene with its weather on a clock that starts at ``first_s``, which is None where frames have no times."""
+    if raw.weather is None:
+        return raw
+    if first_s is None:
+        raise SceneError(f"scene {raw.name} has weather, but its frames have no times: which weather belongs to which?")
+    weather = on_clock(raw.weather, first_s)
+    notes |= {f"weather_{key}": value for key, value in weather.notes.items()}
+    return replace(raw, weather=weather)
 
 
 def _with_temperatures(raw: RawScene, train: Sequence[PreparedImage], notes: dict[str, Any]) -> RawScene:

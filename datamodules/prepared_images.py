@@ -66,29 +66,14 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         "nan": 0,
         "rgb_resized": False,
     }
-    mask = alpha if options.alpha_mask else None
-    if frame.read_mask is not None:
-        given = frame.read_mask()
-        if given.shape != (height, width):
-            raise SceneError(
-                f"mask of {frame.name} is {given.shape[1]}x{given.shape[0]} but the image is {width}x{height}; "
-                "masks must have the size of the stored image"
-            )
-        mask = given if mask is None else mask & given
+    mask = _both(alpha if options.alpha_mask else None, _mask_of(frame, width, height))
     keeps_colour = frame.read is None or options.thermal_channels == 3
     if pixels.ndim == 3 and (pixels.dtype.kind == "f" or not keeps_colour):
         pixels = to_grey(pixels)
     if pixels.dtype.kind == "f":
-        known = (pixels >= MIN_CELSIUS) & (pixels <= MAX_CELSIUS)
-        found["nan"] = int(known.size - known.sum())
-        if found["nan"]:
-            if not known.any():
-                raise SceneError(
-                    f"image {frame.name} holds no finite pixel that is a temperature in °C; remove it from the scene"
-                )
-            # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
-            pixels = np.where(known, pixels, np.median(pixels[known]))
-            mask = known if mask is None else mask & known
+        pixels, known = _filled(pixels, frame.name)
+        if known is not None:
+            found["nan"], mask = int(known.size - known.sum()), _both(mask, known)
     rgb = None
     if frame.read is not None and frame.read_rgb is not None:
         rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
@@ -108,6 +93,37 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     if frame.read is None:
         return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
     return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _mask_of(frame: RawFrame, width: int, height: int) -> np.ndarray | None:
+    """The frame's mask, None where it has none. Raises SceneError where it has another size."""
+    if frame.read_mask is None:
+        return None
+    mask = frame.read_mask()
+    if mask.shape != (height, width):
+        raise SceneError(
+            f"mask of {frame.name} is {mask.shape[1]}x{mask.shape[0]} but the image is {width}x{height}; "
+            "masks must have the size of the stored image"
+        )
+    return mask
+
+
+def _both(mask: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
+    """Where a pixel counts by both masks; None where there are none."""
+    if mask is None or other is None:
+        return other if mask is None else mask
+    return mask & other
+
+
+def _filled(celsius: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """The image with values where it has none, and which pixels had one; None where all had."""
+    known = (celsius >= MIN_CELSIUS) & (celsius <= MAX_CELSIUS)
+    if known.all():
+        return celsius, None
+    if not known.any():
+        raise SceneError(f"image {name} holds no finite pixel that is a temperature in °C; remove it from the scene")
+    # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
+    return np.where(known, celsius, np.median(celsius[known])), known
 
 
 def _three_channels(rgb: np.ndarray, name: str) -> np.ndarray:
