@@ -41,8 +41,8 @@ def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Ten
     """Pixels [H, W] whose surface point lies in the image of some training camera and is not hidden from it; bool.
 
     **Convention:** a pixel without a surface is a direction: it is covered where a training camera looked in that direction
-    and saw no surface around it either, so that a hole in what was reconstructed is no sky. What lies within ``DEPTH_TOLERANCE`` behind a surface counts as that surface, so that the
-    grid of the depth maps does not matter.
+    and saw no surface around it either, so that a hole in what was reconstructed is no sky. What lies within
+    ``DEPTH_TOLERANCE`` behind a surface counts as that surface, so that the grid of the depth maps does not matter.
 
     Args:
         camera: of the new view.
