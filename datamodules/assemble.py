@@ -64,6 +64,7 @@ class RawFrame:
         lens: intrinsics and distortion, for whatever image size they were written down for.
         read: returns the stored thermal pixels [H, W] or [H, W, 3 or 4] (RGB, RGBA), uint8, uint16 or float32. Integers
             span their type (0 .. 255 is 0 .. 1) unless the scene has ``Counts``; float32 holds °C, NaN where unknown.
+            None for a photo, which ``read_rgb`` returns.
         time_s: seconds on any clock, float64, or None.
         read_rgb: returns a visible image of the same camera, or None.
         read_mask: returns [H, W] bool for the stored thermal image, True where a pixel counts, or None.
@@ -74,7 +75,7 @@ class RawFrame:
     name: str
     viewmat: np.ndarray
     lens: Lens
-    read: Callable[[], np.ndarray]
+    read: Callable[[], np.ndarray] | None
     time_s: float | None = None
     read_rgb: Callable[[], np.ndarray] | None = None
     read_mask: Callable[[], np.ndarray] | None = None
@@ -108,7 +109,7 @@ class _Stored:
     """Pixels of one view on their final grid, in the stored type, with what is needed to decode them."""
 
     frame: Frame
-    thermal: np.ndarray
+    thermal: np.ndarray | None
     rgb: np.ndarray | None
     mask: np.ndarray | None
     zero: float
@@ -116,18 +117,22 @@ class _Stored:
     channels: int
 
     def decode(self) -> View:
-        # numpy, not torch: a thread pool costs more than it gains on one image, and much more on a busy machine.
-        unit = np.subtract(self.thermal, self.zero, dtype=np.float32)
-        unit /= np.float32(self.full)
-        np.clip(unit, 0.0, 1.0, out=unit)
-        if unit.ndim == 2:
-            unit = unit[..., None] if self.channels == 1 else np.repeat(unit[..., None], self.channels, axis=2)
         rgb = None
         if self.rgb is not None:
             full = np.float32(np.iinfo(self.rgb.dtype).max)
             rgb = torch.from_numpy(np.divide(self.rgb, full, dtype=np.float32))
         mask = None if self.mask is None else torch.from_numpy(self.mask)
-        return View(frame=self.frame, thermal=torch.from_numpy(unit), rgb=rgb, mask=mask)
+        thermal = None if self.thermal is None else torch.from_numpy(self._unit(self.thermal))
+        return View(frame=self.frame, thermal=thermal, rgb=rgb, mask=mask)
+
+    def _unit(self, stored: np.ndarray) -> np.ndarray:
+        # numpy, not torch: a thread pool costs more than it gains on one image, and much more on a busy machine.
+        unit = np.subtract(stored, self.zero, dtype=np.float32)
+        unit /= np.float32(self.full)
+        np.clip(unit, 0.0, 1.0, out=unit)
+        if unit.ndim == 2:
+            unit = unit[..., None] if self.channels == 1 else np.repeat(unit[..., None], self.channels, axis=2)
+        return unit
 
 
 def build_scene(
@@ -184,6 +189,11 @@ def build_scene(
     notes = dict(notes or {})
     if not frames:
         raise SceneError(f"scene {name} has no frames")
+    if photos := sum(frame.read is None for frame in frames):
+        if photos < len(frames):
+            raise SceneError(f"scene {name} has thermal images of {len(frames) - photos} frames and none of {photos}")
+        notes["photos"] = "visible images only: an RGB scene, without thermal images and temperatures"
+        thermal_range = None
     if not downscale >= 1:
         raise SceneError(f"data.downscale must be 1 or larger, got {downscale}")
     if thermal_channels not in (1, 3):
@@ -241,7 +251,7 @@ def build_scene(
         prepare = partial(_prepare, downscale=downscale, channels=thermal_channels, alpha_mask=alpha_mask)
         prepared = dict(zip(used, pool.map(prepare, [frames[i] for i in used]), strict=True))
     _check_equals({frames[i].name: p for i, p in prepared.items()})
-    if prepared[used[0]].thermal.dtype.kind == "f" and counts is None:
+    if prepared[used[0]].found["type"] == "float32" and counts is None:
         counts = CELSIUS
         notes["encoding"] = "float pixels are temperatures in °C"
     if counts and thermal_range is None:
@@ -272,7 +282,7 @@ def build_scene(
         if weather is not None and environment is None:
             environment = weather_of(raw.name, weather, time_s)
         frame = Frame(name=raw.name, frame_id=i, camera=camera, time_s=time_s, environment=environment)
-        zero, full = _scaling(p.thermal.dtype, counts, thermal_range)
+        zero, full = _scaling(np.dtype(p.found["type"]), counts, thermal_range)
         stored[i] = _Stored(frame, p.thermal, p.rgb, p.mask, zero, full, thermal_channels)
     if counts:
         notes["clipped_fraction"] = _clipped_fraction(list(stored.values()))
@@ -336,7 +346,7 @@ def _of_points(what: str, values: np.ndarray | None, kept: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class _Prepared:
-    thermal: np.ndarray
+    thermal: np.ndarray | None
     rgb: np.ndarray | None
     mask: np.ndarray | None
     lens: Lens
@@ -346,8 +356,13 @@ class _Prepared:
 
 def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool) -> _Prepared:
     """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them."""
-    pixels, alpha = split_alpha(_supported(frame.read(), frame.name))
+    read = frame.read or frame.read_rgb
+    if read is None:
+        raise SceneError(f"frame {frame.name} has neither a thermal nor a visible image")
+    pixels, alpha = split_alpha(_supported(read(), frame.name))
     height, width = pixels.shape[:2]
+    if frame.read is None:
+        pixels, channels = _three_channels(pixels, frame.name), 3
     colour = colour_levels(pixels)
     found = {
         "size": f"{width}x{height}",
@@ -382,11 +397,9 @@ def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool)
             pixels = np.where(known, pixels, np.median(pixels[known]))
             mask = known if mask is None else mask & known
     rgb = None
-    if frame.read_rgb is not None:
+    if frame.read is not None and frame.read_rgb is not None:
         rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
-        if rgb.dtype.kind == "f":
-            raise SceneError(f"the visible image of {frame.name} is {rgb.dtype}; save it with 8 or 16 bits")
-        rgb = rgb if rgb.ndim == 3 else np.repeat(rgb[..., None], 3, axis=2)
+        rgb = _three_channels(rgb, frame.name)
         found["rgb_resized"] = rgb.shape[:2] != (height, width)
         rgb = resized(rgb, width, height)
     lens = frame.lens.resized(width, height)
@@ -399,7 +412,16 @@ def _prepare(frame: RawFrame, downscale: float, channels: int, alpha_mask: bool)
     mask = None if mask is None else resized_mask(mask, *small)
     if mask is not None and mask.all():
         mask = None
+    if frame.read is None:
+        return _Prepared(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
     return _Prepared(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _three_channels(rgb: np.ndarray, name: str) -> np.ndarray:
+    """A visible image [H, W, 3] of integers. Raises SceneError naming its frame where it is of another type."""
+    if rgb.dtype.kind == "f":
+        raise SceneError(f"the visible image of {name} is {rgb.dtype}; save it with 8 or 16 bits")
+    return rgb if rgb.ndim == 3 else np.repeat(rgb[..., None], 3, axis=2)
 
 
 def _supported(pixels: np.ndarray, name: str) -> np.ndarray:
@@ -532,8 +554,6 @@ def _image_notes(prepared: Mapping[int, _Prepared], downscale: float) -> dict[st
     if rgb := sum(f["rgb_resized"] for f in found):
         notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:
-        share = sum(int((~m).sum()) for m in masked) / sum(
-            p.thermal.shape[0] * p.thermal.shape[1] for p in prepared.values()
-        )
+        share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
         notes["masked_fraction"] = share
     return notes

@@ -26,7 +26,7 @@ class Colmap(SceneDataModule):
     names; none.
 
     Args:
-        images: folder of the thermal images.
+        images: folder of the thermal images; None for photos alone, those of ``rgb``.
         rgb: folder of visible images of the same cameras and names, or None.
         raw: folder of 16-bit counts with the same names, used in place of the images' greys, or None.
         raw_scale, raw_offset_c: °C = raw_scale * counts + raw_offset_c.
@@ -44,7 +44,7 @@ class Colmap(SceneDataModule):
     def __init__(
         self,
         *,
-        images: str = "images",
+        images: str | None = "images",
         rgb: str | None = None,
         raw: str | None = None,
         raw_scale: float = 1.0 / 64.0,
@@ -63,6 +63,8 @@ class Colmap(SceneDataModule):
         super().__init__(**shared)
         if radiometric not in ("auto", "never"):
             raise SceneError(f"data.radiometric must be auto or never, got {radiometric!r}")
+        if images is None and (rgb is None or raw is not None):
+            raise SceneError("data.images=null is for photos alone: give their folder as data.rgb, and no data.raw")
         if bounds_c is not None and len(bounds_c) != 2:
             raise SceneError(f"data.bounds_c needs two values [min, max] in °C, got {list(bounds_c)}")
         self.images = images
@@ -81,13 +83,13 @@ class Colmap(SceneDataModule):
     def load(self) -> SceneData:
         folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)")
         model = read_model(folder)
-        index = image_index(folder, self.images, "data.images")
         raw = image_index(folder, self.raw, "data.raw") if self.raw else None
         rgb = image_index(folder, self.rgb, "data.rgb") if self.rgb else None
+        index = raw or (image_index(folder, self.images, "data.images") if self.images else rgb)
         masks = ImageIndex(folder / self.masks)
 
-        files = {name: (raw or index).find(name) for name in model.names}
-        kept, notes = match_model(model, files, (raw or index), self.raw or self.images)
+        files = {name: index.find(name) for name in model.names}
+        kept, notes = match_model(model, files, index, self.raw or self.images or self.rgb)
         read, counts, encoding = self._reader(raw, index, [files[i] for i in kept])
         notes["encoding"] = encoding
         times, notes["time_source"] = self._times(folder, kept)
@@ -104,7 +106,7 @@ class Colmap(SceneDataModule):
                     name=name,
                     viewmat=viewmat,
                     lens=lens,
-                    read=partial(read, (raw or index).folder / files[name]),
+                    read=partial(read, index.folder / files[name]) if self.images else None,
                     time_s=times[name] if times else None,
                     read_rgb=partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
                     read_mask=self.mask_reader(masks, name),

@@ -140,7 +140,7 @@ def _array(folder: Path, name: str | None, default: str, key: str, axes: int) ->
         return None
     try:
         values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, MemoryError) as error:
+    except Exception as error:  # a damaged header ends in errors of numpy, of its parser and of its memory
         raise SceneError(f"data.{key}: {path} is no readable .npy file: {error}") from error
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
         raise SceneError(f"data.{key}: {path} holds no table of numbers; save one array with numpy.save")

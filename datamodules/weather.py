@@ -199,15 +199,18 @@ def site_of(notes: Mapping[str, Any]) -> Site | None:
     """The site that a record's notes name, or None."""
     if notes.get("latitude") is None or notes.get("longitude") is None:
         return None
-    place = (finite(notes.get(key) or 0.0, key) for key in ("latitude", "longitude", "altitude_m"))
+    place = (
+        finite(notes.get(key) or 0.0, f"data.{key} (or that of meta.json)")
+        for key in ("latitude", "longitude", "altitude_m")
+    )
     axes = {key: _axis(notes[key], key) for key in ("up", "north") if notes.get(key) is not None}
     return Site(*place, **axes)
 
 
 def _axis(values: Any, key: str) -> tuple[float, ...]:
     if isinstance(values, str) or not isinstance(values, Sequence):
-        raise SceneError(f"{key} is {shortened(values)}, three numbers are needed")
-    return tuple(finite(value, key) for value in values)
+        raise SceneError(f"data.{key} (or that of meta.json) is {shortened(values)}, three numbers are needed")
+    return tuple(finite(value, f"data.{key} (or that of meta.json)") for value in values)
 
 
 def utc_seconds(text: str | float, zone: str | None, where: str) -> float:

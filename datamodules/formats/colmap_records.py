@@ -50,6 +50,8 @@ def _check_binary(file: Path, end_of: Callable[[bytes, int], int]) -> None:
         while number < count and at <= len(data):
             number += 1
             at = end_of(data, at)
+    except SceneError:
+        raise
     except (error, ValueError):  # the length of the next record lies behind the end
         at = len(data) + 1
     if at > len(data):
@@ -74,8 +76,15 @@ def _camera(data: bytes, at: int) -> int:
 
 
 def _image(data: bytes, at: int) -> int:
-    end_of_name = data.index(b"\0", at + 4 + _POSE + 4) + 1
+    name_at = at + 4 + _POSE + 4
+    end_of_name = data.index(b"\0", name_at) + 1
+    _check_name(data[name_at : end_of_name - 1].decode("utf-8", "replace"))
     return end_of_name + 8 + 24 * _COUNT.unpack_from(data, end_of_name)[0]
+
+
+def _check_name(name: str) -> None:
+    if "\ufffd" in name:
+        raise SceneError(f"sparse model, images: {name!r} is no file name in UTF-8; {REMEDY}, with plain file names")
 
 
 def _point(data: bytes, at: int) -> int:
@@ -148,6 +157,7 @@ def _text_camera(words: list[str]) -> str | None:
 
 def _text_image(words: list[str]) -> str | None:
     good = len(words) >= 10 and _numbers(words[:9])
+    _check_name(" ".join(words[9:]))
     return None if good else "an image is IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of its points"
 
 

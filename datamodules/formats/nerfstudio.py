@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,12 @@ from heatsplat.contracts import SceneError
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
 _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}
+# Keys of a frame's images, in order of preference: the first of each is the data sets' own.
+THERMAL_KEYS = ("thermal_file_path", "thermal", "thermal_path", "ir", "infrared")
+VISIBLE_KEYS = ("file_path", "rgb", "rgb_file_path", "rgb_path", "image", "image_path", "color")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Transforms:
     """A transforms file, its frames as dictionaries.
 
@@ -27,11 +30,13 @@ class Transforms:
         path: the file.
         values: everything in it but the frames; keys here stand for all frames that do not have them.
         frames: one dictionary per frame with at least file_path and transform_matrix.
+        assumed: other keys than those of nerfstudio that its image paths were found under, or nothing.
     """
 
     path: Path
     values: dict[str, Any]
     frames: list[dict[str, Any]]
+    assumed: str = ""
 
     @property
     def applied_transform(self) -> np.ndarray:
@@ -45,11 +50,29 @@ def read_transforms(path: Path) -> Transforms:
     frames = values.pop("frames", None)
     if not frames or not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise SceneError(f"{path} has no frames: key 'frames' is {shortened(frames)}, a list of {{...}} is needed")
+    used: set[str] = set()
     for i, frame in enumerate(frames):
-        for key in ("file_path", "transform_matrix"):
-            if key not in frame:
-                raise SceneError(f"{path}: frame {i} has no key {key!r}; it has {', '.join(frame)}")
-    return Transforms(path, values, frames)
+        thermal, visible = (_path_in(frame, keys, used) for keys in (THERMAL_KEYS, VISIBLE_KEYS))
+        for key, there in (("file_path", thermal or visible), ("transform_matrix", "transform_matrix" in frame)):
+            if not there:
+                has = f"{shortened(frame[key])} under" if key in frame else "no key"
+                raise SceneError(f"{path}: frame {i} has {has} {key!r}; it has {', '.join(frame)}")
+        frame["file_path"] = visible or thermal
+        if thermal:
+            frame["thermal_file_path"] = thermal
+    return Transforms(path, values, frames, assumed=", ".join(sorted(used - {THERMAL_KEYS[0], VISIBLE_KEYS[0]})))
+
+
+def _path_in(frame: dict[str, Any], keys: Sequence[str], used: set[str]) -> str | None:
+    """The path under the first of the keys that has one, itself or under a file_path of its own; the key is noted."""
+    for key in keys:
+        value = frame.get(key)
+        if isinstance(value, dict):
+            value = value.get("file_path")
+        if isinstance(value, str) and value:
+            used.add(key)
+            return value
+    return None
 
 
 def viewmat_of(transforms: Transforms, frame: dict[str, Any], opengl: bool) -> np.ndarray:

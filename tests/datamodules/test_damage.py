@@ -82,6 +82,21 @@ def test_a_damaged_line_is_named(tmp_path, part, old, new, message):
         read_model(tmp_path)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_names_that_are_no_text_and_unknown_cameras_are_refused(tmp_path, text):
+    folder = find_model(write_colmap(tmp_path, names(9), text=text))
+    images, cameras = (folder / f"{part}.{'txt' if text else 'bin'}" for part in ("images", "cameras"))
+    whole = images.read_bytes()
+    images.write_bytes(whole.replace(b"frame_003", b"frame\xff003"))
+    with pytest.raises(SceneError, match="sparse model, images: .* is no file name in UTF-8"):
+        read_model(tmp_path)
+    images.write_bytes(whole)
+    if not text:
+        cameras.write_bytes(cameras.read_bytes()[:12] + b"\x63" + cameras.read_bytes()[13:])
+        with pytest.raises(SceneError, match="cameras.bin: number 99 is no camera model that COLMAP knows"):
+            read_model(tmp_path)
+
+
 # Poses, lenses, temperatures ------------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from layouts import names, write_colmap
 from heatsplat.contracts import SceneError
 
 CONF = Path(__file__).parents[2] / "conf"
-LOADERS = ("rhd", "thermoscenes", "ti_nsd", "colmap", "rgbt_scenes", "ntr", "thermo")
+LOADERS = ("rhd", "thermoscenes", "nerfstudio", "ti_nsd", "colmap", "rgbt_scenes", "ntr", "thermo")
 
 
 def config_of(data, *overrides):

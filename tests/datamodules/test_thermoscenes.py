@@ -151,11 +151,14 @@ def test_lists_in_the_json_win_over_names(tmp_path):
     assert "lists in transforms_thermal.json" in scene.notes["split_source"]
 
 
-def test_names_that_say_nothing_ask_for_another_rule(tmp_path):
-    write_thermoscenes(tmp_path, [f"frame_{i}" for i in range(9)])
+def test_names_that_say_nothing_leave_every_8th_frame_out_and_half_of_them_is_too_little(tmp_path):
+    write_thermoscenes(tmp_path / "a", [f"frame_{i}" for i in range(9)])
+    scene = loaded(tmp_path / "a")
+    assert [f.name for f in scene.test.frames] == ["frame_0.PNG", "frame_8.PNG"]
+    assert scene.notes["split_assumed"].startswith("every 8th frame is test: neither names nor transforms_thermal.json")
+    write_thermoscenes(tmp_path / "b", [f"frame_{i}" for i in range(8)] + ["train_8"])
     with pytest.raises(SceneError, match="data.split=names: frame_0.PNG says neither.*data.split=every_8th"):
-        loaded(tmp_path)
-    assert len(loaded(tmp_path, split="every_8th").test) == 2
+        loaded(tmp_path / "b")
 
 
 def test_the_thermal_image_is_found_beside_the_visible_one(tmp_path):

@@ -120,7 +120,7 @@ def _other_value(values: Any, rng: random.Random) -> Any:
         else:
             values[key] = _other_value(values[key], rng)
         return values
-    if isinstance(values, int | float) and rng.random() < 0.4:
+    if isinstance(values, int | float) and abs(values) < 1e300 and rng.random() < 0.4:
         return values * rng.choice([-1, 0.5, 2, 1e3, 1e-3]) + rng.choice([0, 1e-2, 1])
     return rng.choice(VALUES)
 

@@ -27,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "datamodules"))
 
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
+from heatsplat.datamodules.nerfstudio import Nerfstudio
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.rgbt_scenes import RGBTScenes
 from heatsplat.datamodules.rhd import RHD
@@ -52,6 +53,8 @@ READERS: dict[str, Callable] = {
     "rhd": RHD,
     "thermoscenes": partial(ThermoScenes, random_points=20),
     "thermoscenes_ply": partial(ThermoScenes, random_points=20),
+    "nerfstudio": partial(Nerfstudio, random_points=20),
+    "photos": partial(Nerfstudio, random_points=20),
     "ti_nsd": TINSD,
     "rgbt_scenes": RGBTScenes,
     "ntr": partial(NTR, min_c=10.0, max_c=60.0, random_points=20),
@@ -89,6 +92,17 @@ def write_templates(root: Path) -> None:
     (ply / "points.ply").write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
     transforms = next(ply.glob("transforms*.json"))
     transforms.write_text(json.dumps({**json.loads(transforms.read_text()), "ply_file_path": "points.ply"}))
+
+    other_keys = {"file_path": "rgb", "thermal_file_path": "thermal"}
+    nerfstudio = shutil.copytree(ply, root / "nerfstudio")
+    transforms = next(nerfstudio.glob("transforms*.json"))
+    values = json.loads(transforms.read_text())
+    values["frames"] = [{other_keys.get(key, key): v for key, v in frame.items()} for frame in values["frames"]]
+    transforms.write_text(json.dumps(values))
+
+    photos = shutil.copytree(root / "ntr", root / "photos")
+    for i, path in enumerate(sorted(photos.rglob("*.png"))):
+        assert cv2.imwrite(str(path), np.random.default_rng(i).integers(0, 256, (20, 24, 3)).astype(np.uint8))
 
     thermo = root / "thermo"
     frames = [json.loads(path.read_text())["frames"] for path in sorted(thermo.glob("transforms_*.json"))]

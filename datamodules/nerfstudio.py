@@ -1,0 +1,235 @@
+"""Scenes as nerfstudio, instant-ngp and their relatives write them: transforms*.json beside images."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
+from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.images import (
+    PSEUDO_COLOUR_LEVELS,
+    ImageIndex,
+    colour_levels,
+    read_image,
+    split_alpha,
+)
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.points import ply_points, random_points
+from heatsplat.datamodules.side_files import shortened
+from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
+from heatsplat.datamodules.timestamps import stem_of
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
+
+log = logging.getLogger(__name__)
+
+THERMAL_FOLDERS = ("thermal", "ir", "infrared")
+
+
+class Nerfstudio(SceneDataModule):
+    """root/scene with transforms.json (or transforms_thermal.json, or transforms_train.json and transforms_test.json).
+
+    Poses are camera-to-world in OpenGL axes. A frame names its thermal image (thermal_file_path, thermal, ir) and its
+    visible one (file_path, rgb, image), or one image of file_path. That is thermal where it lies in thermal/, or is grey,
+    or the scene has temperature bounds; coloured ones are photos, and the scene an RGB scene. Points come from a COLMAP
+    model in the scene, from the JSON's ply_file_path, or are random ones. What was assumed stands in the notes.
+
+    Args:
+        rgb: True to load the visible images as well.
+        random_points: number of points to make up where the scene has none.
+        shared: options of every loader (``SceneDataModule``). The split "names" takes what the JSON lists where it lists
+            all frames, and every 8th frame where neither it nor any name speaks of train or test.
+    """
+
+    def __init__(self, *, split: str = "names", rgb: bool = True, random_points: int = 20_000, **shared: Any) -> None:
+        super().__init__(split=split, **shared)
+        self.rgb = rgb
+        self.random_points = random_points
+
+    def load(self) -> SceneData:
+        return self.posed(self.scene_folder(lambda p: bool(find_transforms(p)), "transforms.json"))
+
+    def posed(self, folder: Path) -> SceneData:
+        """The scene of the transforms files in a folder."""
+        bounds, notes = bounds_of(folder)
+        listed = {read_transforms(path): subset for path, subset in find_transforms(folder).items()}
+        first = next(iter(listed))
+        notes["cameras"] = f"{' and '.join(t.path.name for t in listed)}, OpenGL axes"
+        if first.assumed:
+            notes["keys_assumed"] = f"image paths stand under {first.assumed}"
+        frames, found = self._frames(folder, listed, bounds)
+        points, colors, source = self._points(folder, first, frames)
+        notes |= found | {"points_source": source, "time_source": "none: the data set has no times"}
+        split, says = self._split(frames, first)
+        notes |= says
+        if assumed := [notes[key] for key in ("keys_assumed", "images_assumed", "split_assumed") if key in notes]:
+            log.info("scene %s: %s", folder.name, "; ".join(assumed))
+        return self.finish(
+            folder.name,
+            frames,
+            points,
+            split=split,
+            point_colors=colors,
+            thermal_range=None if frames[0].read is None else bounds,
+            notes=notes,
+        )
+
+    def _split(self, frames: Sequence[RawFrame], transforms: Transforms) -> tuple[SplitRule, dict[str, str]]:
+        """The rule, and a note where it is not the one that was asked for."""
+        if self.split.rule != "names":
+            return self.split, {}
+        if all(f.subset for f in frames):
+            return SplitRule("json"), {"split_source": f"train and test lists in {transforms.path.name}"}
+        words = (*TRAIN_WORDS, *TEST_WORDS)
+        if any(word in PurePosixPath(f.name).stem.lower() for f in frames for word in words):
+            return self.split, {}
+        says = f"every 8th frame is test: neither names nor {transforms.path.name} speak of train and test"
+        return SplitRule("every_8th"), {"split_assumed": says}
+
+    def _frames(
+        self, folder: Path, listed: Mapping[Transforms, str | None], bounds: ThermalRange | None
+    ) -> tuple[list[RawFrame], dict[str, Any]]:
+        index, masks = ImageIndex(folder), ImageIndex(folder / self.masks)
+        entries = [
+            (transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
+            for transforms, subset in listed.items()
+            for frame in transforms.frames
+        ]
+        notes: dict[str, Any] = {"registered": len(entries)}
+        photos = False
+        plain = [visible for *_, visible in entries if visible]
+        named = any(thermal or "thermal_file_path" in frame for _, _, frame, thermal, _ in entries)
+        if plain and not named:
+            pixels, _ = split_alpha(read_image(folder / plain[0]))
+            photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and self.thermal_channels == 1
+            what = "photos (they are in colour)" if photos else "thermal images"
+            notes["images_assumed"] = (
+                f"images such as {plain[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
+                "thermal ones thermal_file_path, or set data.thermal_channels=3 for pseudo-colour"
+            )
+            if not photos:
+                entries = [(*entry[:3], entry[4], None) for entry in entries]
+        subset_of = _listed_subsets([*listed])
+        frames, missing, visible = [], [], 0
+        for transforms, subset, frame, file, rgb_file in entries:
+            main = rgb_file if photos else file
+            if main is None:
+                missing.append(str(frame["file_path"]))
+                continue
+            rgb_file = rgb_file if self.rgb or photos else None
+            visible += rgb_file is not None
+            read = partial(read_image, folder / main)
+            name = PurePosixPath(main).name if len(listed) == 1 else main
+            frames.append(
+                RawFrame(
+                    name=name,
+                    viewmat=viewmat_of(transforms, frame, opengl=True),
+                    lens=lens_in(transforms, frame, lambda read=read: read().shape[1::-1]),
+                    read=None if photos else read,
+                    read_rgb=partial(read_image, folder / rgb_file) if rgb_file else None,
+                    read_mask=self.mask_reader(masks, name),
+                    subset=subset or subset_of.get(stem_of(main)),
+                )
+            )
+        if not frames:
+            raise SceneError(
+                f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
+                f"looked for {missing[0]} under thermal_file_path and in thermal/"
+            )
+        if missing:
+            notes["images_missing"] = f"{len(missing)} frames have no thermal image, dropped: {', '.join(missing[:5])}"
+        if self.rgb:
+            notes["rgb"] = f"{visible} of {len(frames)} images have a visible one"
+        return frames, notes
+
+    def _points(
+        self, folder: Path, transforms: Transforms, frames: Sequence[RawFrame]
+    ) -> tuple[np.ndarray, np.ndarray | None, str]:
+        """Points in the world of the JSON, their colours, and where they come from."""
+        rejected = ""
+        if find_model(folder) is not None:
+            model = read_model(folder)
+            # The JSON's world is COLMAP's after applied_transform (nerfstudio turns the axes); its points go along.
+            turn = transforms.applied_transform
+            of_model = {stem_of(n): turn @ np.linalg.inv(v) for n, v in zip(model.names, model.viewmats, strict=True)}
+            pairs = [
+                (of_model[stem_of(f.name)], np.linalg.inv(f.viewmat)) for f in frames if stem_of(f.name) in of_model
+            ]
+            apart = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in pairs), default=0.0)
+            spread = np.ptp(np.stack([np.linalg.inv(f.viewmat)[:3, 3] for f in frames]), axis=0).max()
+            if apart <= 0.05 * spread + 1e-6:
+                place = model.folder.relative_to(folder)
+                return model.points @ turn[:3, :3].T + turn[:3, 3], model.colors, f"{place} (COLMAP), applied_transform"
+            rejected = f"; the model in {model.folder} is not used: its cameras lie up to {apart:.3g} units elsewhere"
+        ply = transforms.values.get("ply_file_path")
+        if ply and (transforms.path.parent / str(ply)).is_file():
+            points, colors = ply_points(transforms.path.parent / str(ply))
+            return points, colors, f"{ply}{rejected}"
+        points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
+        return points, None, f"{len(points)} random points in the cube that the cameras look at{rejected}"
+
+
+def find_transforms(folder: Path) -> dict[Path, str | None]:
+    """The scene's JSON files with the subset that each holds (None: all frames), of the first of these, or none.
+
+    In the folder, or else in its folder thermal/: transforms_thermal.json; transforms.json; transforms_train.json with
+    transforms_test.json (or transforms_val.json); the only transforms*.json.
+    """
+    for place in (folder, folder / "thermal"):
+        for name in ("transforms_thermal.json", "transforms.json"):
+            if (place / name).is_file():
+                return {place / name: None}
+        train = place / "transforms_train.json"
+        tests = [path for word in ("test", "val") if (path := place / f"transforms_{word}.json").is_file()]
+        if train.is_file() and tests:
+            return {train: "train", tests[0]: "test"}
+        others = sorted(place.glob("transforms*.json"))
+        if len(others) == 1:
+            return {others[0]: None}
+    return {}
+
+
+def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
+    """Bounds, or None, and notes. ThermoScenes' own tools swap bounds in the wrong order, and so does this."""
+    path = folder / BOUNDS_FILE
+    if not path.is_file():
+        return None, {"bounds_source": f"none: there is no {BOUNDS_FILE}"}
+    bounds, swapped = read_bounds(path, swap=True)
+    return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
+
+
+def _listed_subsets(files: Sequence[Transforms]) -> dict[str, str]:
+    """Subset by file stem, from the lists that a transforms file may have (train_filenames, ...)."""
+    subsets: dict[str, str] = {}
+    for transforms in files:
+        for key, subset in (("train", "train"), ("val", "test"), ("eval", "test"), ("test", "test")):
+            listed = transforms.values.get(f"{key}_filenames") or []
+            if not isinstance(listed, list):
+                raise SceneError(
+                    f"{transforms.path}: {key}_filenames is {shortened(listed)}, a list of names is needed"
+                )
+            subsets |= {stem_of(str(name)): subset for name in listed}
+    return subsets
+
+
+def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex) -> tuple[str | None, str | None]:
+    """Stored thermal and visible file of a frame of a JSON in ``place``, either may be None.
+
+    A file of which nothing says that it is thermal is a visible one here.
+    """
+    path = PurePosixPath(place.as_posix()) / frame["file_path"]
+    candidates = [PurePosixPath(place.as_posix()) / frame["thermal_file_path"]] if "thermal_file_path" in frame else []
+    candidates.append(PurePosixPath("thermal") / path.name)
+    if set(path.parts[:-1]) & set(THERMAL_FOLDERS):
+        candidates.append(path)
+    thermal = next((file for c in candidates if (file := index.find(str(c)))), None)
+    if place.parts and thermal:  # thermal/ has cameras of its own, which no visible image shares
+        return thermal, None
+    places = (path, PurePosixPath("images") / path.name, PurePosixPath("rgb") / path.name)
+    return thermal, next((file for c in places if (file := index.find(str(c))) and file != thermal), None)

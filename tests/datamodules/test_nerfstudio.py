@@ -1,0 +1,146 @@
+"""Scenes as other tools write them: other keys, other folders, photos alone."""
+
+import json
+import logging
+import shutil
+
+import numpy as np
+import pytest
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.nerfstudio import Nerfstudio
+from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_colmap, write_image, write_json
+
+from heatsplat.contracts import SceneError
+
+LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
+
+
+def photo(index):
+    """A picture in many colours."""
+    pixels = np.random.default_rng(index).integers(0, 256, (HEIGHT, WIDTH, 3))
+    return pixels.astype(np.uint8)
+
+
+def write_frames(folder, frames, file="transforms.json", **values):
+    """A transforms file: a dictionary of image keys for each frame, poses added."""
+    poses = viewmats(len(frames))
+    listed = [{**frame, "transform_matrix": opengl(pose)} for frame, pose in zip(frames, poses, strict=True)]
+    write_json(folder / file, {**LENS, **values, "frames": listed})
+
+
+def loaded(root, **options):
+    return Nerfstudio(root=str(root), **{"random_points": 50, **options}).scene
+
+
+@pytest.mark.parametrize(
+    ("keys", "assumed"),
+    [
+        (lambda name: {"rgb": f"color/{name}", "thermal": f"heat/{name}"}, "image paths stand under rgb, thermal"),
+        (lambda name: {"file_path": f"./color/{name}", "thermal_file_path": f"./heat/{name}"}, None),
+        (
+            lambda name: {"image": {"file_path": f"color/{name}"}, "ir": {"file_path": f"heat/{name}"}},
+            "image paths stand under image, ir",
+        ),
+    ],
+)
+def test_images_are_found_under_other_keys(tmp_path, keys, assumed):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "color" / name, photo(i))
+        write_image(tmp_path / "heat" / name, grey(i))
+    write_frames(tmp_path, [keys(name) for name in names(9)])
+    scene = loaded(tmp_path)
+    assert len(scene.train) == 7 and len(scene.test) == 2
+    for view in scene.train:
+        i = names(9).index(view.frame.name)
+        np.testing.assert_allclose(view.thermal[..., 0] * 255, grey(i), atol=1e-4)
+        np.testing.assert_allclose(view.rgb * 255, photo(i), atol=1e-4)
+        np.testing.assert_allclose(view.camera.viewmat, viewmats(9)[i], atol=1e-9)
+    assert scene.notes.get("keys_assumed") == assumed
+
+
+def test_what_is_assumed_is_noted_and_logged_once(tmp_path, caplog):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "a" / name, grey(i))
+    write_frames(tmp_path, [{"image": f"a/{name}"} for name in names(9)])
+    with caplog.at_level(logging.INFO):
+        scene = loaded(tmp_path)
+    assert scene.notes["keys_assumed"] == "image paths stand under image"
+    assert scene.notes["images_assumed"].startswith("images such as a/frame_000.png are taken as thermal images")
+    assert scene.notes["split_assumed"].startswith("every 8th frame is test")
+    assert [r.message.count("; ") for r in caplog.records if "keys" in r.message or "stand under" in r.message] == [2]
+    assert scene.train[0].rgb is None and scene.train[0].thermal.shape == (HEIGHT, WIDTH, 1)
+
+
+def test_photos_alone_are_an_rgb_scene(tmp_path):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "images" / name, photo(i))
+    write_frames(tmp_path, [{"file_path": f"images/{name}"} for name in names(9)], k1=0.3)
+    scene = loaded(tmp_path, downscale=2, rgb=False)
+    view = scene.train[0]
+    assert view.thermal is None and view.rgb.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert not view.mask.all()  # of the distortion
+    assert scene.thermal_range is None and "thermal_range" not in scene.metadata
+    assert scene.notes["photos"].startswith("visible images only") and "pseudo_colour" not in scene.notes
+    json.dumps(scene.notes)
+    with pytest.raises(SceneError, match="has no thermal image"):
+        view.image("thermal")
+    colours = loaded(tmp_path, thermal_channels=3)
+    assert colours.train[0].thermal.shape == (HEIGHT, WIDTH, 3) and colours.train[0].rgb is None
+
+
+def test_colours_with_bounds_are_no_photos(tmp_path):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "images" / name, photo(i))
+    write_frames(tmp_path, [{"file_path": f"images/{name}"} for name in names(9)])
+    write_json(tmp_path / "temperature_bounds.json", {"absolute_min_temperature": 1, "absolute_max_temperature": 2})
+    with pytest.raises(SceneError, match="is pseudo-colour .* no temperatures although the scene has bounds"):
+        loaded(tmp_path)
+
+
+@pytest.mark.parametrize("test", ["test", "val"])
+def test_instant_ngp_and_blender_files(tmp_path, test):
+    for subset in ("train", test):
+        for i in range(5):
+            write_image(
+                tmp_path / subset / f"r_{i}.png", np.dstack([photo(i), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+            )
+        frames = [{"file_path": f"./{subset}/r_{i}"} for i in range(5)]
+        write_frames(tmp_path, frames, f"transforms_{subset}.json")
+        values = json.loads((tmp_path / f"transforms_{subset}.json").read_text())
+        values = {"camera_angle_x": 0.7, "frames": values["frames"]}
+        write_json(tmp_path / f"transforms_{subset}.json", values)
+    scene = loaded(tmp_path)
+    assert [f.name for f in scene.train.frames] == [f"train/r_{i}.png" for i in range(5)]
+    assert [f.name for f in scene.test.frames] == [f"{test}/r_{i}.png" for i in range(5)]
+    assert scene.train[0].camera.K[0, 0] == pytest.approx(0.5 * WIDTH / np.tan(0.35))
+    assert scene.train[0].thermal is None and scene.train[0].rgb is not None
+
+
+def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "thermal" / "images" / name, grey(i))
+        write_image(tmp_path / "rgb" / "images" / name, photo(i))
+    write_frames(tmp_path / "thermal", [{"file_path": f"images/{name}"} for name in names(9)])
+    shutil.copy(tmp_path / "thermal" / "transforms.json", tmp_path / "rgb" / "transforms.json")
+    scene = loaded(tmp_path)
+    view = scene.train[0]
+    np.testing.assert_allclose(view.thermal[..., 0] * 255, grey(names(9).index(view.frame.name)), atol=1e-4)
+    assert view.rgb is None
+
+
+def test_images_without_any_known_key_are_refused(tmp_path):
+    write_frames(tmp_path, [{"picture": "a.png"}])
+    with pytest.raises(SceneError, match="frame 0 has no key 'file_path'; it has picture, transform_matrix"):
+        loaded(tmp_path)
+    write_frames(tmp_path, [{"file_path": 5}])
+    with pytest.raises(SceneError, match="frame 0 has 5 under 'file_path'"):
+        loaded(tmp_path)
+
+
+def test_photos_with_a_sparse_model(tmp_path):
+    write_colmap(tmp_path, names(9), pixels=[photo(i) for i in range(9)])
+    scene = Colmap(root=str(tmp_path), images=None, rgb="images").scene
+    assert scene.train[0].thermal is None
+    np.testing.assert_allclose(scene.train[0].rgb * 255, photo(1), atol=1e-4)
+    with pytest.raises(SceneError, match="data.images=null is for photos alone"):
+        Colmap(images=None)
