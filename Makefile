@@ -13,7 +13,7 @@ EXTRAS      := dev$(if $(CUDA),$(comma)gsplat)
 comma       := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow wheel-test docs lint format bench stability tensorboard clean
+.PHONY: help install demo test test-slow wheel-test docs lint format bench stability fuzz tensorboard clean
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -56,6 +56,9 @@ bench: $(READY)  ## time the renderer against its peers and its floor
 
 stability: $(READY)  ## measure the hard cases of arithmetic and write docs/stability.md
 	@$(RUN) src/study.py study=stability $(ARGS)
+
+fuzz: $(READY)  ## read damaged scenes for an hour (ARGS=60 for a minute) and count what became of them
+	@OMP_NUM_THREADS=1 $(RUN) tests/fuzz/readers.py $(or $(ARGS),3600)
 
 tensorboard: $(READY)  ## look at all runs in TensorBoard
 	@$(VENV)/bin/tensorboard --logdir outputs

@@ -100,7 +100,7 @@ class Lens:
 
 
 def lens_of(model: str, params: Sequence[float], width: int, height: int, source: str) -> Lens:
-    """The lens of a COLMAP camera. Raises SceneError naming ``source`` for a model that is not supported."""
+    """The lens of a COLMAP camera. Raises SceneError naming ``source`` for an unsupported model or impossible numbers."""
     if model not in MODELS:
         raise SceneError(
             f"{source}: camera model {model} is not supported; supported are {', '.join(MODELS)}. "
@@ -113,17 +113,20 @@ def lens_of(model: str, params: Sequence[float], width: int, height: int, source
     focal = values.get("f")
     fisheye = model.endswith("FISHEYE")
     coefficients = tuple(values.get(key, 0.0) for key in (_FISHEYE if fisheye else _POLYNOMIAL))
-    return Lens(
-        fx=values.get("fx", focal),
-        fy=values.get("fy", focal),
-        cx=values["cx"],
-        cy=values["cy"],
-        width=width,
-        height=height,
-        distortion=coefficients if fisheye or any(coefficients) else (),
-        fisheye=fisheye,
-        model=model,
-    )
+    try:
+        return Lens(
+            fx=values.get("fx", focal),
+            fy=values.get("fy", focal),
+            cx=values["cx"],
+            cy=values["cy"],
+            width=width,
+            height=height,
+            distortion=coefficients if fisheye or any(coefficients) else (),
+            fisheye=fisheye,
+            model=model,
+        )
+    except SceneError as error:
+        raise SceneError(f"{source}: {error}") from error
 
 
 @lru_cache(maxsize=2)

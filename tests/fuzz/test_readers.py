@@ -1,0 +1,58 @@
+"""A few hundred damaged scenes; ``make fuzz`` tries thousands."""
+
+import json
+import random
+import time
+
+import mutate
+import pytest
+import readers
+from mutate import Outcome, damaged, guarded, other_bytes
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    root = tmp_path_factory.mktemp("whole")
+    readers.write_templates(root)
+    return root
+
+
+@pytest.mark.parametrize("layout", readers.READERS)
+def test_damaged_scenes_load_sanely_or_are_refused_by_name(whole, layout, tmp_path):
+    outcomes = readers.fuzzed(layout, whole / layout, tmp_path / "copy", range(25))
+    assert [outcome for outcome in outcomes if outcome.failed] == []
+    assert {outcome.kind for outcome in outcomes} == {"loads", "refused"}
+
+
+@pytest.mark.parametrize("layout", readers.READERS)
+def test_whole_scenes_load(whole, layout, tmp_path, monkeypatch):
+    monkeypatch.setattr(mutate, "damage", lambda folder, rng: [])
+    assert readers.outcome_of(layout, whole / layout, tmp_path / "copy", 0).kind == "loads"
+
+
+def test_the_guard_sees_hangs_crashes_and_hunger_and_goes_on(monkeypatch):
+    monkeypatch.setattr(mutate, "SECONDS", 2.0)
+
+    def work(number):
+        if number == 1:
+            time.sleep(60)
+        if number == 2:
+            mutate.os.abort()
+        if number == 3:
+            try:
+                bytearray(64 << 30)
+            except MemoryError:
+                return Outcome(number, "traceback", "MemoryError")
+        return Outcome(number, "loads")
+
+    kinds = [outcome.kind for outcome in guarded(range(5), work)]
+    assert kinds == ["loads", "hang", "crash", "traceback", "loads"]
+
+
+def test_damage_is_repeatable_and_does_something():
+    data = json.dumps({"frames": [{"a": [1.0, 2.0]}] * 3}).encode()
+    for suffix in (".json", ".csv", ".bin"):
+        twice = [[damaged(data, suffix, random.Random(i)) for i in range(50)] for _ in range(2)]
+        assert twice[0] == twice[1]
+        assert sum(d != data for d in twice[0]) > 40 and len(set(twice[0])) > 25
+    assert other_bytes(b"", random.Random(1)) is not None
