@@ -120,6 +120,93 @@ class Newton:
         return self.rate
 
 
+@dataclass(frozen=True)
+class Bodies:
+    """What ``Newton`` is asked of, and the solutions that need no time steps.
+
+    Args:
+        rate, initial: [N] float64.
+        omega: [K] float64.
+        gains: [N, 2, K] float64, of sin and of cos.
+        rates: least and greatest rate, between which a table lies.
+    """
+
+    rate: Tensor
+    initial: Tensor
+    omega: Tensor
+    gains: Tensor
+    rates: tuple[float, float]
+
+    def forms(self, types: tuple[str, ...], sizes: tuple[int, ...]) -> list[Form]:
+        """The solutions in the types and for the table sizes asked for."""
+        found = []
+        for kind in types:
+            dtype = getattr(torch, kind)
+            found += [Form("closed form, fused kernel", "", kind, partial(self.fused, dtype), True)]
+            found += [Form("closed form, torch", "", kind, partial(self.plain, dtype), True)]
+            found += [Form("printed formula", "", kind, partial(self.printed, dtype), False)]
+            found += [Form("rate table", f"{n} rates", kind, partial(self.table, dtype, n), False) for n in sizes]
+        return found
+
+    def printed(self, dtype: torch.dtype) -> Moment:
+        a, w, g, first = (x.to(dtype) for x in (self.rate, self.omega, self.gains, self.initial))
+
+        def at(t: float) -> Tensor:
+            time = torch.tensor(t, dtype=dtype)
+            sine, cosine = PRINTED(a[:, None], w, time)
+            decayed = AMBIENT_K + (first - AMBIENT_K) * torch.exp(-time / (1 / a))
+            return decayed + (g[:, 0] * sine + g[:, 1] * cosine).sum(1)
+
+        return at
+
+    def plain(self, dtype: torch.dtype) -> Moment:
+        a, g, first = (x.to(dtype) for x in (self.rate, self.gains, self.initial))
+        sin_gain, cos_gain = (x.contiguous() for x in g.unbind(1))
+        ambient = torch.tensor(AMBIENT_K, dtype=dtype)
+        return lambda t: temperature(
+            torch.tensor(t, dtype=torch.float64), ambient, first, a, self.omega, sin_gain, cos_gain
+        )
+
+    def fused(self, dtype: torch.dtype) -> Moment:
+        a, g, first = (x.to(dtype).contiguous() for x in (self.rate, self.gains, self.initial))
+        source, ambient = g if len(self.omega) else None, torch.tensor(AMBIENT_K, dtype=dtype)
+        return lambda t: visible_temperature(
+            torch.tensor(t, dtype=torch.float64), ambient, first, a, self.omega, source
+        )
+
+    def table(self, dtype: torch.dtype, size: int) -> Moment:
+        grid = log_rate_grid(size, *self.rates)
+        cell, x = grid_position(self.rate.log(), grid)
+        x, flat, first = x.to(dtype), self.gains.flatten(1).to(dtype), self.initial.to(dtype)
+
+        def at(t: float) -> Tensor:
+            responses = harmonic_response(grid.exp(), self.omega, torch.tensor(t, dtype=torch.float64))
+            rows = torch.cat((torch.exp(-grid.exp() * t)[:, None], *responses), 1)
+            found = interpolate(cubics(rows).to(dtype), cell, x)
+            return AMBIENT_K + (first - AMBIENT_K) * found[:, 0] + (flat * found[:, 1:]).sum(1)
+
+        return at
+
+    def reference(self, moments_s: list[float], count: int) -> np.ndarray:
+        """[count, F] float64 of the first bodies, by formula with many digits."""
+        import mpmath
+
+        values = np.empty((count, len(moments_s)))
+        with mpmath.workdps(DIGITS):
+            w = [mpmath.mpf(x) for x in self.omega.tolist()]
+            turns = [[mpmath.expj(x * mpmath.mpf(t)) for x in w] for t in moments_s]
+            for i in range(count):
+                a, first = mpmath.mpf(self.rate[i].item()), mpmath.mpf(self.initial[i].item())
+                pairs = zip(w, *self.gains[i].tolist(), strict=True)
+                # Re of it times (e^{iωt} - e^{-at})
+                terms = [mpmath.mpc(c, -s) / mpmath.mpc(a, x) for x, s, c in pairs]
+                for f, t in enumerate(moments_s):
+                    kept = mpmath.exp(-a * mpmath.mpf(t))
+                    heat = sum((z * (turn - kept) for z, turn in zip(terms, turns[f], strict=True)), mpmath.mpc(0))
+                    values[i, f] = AMBIENT_K + (first - AMBIENT_K) * kept + heat.real
+        return values
+
+
 def newton_problem(
     gaussians: int, frames: int, name: str, title: str, frequencies: int, rates: tuple, omegas: tuple, span_s: float
 ) -> Problem:
@@ -130,79 +217,12 @@ def newton_problem(
     amplitude = uniform(f"{name} gains", -2.0, 2.0, gaussians * 2 * frequencies).reshape(gaussians, 2, frequencies)
     gains = (amplitude * (rate[:, None, None] ** 2 + omega**2).sqrt()).float().double()
     if name == "stiff":  # some frames lie within the fastest bodies' settling
-        moments = torch.logspace(-3, math.log10(span_s), frames, dtype=torch.float64)
+        moments = torch.logspace(-3, math.log10(span_s), frames, dtype=torch.float64).tolist()
     else:
-        moments = torch.linspace(span_s / frames, span_s, frames, dtype=torch.float64)
-
-    def printed(dtype: torch.dtype) -> Moment:
-        a, w, g, first = (x.to(dtype) for x in (rate, omega, gains, initial))
-
-        def at(t: float) -> Tensor:
-            time = torch.tensor(t, dtype=dtype)
-            sine, cosine = PRINTED(a[:, None], w, time)
-            decayed = AMBIENT_K + (first - AMBIENT_K) * torch.exp(-time / (1 / a))
-            return decayed + (g[:, 0] * sine + g[:, 1] * cosine).sum(1)
-
-        return at
-
-    def plain(dtype: torch.dtype) -> Moment:
-        a, g, first = (x.to(dtype) for x in (rate, gains, initial))
-        sin_gain, cos_gain = (x.contiguous() for x in g.unbind(1))
-        ambient = torch.tensor(AMBIENT_K, dtype=dtype)
-        return lambda t: temperature(
-            torch.tensor(t, dtype=torch.float64), ambient, first, a, omega, sin_gain, cos_gain
-        )  # fmt: skip
-
-    def fused(dtype: torch.dtype) -> Moment:
-        a, g, first = (x.to(dtype).contiguous() for x in (rate, gains, initial))
-        source, ambient = g if frequencies else None, torch.tensor(AMBIENT_K, dtype=dtype)
-        return lambda t: visible_temperature(torch.tensor(t, dtype=torch.float64), ambient, first, a, omega, source)
-
-    def table(dtype: torch.dtype, size: int) -> Moment:
-        grid = log_rate_grid(size, *rates)
-        cell, x = grid_position(rate.log(), grid)
-        x, flat, first = x.to(dtype), gains.flatten(1).to(dtype), initial.to(dtype)
-
-        def at(t: float) -> Tensor:
-            responses = harmonic_response(grid.exp(), omega, torch.tensor(t, dtype=torch.float64))
-            rows = torch.cat((torch.exp(-grid.exp() * t)[:, None], *responses), 1)
-            found = interpolate(cubics(rows).to(dtype), cell, x)
-            return AMBIENT_K + (first - AMBIENT_K) * found[:, 0] + (flat * found[:, 1:]).sum(1)
-
-        return at
-
-    def forms(types: tuple[str, ...], sizes: tuple[int, ...]) -> list[Form]:
-        found = []
-        for kind in types:
-            dtype = getattr(torch, kind)
-            found += [Form("closed form, fused kernel", "", kind, partial(fused, dtype), True)]
-            found += [Form("closed form, torch", "", kind, partial(plain, dtype), True)]
-            found += [Form("printed formula", "", kind, partial(printed, dtype), False)]
-            found += [Form("rate table", f"{n} rates", kind, partial(table, dtype, n), False) for n in sizes]
-        return found
-
-    def reference(count: int) -> np.ndarray:
-        import mpmath
-
-        values = np.empty((count, frames))
-        with mpmath.workdps(DIGITS):
-            w = [mpmath.mpf(x) for x in omega.tolist()]
-            turns = [[mpmath.expj(x * mpmath.mpf(t)) for x in w] for t in moments.tolist()]
-            for i in range(count):
-                a, first = mpmath.mpf(rate[i].item()), mpmath.mpf(initial[i].item())
-                pairs = zip(w, *gains[i].tolist(), strict=True)
-                terms = [
-                    mpmath.mpc(c, -s) / mpmath.mpc(a, x) for x, s, c in pairs
-                ]  # Re of it times (e^{iωt} - e^{-at})
-                for f, t in enumerate(moments.tolist()):
-                    kept = mpmath.exp(-a * mpmath.mpf(t))
-                    heat = sum((z * (turn - kept) for z, turn in zip(terms, turns[f], strict=True)), mpmath.mpc(0))
-                    values[i, f] = AMBIENT_K + (first - AMBIENT_K) * kept + heat.real
-        return values
-
-    return Problem(
-        name, title, tuple(moments.tolist()), (), initial, partial(Newton, rate, omega, gains), forms, reference
-    )
+        moments = torch.linspace(span_s / frames, span_s, frames, dtype=torch.float64).tolist()
+    bodies = Bodies(rate, initial, omega, gains, rates)
+    equation, reference = partial(Newton, rate, omega, gains), partial(bodies.reference, moments)
+    return Problem(name, title, tuple(moments), (), initial, equation, bodies.forms, reference)
 
 
 # ---- The balance of surfaces under the sky ----

@@ -245,13 +245,12 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
     from rich.progress import track
 
-    from heatsplat.contracts import SceneError
+    from heatsplat.contracts import SceneError, check_option
     from heatsplat.runs.run import UNSEEN, load
     from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
     from heatsplat.training.session import prepare_machine
 
-    if config["unseen"] not in UNSEEN:
-        raise SceneError(f"unseen must be one of {', '.join(UNSEEN)}, got '{config['unseen']}'")
+    check_option("unseen", config["unseen"], UNSEEN, SceneError)
     prepare_machine(config["threads"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]

@@ -24,10 +24,10 @@ class SceneError(ValueError):
     """Input data that cannot be used as it is. The message names the file, key or shape and the remedy."""
 
 
-def check_option(name: str, value: Any, known: Iterable[Any]) -> None:
-    """Raises ValueError, with the values that are known, where an option has another one."""
+def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueError] = ValueError) -> None:
+    """Raises ``error``, with the values that are known, where an option has another one."""
     if value not in known:
-        raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+        raise error(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
 
 
 @dataclass(frozen=True)

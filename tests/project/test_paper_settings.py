@@ -5,6 +5,9 @@ gives as shares of a run may differ by what rounding the share does. Where a met
 stand in ``DEPARTURES``: whoever changes one has to say so here.
 """
 
+from functools import reduce
+from operator import or_
+
 import pytest
 from helpers import ALL_METHODS
 
@@ -52,26 +55,45 @@ BOTH_IMAGES = {  # ThermalGaussian and 3DGS+IR: a colour and a thermal image, ea
     "thermal.sh_degree": (3, "sh_degree"),
     "thermal.companions.rgb": (3, "RGB"),
 }
+BOTH_PHOTOMETRIC = {
+    "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
+    "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
+}
 FROZEN = {key: value for key, value in ADAPTIVE.items() if not key.endswith("stop")}
 
-PAPERS = {
-    "3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC,
-    "3dgs_ir": GAUSSIANS
-    | ADAPTIVE
-    | BOTH_IMAGES
-    | {
+SHARED = {  # what a method has of others
+    "3dgs": (GAUSSIANS, ADAPTIVE, COLOUR, PHOTOMETRIC),
+    "3dgs_ir": (GAUSSIANS, ADAPTIVE, BOTH_IMAGES),
+    "bicubic_3dgs": (GAUSSIANS, ADAPTIVE, COLOUR, PHOTOMETRIC),
+    "lanczos_3dgs": (GAUSSIANS, ADAPTIVE, COLOUR, PHOTOMETRIC),
+    "direct_3dgs": (GAUSSIANS, ADAPTIVE, COLOUR),
+    "energy_balance": (GAUSSIANS, ADAPTIVE, PHOTOMETRIC),
+    "etgs": (GAUSSIANS, ADAPTIVE),
+    "hexplane_4dgs": (GAUSSIANS, ADAPTIVE),
+    "mftg": (GAUSSIANS, BOTH_IMAGES, BOTH_PHOTOMETRIC),
+    "mip_splatting": (GAUSSIANS, ADAPTIVE, PHOTOMETRIC),
+    "msmg": (GAUSSIANS, ADAPTIVE, BOTH_IMAGES, BOTH_PHOTOMETRIC),
+    "ntr_gaussian": (GAUSSIANS, FROZEN, PHOTOMETRIC),
+    "ommg": (GAUSSIANS, ADAPTIVE, BOTH_IMAGES, BOTH_PHOTOMETRIC),
+    "ravigs": (GAUSSIANS, ADAPTIVE, BOTH_PHOTOMETRIC),
+    "srgs": (GAUSSIANS, ADAPTIVE, COLOUR),
+    "supirgs": (GAUSSIANS, ADAPTIVE, COLOUR),
+    "thermal3dgs": (GAUSSIANS, ADAPTIVE),
+    "thermalgs": (GAUSSIANS, FROZEN, PHOTOMETRIC),
+    "thermogs": (GAUSSIANS, FROZEN),
+    "ti3dgs": (GAUSSIANS, ADAPTIVE),
+}
+OWN = {
+    "3dgs_ir": {
         "loss.terms.thermal.dssim_weight": (0.2, "3DGS"),
         "loss.terms.rgb.dssim_weight": (0.2, "3DGS"),
         "thermal.shared_opacity": (True, "one opacity"),
         "thermal.sh_degree_interval": (1000, "3DGS: oneupSHdegree"),
     },
-    "bicubic_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
-    "lanczos_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | PHOTOMETRIC | {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
-    "direct_3dgs": GAUSSIANS | ADAPTIVE | COLOUR | {"module.supersample": (4, "SupIR-GS, Tab. 1: x4")},
-    "energy_balance": GAUSSIANS | ADAPTIVE | PHOTOMETRIC,
-    "etgs": GAUSSIANS
-    | ADAPTIVE
-    | {
+    "bicubic_3dgs": {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
+    "lanczos_3dgs": {"data.degrade": ("lr4", "SupIR-GS, Tab. 1: x4")},
+    "direct_3dgs": {"module.supersample": (4, "SupIR-GS, Tab. 1: x4")},
+    "etgs": {
         "thermal.frequencies": (24, "App. B: K"),
         "thermal.frequency_gain": (2**-0.5, "App. B: alpha"),
         "thermal.source_l2": (1e-5, "second-hand: lambda_reg"),
@@ -80,9 +102,7 @@ PAPERS = {
         f"{TERM}.dssim_weight": (0.2, "Eq. 36, lambda of 3DGS"),
         f"{TERM}.dssim_half": (True, "Eq. 36: (1 - SSIM) / 2"),
     },
-    "hexplane_4dgs": GAUSSIANS
-    | ADAPTIVE
-    | {
+    "hexplane_4dgs": {
         "first_steps": (3000, "coarse_iterations"),
         "thermal.scales": ([1, 2], "multires of dnerf_default"),
         "thermal.width": (64, "net_width"),
@@ -92,20 +112,13 @@ PAPERS = {
         "thermal.lr_end": (0.1, "deformation_lr_final / deformation_lr_init"),
         "thermal.emission.lr": (2.5e-3, "feature_lr"),
     },
-    "mftg": GAUSSIANS
-    | BOTH_IMAGES
-    | {
+    "mftg": {
         "density.grad_threshold": GROWTH["grad_threshold"],
         "density.stop": (7500, "15000 of each round's 30000, halved: both rounds are 30000 here"),
         "first_steps": (15000, "30000 of 60000"),
-        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
-        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
         "loss.terms.smoothness.term.weight": (0.6, "train.py: lambda of smoothness"),
     },
-    "mip_splatting": GAUSSIANS
-    | ADAPTIVE
-    | PHOTOMETRIC
-    | {
+    "mip_splatting": {
         "smoothing.variance": (0.2, "compute_3D_filter: sqrt(0.2) of the sampling interval"),
         "smoothing.every": (100, "train.py"),
         "smoothing.near": (0.2, "compute_3D_filter"),
@@ -113,22 +126,14 @@ PAPERS = {
         "renderer.eps2d": (0.1, "kernel_size"),
         "renderer.antialiased": (True, "2D Mip filter"),
     },
-    "msmg": GAUSSIANS
-    | ADAPTIVE
-    | BOTH_IMAGES
-    | {
+    "msmg": {
         "thermal.shared_opacity": (False, "two models"),
         "init.separate": (True, "two clouds"),
         "loss.terms.thermal.weight": (0.6, "MSMG: .6"),
         "loss.terms.rgb.weight": (0.3, "MSMG: .3"),
         "loss.terms.smoothness.weight": (0.36, ".6 of .6"),
-        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
-        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
     },
-    "ntr_gaussian": GAUSSIANS
-    | FROZEN
-    | PHOTOMETRIC
-    | {
+    "ntr_gaussian": {
         "thermal.nodes": (6, "nodes of the trapezoid rule"),
         "thermal.window_s": (3600.0, "one hour"),
         "thermal.position_frequencies": (10, "L"),
@@ -137,20 +142,13 @@ PAPERS = {
         "thermal.integral": (0.002, "train.py"),
         "thermal.lr": (1.6e-3, "T-net"),
     },
-    "ommg": GAUSSIANS
-    | ADAPTIVE
-    | BOTH_IMAGES
-    | {
+    "ommg": {
         "thermal.shared_opacity": (True, "one opacity"),
         "loss.terms.thermal.weight": (0.5, "L = 1/2 (L_RGB + L_T)"),
         "loss.terms.rgb.weight": (0.5, "L = 1/2 (L_RGB + L_T)"),
         "loss.terms.smoothness.weight": (0.3, "1/2 of .6"),
-        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
-        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
     },
-    "ravigs": GAUSSIANS
-    | ADAPTIVE
-    | {
+    "ravigs": {
         "density.prune_opacity": (0.005, "Eq. 11: tau"),
         "thermal.dual_opacity": (True, "section 3.1"),
         "thermal.three_parameter": (True, "section 3.2"),
@@ -160,13 +158,8 @@ PAPERS = {
         "loss.terms.guided_variation.weight": (0.5 * 0.02, "lambda_ir lambda_s"),
         "loss.terms.physical_prior.weight": (0.5 * 0.01, "lambda_ir lambda_p"),
         "loss.terms.physical_prior.term.tolerance": (0.05, "Eq. 16: delta"),
-        "loss.terms.thermal.term.dssim_weight": (0.2, "3DGS"),
-        "loss.terms.rgb.term.dssim_weight": (0.2, "3DGS"),
     },
-    "srgs": GAUSSIANS
-    | ADAPTIVE
-    | COLOUR
-    | {
+    "srgs": {
         "super_resolution": (4, "x4"),
         f"{TERM}.factor": (4, "x4"),
         f"{TERM}.target_weight": (0.6, "train.py, the commented line"),
@@ -174,10 +167,7 @@ PAPERS = {
         f"{TERM}.kernel": ("area", "average pooling"),
         f"{TERM}.dssim_weight": (0.2, "3DGS"),
     },
-    "supirgs": GAUSSIANS
-    | ADAPTIVE
-    | COLOUR
-    | {
+    "supirgs": {
         "super_resolution": (4, "x4"),
         "module.supersample": (4, "x4"),
         "sensor.parts.calibration.grid": (16, "Eq. 4"),
@@ -193,9 +183,7 @@ PAPERS = {
         f"{SUPIRGS_HF}.schedule.start": (0.65, "HF 65-95 %"),
         f"{SUPIRGS_HF}.schedule.end": (0.95, "HF 65-95 %"),
     },
-    "thermal3dgs": GAUSSIANS
-    | ADAPTIVE
-    | {
+    "thermal3dgs": {
         "thermal.position_frequencies": (10, "multires"),
         "thermal.time_frequencies": (10, "t_multires"),
         "thermal.lr": (8e-4, "1.6e-4 times the spatial scale 5"),
@@ -211,18 +199,13 @@ PAPERS = {
         "loss.terms.corner.schedule.before": (1.0, "max(1 - i / 5000, 0)"),
         "loss.terms.corner.schedule.after": (0.0, "max(1 - i / 5000, 0)"),
     },
-    "thermalgs": GAUSSIANS
-    | FROZEN
-    | PHOTOMETRIC
-    | {
+    "thermalgs": {
         "thermal.time_frequencies": (4, "GaussianMeshTimeModel in NTR-Gaussian's code"),
         "thermal.code_size": (16, "GaussianMeshTimeModel"),
         "thermal.lr": (2.5e-3, "GaussianMeshTimeModel: MLP"),
         "thermal.lr_time": (1e-3, "GaussianMeshTimeModel: time encoder"),
     },
-    "thermogs": GAUSSIANS
-    | FROZEN
-    | {
+    "thermogs": {
         "loss.terms.data.weight": (0.8, "lambda_1"),
         "loss.terms.edge.weight": (0.2, "lambda_2"),
         "thermal.weights.smooth": (1.0, "lambda_3"),
@@ -233,9 +216,7 @@ PAPERS = {
         "thermal.surface_area": ("printed", "Eq. 6"),
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
-    "ti3dgs": GAUSSIANS
-    | ADAPTIVE
-    | {
+    "ti3dgs": {
         "thermal.position_frequencies": (10, "Eq. 9: L"),
         "thermal.time_frequencies": (10, "Eq. 9: L"),
         "thermal.lr": (8e-4, "section IV-A"),
@@ -243,6 +224,7 @@ PAPERS = {
         f"{TERM}.dssim_weight": (0.2, "3DGS"),
     },
 }
+PAPERS = {method: reduce(or_, (*shared, OWN.get(method, {}))) for method, shared in SHARED.items()}
 
 DEPARTURES = {  # ours and the published number
     "hexplane_4dgs": {

@@ -15,7 +15,8 @@ from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.studies import frontier
-from heatsplat.studies.frontier import asked_for, dominated, find_runs, group, run, seconds_to
+from heatsplat.studies.frontier import asked_for, run
+from heatsplat.studies.frontier_runs import dominated, find_runs, group, seconds_to
 
 CONFIG = Path(cli.CONF) / "study" / "frontier.yaml"
 LEVELS = {"psnr_levels_db": [25, 30], "mae_levels_c": [15, 10]}

@@ -180,7 +180,8 @@ def test_the_rate_is_the_balance_of_ellipsoid_sun_and_air():
     units = torch.linspace(0.1, 0.9, 40)
     hidden = model.network(model._base(splats, ids), model._moment(time_s))
     body = model._body(splats, ids, hidden)
-    rate = model._rate(units, body, model._areas(splats, ids), time_s) * 60.0  # the network's range is 60 K
+    areas = model.balance.areas(splats, ids, 1.0)
+    rate = model._rate(units, body, areas, time_s) * 60.0  # the network's range is 60 K
 
     axes = splats.scales.double().clamp(min=0.01)
     sun = torch.tensor([math.cos(0.3 * math.pi), 0.0, math.sin(0.3 * math.pi)], dtype=torch.float64)

@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.effects.base import CHOICES, SLOTS, Effect, Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 
@@ -23,8 +23,7 @@ def choices(effects: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         SceneError: a choice or the selection is unknown.
     """
-    if effects["select"] not in SELECTIONS:
-        raise SceneError(f"effects.select must be one of {', '.join(SELECTIONS)}, got '{effects['select']}'")
+    check_option("effects.select", effects["select"], SELECTIONS, SceneError)
     return dict.fromkeys(NAMES, SELECTIONS[effects["select"]]) | explicit_choices(effects)
 
 
@@ -37,12 +36,10 @@ def explicit_choices(effects: Mapping[str, Any]) -> dict[str, str]:
     given = {}
     for name in NAMES:
         choice = effects.get(name)
-        choice = (
-            {True: "on", False: "off"}.get(choice, choice) if isinstance(choice, bool) else choice
-        )  # YAML reads on as true
+        if isinstance(choice, bool):  # YAML reads on as true
+            choice = "on" if choice else "off"
         if choice is not None:
-            if choice not in CHOICES:
-                raise SceneError(f"effects.{name} must be one of {', '.join(CHOICES)}, got '{choice}'")
+            check_option(f"effects.{name}", choice, CHOICES, SceneError)
             given[name] = choice
     return given
 

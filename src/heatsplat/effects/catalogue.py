@@ -9,7 +9,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from types import ModuleType
 
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.effects import physical
 from heatsplat.effects.base import CHOICES, STAGES, Effect, Verdict
 from heatsplat.effects.inspection import Inspection
@@ -42,8 +42,7 @@ def decide(scene: SceneData, choices: Mapping[str, str] = {}) -> dict[str, Verdi
     for name, choice in choices.items():
         if name not in names:
             raise SceneError(f"effects.{name}: there is no such effect; the catalogue has {', '.join(names)}")
-        if choice not in CHOICES:
-            raise SceneError(f"effects.{name} must be one of {', '.join(CHOICES)}, got '{choice}'")
+        check_option(f"effects.{name}", choice, CHOICES, SceneError)
     inspected = Inspection(scene, CATALOGUE)
     verdicts = {effect.name: _verdict(effect, inspected, choices.get(effect.name, "auto")) for effect in CATALOGUE}
     for verdict in verdicts.values():

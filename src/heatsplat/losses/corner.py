@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.contracts import check_option
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.edge import sobel, whole_windows
 
@@ -62,8 +63,7 @@ class Corner:
     """
 
     def __init__(self, weight: str = "corners", floor: float = 0.01) -> None:
-        if weight not in WEIGHTS:
-            raise ValueError(f"weight must be one of {', '.join(WEIGHTS)}, got '{weight}'")
+        check_option("weight", weight, WEIGHTS)
         if not 0 <= floor <= 1:
             raise ValueError(f"floor is a weight in [0, 1], got {floor}")
         self.published, self.floor = weight == "published", floor

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from heatsplat.contracts import check_option
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.losses.compose import LossInputs
 
@@ -43,8 +44,7 @@ class PhysicalPrior:
         emissivity: str = "emissivity",
         reflectance: str = "reflectance",
     ) -> None:
-        if of not in OF:
-            raise ValueError(f"of must be one of {', '.join(OF)}, got '{of}'")
+        check_option("of", of, OF)
         self.tolerance, self.activated = tolerance, of == "activated"
         self.names = emissivity, reflectance
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -71,14 +71,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
     if means2d.requires_grad:
         means2d.retain_grad()
 
-    features = inputs.features
-    if callable(features):
-        emitted = features(ids)
-        channels = reference.channel_counts(inputs, emitted, len(ids))
-        features = emitted.new_zeros(count, emitted.shape[1]).index_copy(0, ids, emitted)
-    else:
-        channels = reference.channel_counts(inputs, features, count)
-
+    features, channels = _features_and_channels(inputs, ids)
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     _, pairs, order = kernels.intersect(means2d[None], radii, depths, TILE, columns, rows)
     starts = kernels.offsets(pairs, 1, columns, rows)
@@ -87,9 +80,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
 
     def composite(values: Tensor, opacities: Tensor, behind: Tensor | None) -> tuple[Tensor, Tensor]:
         images, alphas = [], []
-        groups = values.split(CHANNELS, dim=1)
-        grounds = [None] * len(groups) if behind is None else behind.split(CHANNELS)
-        for some, ground in zip(groups, grounds, strict=True):
+        for some, ground in _in_groups(values, behind, CHANNELS):
             parts.append(means2d[None])
             image, alpha = kernels.rasterize(
                 parts[-1],
@@ -109,8 +100,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
         return torch.cat(images, dim=2), alphas[0]
 
     images, alphas, depth = [], [], None
-    grounds = [None] * len(channels) if inputs.background is None else inputs.background.split(channels)
-    for m, (values, behind) in enumerate(zip(features.split(channels, dim=1), grounds, strict=True)):
+    for m, (values, behind) in enumerate(_in_groups(features, inputs.background, channels)):
         opacities = inputs.opacities[m] * compensations[0] if inputs.antialiased else inputs.opacities[m]
         with_depth = inputs.depth and m == 0
         if with_depth:  # one more channel of the first modality, with nothing behind it
@@ -125,6 +115,25 @@ def render(inputs: RenderInputs) -> RenderOutput:
         _gather_absgrad(means2d, parts)
     meta = {"means2d": means2d, "radii": radii[0], "visible_ids": ids}
     return RenderOutput(torch.cat(images, dim=2), torch.stack(alphas), depth, meta)
+
+
+def _features_and_channels(inputs: RenderInputs, ids: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+    """Features of all Gaussians [N, C], zero where a function gives them and they are not in ``ids``; channels per modality."""
+    features, count = inputs.features, len(inputs.means)
+    if not callable(features):
+        return features, reference.channel_counts(inputs, features, count)
+    emitted = features(ids)
+    channels = reference.channel_counts(inputs, emitted, len(ids))
+    return emitted.new_zeros(count, emitted.shape[1]).index_copy(0, ids, emitted), channels
+
+
+def _in_groups(
+    values: Tensor, background: Tensor | None, sizes: int | tuple[int, ...]
+) -> Iterator[tuple[Tensor, Tensor | None]]:
+    """Groups of the channels of values [N, C], each with its background (see ``Tensor.split``)."""
+    groups = values.split(sizes, dim=1)
+    grounds = [None] * len(groups) if background is None else background.split(sizes)
+    return zip(groups, grounds, strict=True)
 
 
 def load() -> Kernels:

@@ -188,6 +188,53 @@ class Plan:
         return f"twice the time ({2 * self.asked_s:g} s) would buy about {self.twice_gain_db:+.2f} dB: {self.twice_steps:,} steps"
 
 
+@dataclass(frozen=True)
+class Prices:
+    """What runs cost here, and the best that seconds buy.
+
+    Args:
+        outlook: what choices promise.
+        pace: what a step costs here.
+        cap_max: Gaussians that the configuration allows; None where the method adds none.
+    """
+
+    outlook: Outlook
+    pace: Pace
+    cap_max: int | None
+
+    def cost(self, choice: Choice, steps: float) -> float:
+        """Seconds of a run."""
+        gaussians = self.pace.points
+        if self.cap_max is not None:
+            gaussians = min(gaussians * self.outlook.mean_growth(choice, steps), max(self.cap_max, gaussians))
+        return steps * self.pace.step_s(gaussians)
+
+    def affordable(self, choice: Choice, seconds: float) -> float:
+        """Steps that take so many seconds; the cost rises with the steps."""
+        low, high = 1.0, 2.0
+        while self.cost(choice, high) < seconds:
+            low, high = high, 2 * high
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.cost(choice, middle) < seconds else (low, middle)
+        return low
+
+    def best(self, seconds: float) -> tuple[float, Choice, int]:
+        """Expected PSNR, choice and steps of the best."""
+        steps = {choice: self.affordable(choice, seconds) for choice in self.outlook.choices}
+        return max((self.outlook.psnr(choice, count), choice, round(count)) for choice, count in steps.items())
+
+    def cap(self, growth: float) -> int | None:
+        """Gaussians at most."""
+        if self.cap_max is None or math.isinf(growth):
+            return self.cap_max
+        return min(self.cap_max, max(round(growth * self.pace.points), 1))
+
+    def growth(self, choice: Choice) -> float | None:
+        """The cap in Gaussians of the start, None where it is not chosen."""
+        return None if self.cap_max is None or math.isinf(choice.growth) else choice.growth
+
+
 def plan(
     points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_max: int | None, free_decay: bool = True
 ) -> Plan:
@@ -204,8 +251,48 @@ def plan(
     Raises:
         SceneError: the time is too short, with the least; or nothing was measured.
     """
-    own = [point for point in points if point.method == method]
+    own, reasons = _of_method(points, method, cap_max is not None, free_decay)
+    outlook = Outlook(own)
+    prices, train_s = Prices(outlook, pace, cap_max), asked_s - pace.spent_s
+    least = min(prices.cost(choice, MIN_STEPS) for choice in outlook.choices)
+    if train_s < least:
+        raise SceneError(
+            f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
+            f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
+            "smaller (data.downscale=2, init.count=10000)."
+        )
+    score, chosen, steps = prices.best(train_s)
+    better, more, longer = prices.best(train_s + asked_s)
+    if without := outlook.missing(chosen):
+        reasons.append(
+            f"this cap and decay were not measured on {', '.join(without)}; what they gain elsewhere stands in there"
+        )
+    measured = outlook.last(more)
+    if longer > measured:
+        reasons.append(
+            f"runs of more than {measured:,} steps were not measured; what they gain is continued from the last"
+        )
+    return Plan(
+        asked_s=asked_s,
+        calibration_s=round(pace.spent_s, 3),
+        train_s=round(train_s, 3),
+        steps=max(steps, MIN_STEPS),
+        cap=prices.cap(chosen.growth),
+        growth=prices.growth(chosen),
+        decay=chosen.decay if free_decay else None,
+        expected_psnr=round(score, 2) if any(point.method == method for point in points) else None,
+        twice_steps=longer,
+        twice_growth=prices.growth(more),
+        twice_gain_db=round(max(better - score, 0.0), 2),
+        step_ms=round(1e3 * pace.step_s(pace.points), 3),
+        reasons=tuple(reasons),
+    )
+
+
+def _of_method(points: Sequence[Point], method: str, grows: bool, free_decay: bool) -> tuple[list[Point], list[str]]:
+    """The points that a plan for a method goes by, and sentences about them (see ``plan``)."""
     reasons = []
+    own = [point for point in points if point.method == method]
     if not own:
         own = list(points)
         methods = ", ".join(sorted({point.method for point in own}))
@@ -215,78 +302,14 @@ def plan(
     if not own:
         raise SceneError("there are no measured curves to plan from; run python src/study.py study=budget")
     own = [point for point in own if free_decay or point.decay == 1.0] or own
-    if cap_max is None:
+    if not grows:
         decays: dict[float, set[float]] = {}
         for point in own:
             decays.setdefault(point.growth, set()).add(point.decay)
         alike = min(decays, key=lambda growth: (-len(decays[growth]), growth))  # so that choices differ in decay alone
         own = [point for point in own if point.growth == alike]
         reasons.append("this method adds no Gaussians, so their number was not chosen")
-    outlook = Outlook(own)
-    train_s = asked_s - pace.spent_s
-
-    def cost(choice: Choice, steps: float) -> float:
-        """Seconds of a run."""
-        if cap_max is None:
-            return steps * pace.step_s(pace.points)
-        return steps * pace.step_s(min(pace.points * outlook.mean_growth(choice, steps), max(cap_max, pace.points)))
-
-    def affordable(choice: Choice, seconds: float) -> float:
-        """Steps that take so many seconds; the cost rises with the steps."""
-        low, high = 1.0, 2.0
-        while cost(choice, high) < seconds:
-            low, high = high, 2 * high
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if cost(choice, middle) < seconds else (low, middle)
-        return low
-
-    def best(seconds: float) -> tuple[float, Choice, int]:
-        """Expected PSNR, choice and steps of the best."""
-        ends = []
-        for choice in outlook.choices:
-            steps = affordable(choice, seconds)
-            ends.append((outlook.psnr(choice, steps), choice, round(steps)))
-        return max(ends)
-
-    least = min(cost(choice, MIN_STEPS) for choice in outlook.choices)
-    if train_s < least:
-        raise SceneError(
-            f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
-            f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
-            "smaller (data.downscale=2, init.count=10000)."
-        )
-    score, chosen, steps = best(train_s)
-    (growth, decay), steps = chosen, max(steps, MIN_STEPS)
-    better, more, longer = best(train_s + asked_s)
-    without = outlook.missing(chosen)
-    if without:
-        reasons.append(
-            f"this cap and decay were not measured on {', '.join(without)}; what they gain elsewhere stands in there"
-        )
-    measured = outlook.last(more)
-    if longer > measured:
-        reasons.append(
-            f"runs of more than {measured:,} steps were not measured; what they gain is continued from the last"
-        )
-    cap = (
-        None if cap_max is None else min(cap_max, max(round(growth * pace.points), 1)) if growth < math.inf else cap_max
-    )
-    return Plan(
-        asked_s=asked_s,
-        calibration_s=round(pace.spent_s, 3),
-        train_s=round(train_s, 3),
-        steps=steps,
-        cap=cap,
-        growth=None if cap_max is None or math.isinf(growth) else growth,
-        decay=decay if free_decay else None,
-        expected_psnr=round(score, 2) if any(point.method == method for point in points) else None,
-        twice_steps=longer,
-        twice_growth=None if cap_max is None or math.isinf(more.growth) else more.growth,
-        twice_gain_db=round(max(better - score, 0.0), 2),
-        step_ms=round(1e3 * pace.step_s(pace.points), 3),
-        reasons=tuple(reasons),
-    )
+    return own, reasons
 
 
 # The run ------------------------------------------------------------------------------------------------------------

@@ -65,11 +65,9 @@ class GainControl(SensorPart):
         values = self.bounds * self.raw.tanh()
         return values - values.mean(0)
 
-    def regulariser(self) -> Tensor | None:
-        if self.weight == 0:
-            return None
+    def penalty(self) -> Tensor:
         log_stretch, shift = self.settings().unbind(1)
-        return self.weight * (log_stretch.expm1().square() + shift.square()).mean()
+        return (log_stretch.expm1().square() + shift.square()).mean()
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"agc": {"frames": len(self.raw)}}

@@ -17,10 +17,12 @@ class SensorPart(nn.Module, ABC):
     Attributes:
         lr: learning rate of its parameters.
         lr_end: factor on it at the last step of the run, log-linear in between.
+        weight: of its penalty.
     """
 
     lr: float = 1e-3
     lr_end: float = 1.0
+    weight: float = 0.0
 
     def prepare(self, scene: SceneData) -> None:
         """Takes sizes (number of frames, image shape) from the scene. Called once, before training."""
@@ -30,9 +32,14 @@ class SensorPart(nn.Module, ABC):
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         """The image that the camera records of the clean ``image`` [H, W, C]; identity before training."""
 
-    def regulariser(self) -> Tensor | None:
-        """A weighted scalar added to the loss, or None."""
+    def penalty(self) -> Tensor | None:
+        """What its parameters cost, a scalar before ``weight``, or None."""
         return None
+
+    def regulariser(self) -> Tensor | None:
+        """``weight`` times ``penalty``, which is added to the loss; None without either."""
+        penalty = self.penalty() if self.weight else None
+        return None if penalty is None else self.weight * penalty
 
     def effects(self) -> dict[str, dict[str, Any]]:
         """The effects that the part simulates: catalogue name -> settings (for metrics.json)."""

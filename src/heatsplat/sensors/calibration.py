@@ -100,13 +100,11 @@ class Calibration(SensorPart):
             return torch.zeros(0)
         return self.vignetting_max * self.raw_falloff.tanh()
 
-    def regulariser(self) -> Tensor | None:
-        if self.weight == 0:
-            return None
+    def penalty(self) -> Tensor | None:
         terms = [self.coefficients().square().sum()] if self.raw_falloff is not None else []
         for field in self.nodes().values():
             terms += [field.diff(dim=0).abs().mean() + field.diff(dim=1).abs().mean() + field.square().mean()]
-        return self.weight * sum(terms) if terms else None
+        return sum(terms) if terms else None
 
     def effects(self) -> dict[str, dict[str, Any]]:
         effects: dict[str, dict[str, Any]] = {}

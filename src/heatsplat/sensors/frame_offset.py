@@ -95,13 +95,11 @@ class FrameOffset(SensorPart):
         earlier, later = self.moments[after - 1].item(), self.moments[after].item()
         return after - 1, after, (moment - earlier) / (later - earlier)
 
-    def regulariser(self) -> Tensor | None:
-        if self.weight == 0:
-            return None
+    def penalty(self) -> Tensor:
         penalty = self.offsets().square().mean()
         if self.raw_gain is not None:
             penalty = penalty + self.gains().square().mean()
-        return self.weight * penalty
+        return penalty
 
     def effects(self) -> dict[str, dict[str, Any]]:
         learned = "offset" if self.raw_gain is None else "offset and gain"

@@ -56,8 +56,8 @@ class PointSpread(SensorPart):
         bounded = self.raw_spread.tanh()
         return self.width_max**2 * (bounded + (bounded.clamp(min=0.0) - bounded).detach())
 
-    def regulariser(self) -> Tensor | None:
-        return None if self.weight == 0 else self.weight * self.variance() / self.width_max**2
+    def penalty(self) -> Tensor:
+        return self.variance() / self.width_max**2
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"point_spread": {"width_px": self.variance().item() ** 0.5}}

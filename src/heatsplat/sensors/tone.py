@@ -87,10 +87,8 @@ class Tone(SensorPart):
         slope = (offsets * correction).sum() / offsets.square().sum()
         return torch.stack((slope, correction.mean() - 0.5 * slope))
 
-    def regulariser(self) -> Tensor | None:
-        if self.weight == 0:
-            return None
-        return self.weight * self.network(self.levels).square().sum(1).mean()
+    def penalty(self) -> Tensor:
+        return self.network(self.levels).square().sum(1).mean()
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"tone": {"width": self.network[0].out_features}}

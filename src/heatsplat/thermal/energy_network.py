@@ -13,33 +13,22 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_option
-from heatsplat.geometry.rotations import quats_to_matrices
-from heatsplat.physics.ellipsoids import (
-    PROJECTED_AREAS,
-    SMALLEST_AXIS_M,
-    SURFACE_AREAS,
-    convecting_area_ratio,
-    floored_axes,
-    projected_area_ratio,
-    radiating_area_ratio,
-)
-from heatsplat.physics.heat_flow import heating_rate
-from heatsplat.physics.sky import LAWS, sky_temperature_k
-from heatsplat.physics.units import DAY_S, kelvin
+from heatsplat.physics.ellipsoids import SMALLEST_AXIS_M
+from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
+from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
-from heatsplat.thermal.weather_drive import columns_at, source_of_sunlight, sunlight_at
+from heatsplat.thermal.weather_drive import columns_at
 
 log = logging.getLogger(__name__)
 
 TIMES = ("record", "day", "none")
 FEATURES = ("learned", "given", "labels", "none")
 BODIES = ("inferred", "table")
-SKIES = ("none", *LAWS)
 TERMS = ("smooth", "physical", "ode", "pinn")
 BALANCED = ("ode", "pinn")  # the terms that need the balance of heat
 LATENT = "latent_heat"
@@ -149,15 +138,10 @@ class EnergyNetwork(ThermalModel):
         lr_first: float = 2.5e-3,
     ) -> None:
         super().__init__()
-        for name, value, known in (
-            ("time", time, TIMES),
-            ("features", features, FEATURES),
-            ("attributes", attributes, BODIES),
-            ("projected_area", projected_area, PROJECTED_AREAS),
-            ("surface_area", surface_area, SURFACE_AREAS),
-            ("sky", sky, SKIES),
-        ):
-            check_option(name, value, known)
+        check_option("time", time, TIMES)
+        check_option("features", features, FEATURES)
+        check_option("attributes", attributes, BODIES)
+        self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
         if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
             raise ValueError(
                 "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
@@ -183,8 +167,7 @@ class EnergyNetwork(ThermalModel):
         self.features_from, self.feature_size = features, sizes[features]
         self.position_frequencies, self.time_frequencies, self.time = position_frequencies, time_frequencies, time
         self.first_steps, self.ramp_steps, self.interval_s = first_steps, ramp_steps, (shortest, longest)
-        self.sampled, self.sky, self.smallest_axis_m, self.margin = sampled, sky, smallest_axis_m, margin
-        self.projected_area, self.surface_area = projected_area, surface_area
+        self.sampled, self.margin = sampled, margin
         self.path = None if network is None else Path(network).expanduser()
         self.lr, self.lr_end = 0.0 if network is not None and not fine_tune else lr, lr_end
         self.lr_feature, self.lr_first = lr_feature, lr_first
@@ -244,17 +227,8 @@ class EnergyNetwork(ThermalModel):
                 f"scene '{scene.name}' gives features {list(scene.point_features.shape)} for {len(scene.points)} points; "
                 f"set thermal.feature_size={scene.point_features.shape[-1]} and give one row per point"
             )
-        if self._balanced and scene.weather.air_c is None:
-            raise SceneError(
-                f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
-                "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
-            )
-
-        if self._balanced and self.sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
-            raise SceneError(
-                f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={self.sky} needs; "
-                "thermal.sky=swinbank does without"
-            )
+        if self._balanced:
+            self.balance.check(scene)
 
     def prepare(self, scene: SceneData) -> None:
         self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
@@ -346,7 +320,7 @@ class EnergyNetwork(ThermalModel):
         if "smooth" in weights:
             terms["smooth"] = heat_terms.change(now, later)
         if self._balanced:
-            areas = self._areas(splats, ids)
+            areas = self.balance.areas(splats, ids, self.metres_per_unit)
             first_rate = self._rate(now, self._body(splats, ids, seen.hidden[rows]), areas, seen.time_s)
             if "ode" in weights:
                 middle = self._body(splats, ids, self.network(base, self._moment(middle_s)))
@@ -379,11 +353,8 @@ class EnergyNetwork(ThermalModel):
         used = [name for name in WEATHER_COLUMNS if name not in missing]
         effects = {"relaxation": {"network_sees": used, "left_out": missing, "time": self.time}}
         if self._balanced:
-            radiation = {"sky": self.sky, "materials": "inferred" if self.inferred else "table"}
-            effects |= {"radiation": radiation, "convection": {"surface_area": self.surface_area}}
-            if self.weather is not None:
-                light = source_of_sunlight(self.weather)
-                effects["solar"] = {"projected_area": self.projected_area, "irradiance": light}
+            effects |= self.balance.effects(self.weather)
+            effects["radiation"]["materials"] = "inferred" if self.inferred else "table"
         return effects
 
     @property
@@ -461,8 +432,6 @@ class EnergyNetwork(ThermalModel):
         coldest, span = self.bounds_k.tolist()
         return torch.logit(((lower + width * value - coldest) / span).clamp(0.05, 0.95))
 
-    # The balance ----------------------------------------------------------------------------------------
-
     def _body(self, splats: Splats, ids: Tensor | None, hidden: Tensor) -> dict[str, Tensor]:
         """The four attributes, each [n], from hidden values [n, width] or from the table."""
         if self.inferred:
@@ -471,41 +440,10 @@ class EnergyNetwork(ThermalModel):
             values = reference(Query(ids).rows(splats["label"].detach()).long())
         return dict(zip(ATTRIBUTES, values.unbind(1), strict=True))
 
-    @torch.no_grad()
-    def _areas(self, splats: Splats, ids: Tensor) -> dict[str, Tensor]:
-        """Areas over volumes in 1/m, the axes themselves [n, 3] and their directions [n, 3, 3]."""
-        axes = floored_axes(splats.scales[ids], self.metres_per_unit, self.smallest_axis_m)
-        return {
-            "axes": axes,
-            "rotations": quats_to_matrices(splats.quats[ids]),
-            "radiating": radiating_area_ratio(axes),
-            "convecting": convecting_area_ratio(axes, self.surface_area),
-        }
-
     def _rate(self, units: Tensor, body: dict[str, Tensor], areas: dict[str, Tensor], time_s: float) -> Tensor:
         """dT/dt of the balance at temperatures ``units``, in ranges per second, [n]."""
         coldest, span = self.bounds_k.tolist()
-        lit = 0.0
-        for direction, power in sunlight_at(self.weather, time_s):
-            local = direction.to(areas["rotations"]) @ areas["rotations"]
-            lit = lit + power * projected_area_ratio(areas["axes"], local, self.projected_area)
-        now = self.weather.at(time_s)
-        air_k, sky_k = kelvin(torch.tensor(now.air_c, dtype=torch.float64)), 0.0
-        if self.sky != "none":
-            moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
-            sky_k = float(sky_temperature_k(air_k, moist, self.sky))
-        rate = heating_rate(
-            coldest + span * units,
-            absorbed_w_m3=body["absorptivity"] * lit,
-            emissivity=body["emissivity"],
-            convection=body["convection"],
-            capacity=body["capacity"],
-            radiating_ratio=areas["radiating"],
-            convecting_ratio=areas["convecting"],
-            air_k=float(air_k),
-            sky_k=sky_k,
-        )
-        return rate / span
+        return self.balance.rate(coldest + span * units, body, areas, self.weather, time_s) / span
 
     # The network of another run --------------------------------------------------------------------------
 

@@ -194,62 +194,29 @@ def reproduction_of(
             raise SceneError(f"{key}=...: a table has several; choose among them with table.{instead}=[...]")
     paper, table = str(config["paper"]), str(config["number"])
     printed = figures(paper, table)
-    rows = list(dict.fromkeys((figure.method, figure.setting) for figure in printed if figure.method))
-    extra = [name for name in config["methods"] or () if name not in {method for method, _ in rows}]
-    if unknown := [name for name in extra if name not in methods]:
-        raise SceneError(
-            f"table.methods: {', '.join(unknown)} is neither in the table ({_listed(m for m, _ in rows)}) nor in "
-            f"conf/method ({_listed(methods)})"
-        )
-    settings = list(dict.fromkeys(setting for _, setting in rows))
-    rows += [(name, setting) for name in extra for setting in settings if not config["ablation"]]
-    run = set(_chosen(rows, [method for method, _ in rows], config["methods"], "methods"))
-    run &= set(_chosen(rows, [setting for _, setting in rows], config["settings"], "settings"))
-
-    recipes: dict[tuple[str, str], list[str]] = {}
-    absent: dict[tuple[str, str], str] = {}
-    for method, setting in rows:
-        reasons = config["absent"]
-        reason = reasons.get(f"{method} {setting}", reasons.get(method))
-        if reason is None and method not in config["recipes"] and method not in methods:
-            reason = NOT_HERE
-        if reason is None and f"{method} {setting}" not in config["others"]:
-            reason = reasons.get(setting)
-        if reason is None and (method, setting) not in run:
-            reason = NOT_ASKED
-        if reason is None:
-            recipe = [*config["recipes"].get(method, [f"method={method}"]), *_protocol(config, setting, ablation or {})]
-            recipes[method, setting] = [text for text in recipe if not _overruled(text, given)]
-        else:
-            absent[method, setting] = reason
-
+    rows, chosen = _rows(config, printed, methods)
+    reasons = {row: _why_absent(config, row, methods, chosen) for row in rows}
+    absent = {row: reason for row, reason in reasons.items() if reason is not None}
+    recipes = {row: _recipe(config, row, ablation or {}, given) for row in rows if row not in absent}
     data = source(config["source"]) if config["source"] else None
-    wanted: list[str] = []
-    if data is not None and recipes:
-        named = dict.fromkeys(figure.scene or config["unnamed"] for figure in printed)
-        wanted = list(dict.fromkeys(key for scene in named for key in data.members(scene)))
-        if config["scenes"]:
-            asked = {key for scene in config["scenes"] for key in data.members(scene) or (scene,)}
-            wanted = _chosen(wanted, wanted, sorted(asked), "scenes")
+    wanted = _wanted(config, data, printed) if data and recipes else []
     folder = Path(root).expanduser() if root else None
     found = data.find(folder, config["folders"]) if data else {}
     runs: list[Run] = []
     waiting: list[str] = []
     for (method, setting), recipe in recipes.items():
         others = config["others"].get(f"{method} {setting}")
-        for scene in wanted:
-            if scene not in found:
+        for scene in (key for key in wanted if key in found):
+            if others is None:
+                after = None
+            elif lost := [key for key in data.scenes if key != scene and key not in found]:
+                waiting.append(
+                    f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
+                    f"{', '.join(lost)} is not on disk"
+                )
                 continue
-            after = None
-            if others is not None:
-                rest = [key for key in data.scenes if key != scene]
-                if lost := [key for key in rest if key not in found]:
-                    waiting.append(
-                        f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
-                        f"{', '.join(lost)} is not on disk"
-                    )
-                    continue
-                folders = [found[key] for key in rest]
+            else:
+                folders = [found[key] for key in data.scenes if key != scene]
                 scenes = ",".join(f"'{name}'" for name in folders)
                 joined = (*recipe, *others, f"data.scenes=[{scenes}]")
                 after = OnOthers(method, setting, scene, "+".join(folders), joined)
@@ -269,6 +236,57 @@ def reproduction_of(
         config["unnamed"],
         (*config["notes"], *doubts(paper, table)),
     )
+
+
+def _rows(
+    config: Mapping[str, Any], printed: Sequence[Figure], methods: Collection[str]
+) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
+    """(method, setting) of every row, those asked for beyond the paper last; and which of them are asked for."""
+    rows = list(dict.fromkeys((figure.method, figure.setting) for figure in printed if figure.method))
+    extra = [name for name in config["methods"] or () if name not in {method for method, _ in rows}]
+    if unknown := [name for name in extra if name not in methods]:
+        raise SceneError(
+            f"table.methods: {', '.join(unknown)} is neither in the table ({_listed(m for m, _ in rows)}) nor in "
+            f"conf/method ({_listed(methods)})"
+        )
+    settings = list(dict.fromkeys(setting for _, setting in rows))
+    rows += [(name, setting) for name in extra for setting in settings if not config["ablation"]]
+    chosen = set(_chosen(rows, [method for method, _ in rows], config["methods"], "methods"))
+    return rows, chosen & set(_chosen(rows, [setting for _, setting in rows], config["settings"], "settings"))
+
+
+def _why_absent(
+    config: Mapping[str, Any], row: tuple[str, str], methods: Collection[str], chosen: Collection[tuple[str, str]]
+) -> str | None:
+    """Why a row has the paper's figures only; None where it is trained."""
+    method, setting = row
+    reasons, name = config["absent"], f"{method} {setting}"
+    reason = reasons.get(name, reasons.get(method))
+    if reason is None and method not in config["recipes"] and method not in methods:
+        reason = NOT_HERE
+    if reason is None and name not in config["others"]:
+        reason = reasons.get(setting)
+    return NOT_ASKED if reason is None and row not in chosen else reason
+
+
+def _recipe(
+    config: Mapping[str, Any],
+    row: tuple[str, str],
+    ablation: Mapping[str, Mapping[str, Any]],
+    given: Collection[str],
+) -> list[str]:
+    """Overrides of a row, without those that the command line decides."""
+    method, setting = row
+    recipe = [*config["recipes"].get(method, [f"method={method}"]), *_protocol(config, setting, ablation)]
+    return [text for text in recipe if not _overruled(text, given)]
+
+
+def _wanted(config: Mapping[str, Any], data: Source, printed: Sequence[Figure]) -> list[str]:
+    """Keys of the scenes whose figures are printed, those that are asked for."""
+    named = dict.fromkeys(figure.scene or config["unnamed"] for figure in printed)
+    wanted = list(dict.fromkeys(key for scene in named for key in data.members(scene)))
+    asked = {key for scene in config["scenes"] or () for key in data.members(scene) or (scene,)}
+    return _chosen(wanted, wanted, sorted(asked), "scenes")
 
 
 def row_name(method: str, setting: str) -> str:

@@ -1,0 +1,179 @@
+"""What the frontier is shown as: tables, a picture, a page and a file for programs."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from heatsplat.io.tables import markdown_table, number
+from heatsplat.studies.frontier_runs import Recipe, dominated
+
+COLUMNS = {  # digits, and whether the spread stands beside the mean
+    "train_seconds": (1, True), "psnr": (2, True), "ssim": (4, False), "mae_c": (3, True),
+    "peak_memory_mb": (0, False), "render_fps": (0, False), "gaussians": (0, False),
+}  # fmt: skip
+
+
+def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
+    """The levels that some recipe reaches and not all reach at their first validation."""
+    reached = [[recipe.seconds_to(name, level) for recipe in recipes] for level in levels]
+    starts = [
+        min((course[name][0][0] for course in recipe.table["course"] if course[name]), default=0.0)
+        for recipe in recipes
+    ]
+    return [
+        level
+        for level, times in zip(levels, reached, strict=True)
+        if any(t is not None for t in times)
+        and not all(t is not None and t <= s for t, s in zip(times, starts, strict=True))
+    ]
+
+
+def tables(
+    recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]
+) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, heading and rows of the tables of every panel: results beside costs, and time to a quality.
+
+    Args:
+        recipes: from ``group``.
+        levels: score -> the qualities that are asked for, the easy ones first.
+    """
+    found = []
+    for scene in dict.fromkeys(recipe.scene for recipe in recipes):
+        own = [recipe for recipe in recipes if recipe.scene == scene]
+        head = [
+            "recipe",
+            "runs",
+            "train (s)",
+            "PSNR (dB)",
+            "SSIM",
+            "MAE (°C)",
+            "memory (MB)",
+            "frames/s",
+            "Gaussians",
+            "front",
+        ]
+        rows = []
+        for recipe in own:
+            cells = [
+                number(recipe.mean(name), digits, (spread and recipe.spread(name)) or None)
+                for name, (digits, spread) in COLUMNS.items()
+            ]
+            marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
+            rows.append([recipe.name, str(recipe.count), *cells, ", ".join(marks)])
+        found.append((f"{scene}: results beside their costs{_views_of(own)}", head, rows))
+        psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
+        if psnr or mae:
+            head = ["seconds to", *(f"{level:g} dB" for level in psnr), *(f"{level:g} °C" for level in mae)]
+            rows = [
+                [
+                    recipe.name,
+                    *(number(recipe.seconds_to("psnr", level), 1) for level in psnr),
+                    *(number(recipe.seconds_to("mae_c", level), 1) for level in mae),
+                ]
+                for recipe in own
+            ]
+            found.append((f"{scene}: seconds of training until the validation views reach a quality", head, rows))
+    return found
+
+
+def _views_of(recipes: Sequence[Recipe]) -> str:
+    """How many views were measured on the way and at the end, in brackets; empty where the runs of a panel do not tell."""
+    measured = [one for recipe in recipes for one in recipe.table["measured"]]
+    counts = {(one.get("validation views"), one.get("test views")) for one in measured}
+    val, test = counts.pop() if len(counts) == 1 else (None, None)
+    return "" if None in (val, test) else f" ({val} validation views on the way, {test} test views at the end)"
+
+
+def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -> str:
+    """The tables for people."""
+    lines = ["# Accuracy against training time", ""]
+    for title, head, rows in tables(recipes, levels):
+        lines += [f"## {title}", "", *markdown_table(head, rows), ""]
+    return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])
+
+
+def records(recipes: Sequence[Recipe]) -> list[dict[str, Any]]:
+    """Every point of every course, all scores and costs of the ends, and which ends are on the front, for programs."""
+    records = []
+    for recipe, one in ((shown, one) for shown in recipes for _, one in shown.table.iterrows()):
+        place = {"scene": recipe.scene, "recipe": recipe.name, "folder": one["folder"].name}
+        for score, course in one["course"].items():
+            records += [
+                {**place, "views": "validation", "seconds": s, "score": score, "value": v, "on_front": ""}
+                for s, v in course
+            ]
+        seconds = one.get("train_seconds")
+        for score in COLUMNS:
+            value = one.get(score)
+            if score != "train_seconds" and pd.notna(seconds) and pd.notna(value):
+                end = {"views": "test", "seconds": seconds, "score": score, "value": value}
+                records.append({**place, **end, "on_front": recipe.on_front.get(score, "")})
+    return records
+
+
+def picture(recipes: Sequence[Recipe]) -> Figure:
+    """Quality against seconds, a row of axes per panel: thin lines are courses, marks ends, the step line the front of all.
+
+    A recipe looks the same in all panels.
+    """
+    scenes = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    places = {name: j for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
+    figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
+    for i, scene in enumerate(scenes):
+        own = [recipe for recipe in recipes if recipe.scene == scene]
+        for k, (name, label) in enumerate((("psnr", "PSNR (dB)"), ("mae_c", "MAE (°C)"))):
+            axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
+            for recipe in own:
+                j = places[recipe.name]
+                color, mark = f"C{j % 10}", "os^Dv<>P"[j // 10 % 8]
+                for course in recipe.table["course"]:
+                    if course[name]:
+                        axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
+                x, y = recipe.mean("train_seconds"), recipe.mean(name)
+                if x is not None and y is not None:
+                    edge = "black" if recipe.on_front.get(name) else color
+                    axes.errorbar(
+                        x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
+                        linestyle="", label=recipe.name,
+                    )  # fmt: skip
+            sign = 1.0 if name == "psnr" else -1.0
+            every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
+            front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
+            if len(front) > 1:
+                axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
+            axes.set(xlabel="seconds of training", ylabel=label, title=scene, xscale="log")
+            if name == "mae_c":
+                axes.set_yscale("log")
+                axes.yaxis.set_major_formatter("{x:g}")
+                axes.yaxis.set_minor_formatter("{x:g}")
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.grid(alpha=0.25, which="both")
+            if k == 0 and own:
+                axes.legend(fontsize=7)
+    return figure
+
+
+def page(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]], vector: str) -> str:
+    """A page that needs no other file: the picture and the tables."""
+    picture_data = base64.b64encode(vector.encode()).decode()
+    parts = [
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Accuracy against training time</title>',
+        "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1100px;padding:0 1em}"
+        "table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ccc;text-align:right}"
+        "td:first-child,th:first-child{text-align:left}img{width:100%}</style>",
+        "<h1>Accuracy against training time</h1>",
+        f'<img alt="quality against seconds" src="data:image/svg+xml;base64,{picture_data}">',
+        "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto "
+        "front of both; ends with a black edge are those that no other recipe equalled sooner.</p>",
+    ]
+    for title, head, rows in tables(recipes, levels):
+        cells = "".join(f"<th>{html.escape(text)}</th>" for text in head)
+        body = "".join("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows)
+        parts.append(f"<h2>{html.escape(title)}</h2><table><tr>{cells}</tr>{body}</table>")
+    return "\n".join(parts)
