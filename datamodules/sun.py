@@ -35,8 +35,8 @@ class Site:
     def __post_init__(self) -> None:
         if not (-90.0 <= self.latitude <= 90.0 and -180.0 <= self.longitude <= 360.0):
             raise SceneError(
-                f"latitude {self.latitude} and longitude {self.longitude} are no place on the earth: degrees north "
-                "(-90 to 90) and degrees east (-180 to 180) are needed"
+                f"data.latitude={self.latitude} and data.longitude={self.longitude} (or those of meta.json) are no place "
+                "on earth: degrees north (-90 to 90) and degrees east (-180 to 180) are needed"
             )
         self.axes()
 

@@ -219,7 +219,7 @@ def test_world_axes_turn_the_sun():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"latitude": 95.0}, "latitude 95.0 and longitude 9.0 are no place"),
+        ({"latitude": 95.0}, "latitude=95.0 and data.longitude=9.0 .* are no place"),
         ({"north": (0.0, 0.0, 2.0)}, "data.north=.* points up"),
         ({"up": (0.0, 0.0, 0.0)}, "data.up and data.north are three numbers"),
     ],
