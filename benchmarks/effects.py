@@ -114,7 +114,7 @@ def run(
                 for name in rows[-1].effects:
                     left = replace(job, left_out=name)
                     less = [
-                        of(replace(left, seed=seed), _on(results) <= assembly.falls_with(name))
+                        of(replace(left, seed=seed), _on(results) <= assembly.dependents(name))
                         for seed, results in zip(seeds, whole, strict=True)
                     ]
                     rows.append(_mean(left, less))

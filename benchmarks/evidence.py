@@ -42,14 +42,14 @@ source.
 
 1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it there and puts it in the order in
    which heat meets effects: by `stage`, then by `place`.
-2. Give it its entry in `conf/effects/shared`: a line in `wishes.yaml`, and the settings of its part in `parts.yaml`, unless
+2. Give it its entry in `conf/effects/shared`: a line in `choices.yaml`, and the settings of its part in `parts.yaml`, unless
    another effect has that part already.
 
 Nothing else changes. The file says:
 
 - what it is: `summary`, `source`, `adds`, and `needs`, the metadata without which it is off;
-- its `evidence`, a function of a `Look` at the scene (`look.obs`: images and tracks; `look.joint`: the joint fit and what it
-  selected), its `null` hypothesis and its `threshold`, with a comment where the number comes from;
+- its `evidence`, a function of an `Inspection` of the scene (`inspected.obs`: images and tracks; `inspected.joint`: the joint fit
+  and what it selected), its `null` hypothesis and its `threshold`, with a comment where the number comes from;
 - its `term` in the joint fit, if tracks can show it: `Own` numbers of each point, `Shared` numbers of all points, or a `Path`
   that lets a share of the heat arrive (`effects/joint/terms.py`), with the rules that it has to meet beside its threshold;
 - its `part`: the slot of the configuration, the settings, and what is set when it is off while another effect needs the part;

@@ -141,7 +141,7 @@ MUTATIONS = (
     ),
     Mutation(
         "Determinant as xx yy - xy²", "geometry.projection",
-        "remainder = cross.square().sum(1) + blur * (plain_xx / yy + 1)", "remainder = (xx * yy - xy * xy) / yy",
+        "remainder = cross.square().sum(1) + eps2d * (plain_xx / yy + 1)", "remainder = (xx * yy - xy * xy) / yy",
         f"{SHAPES}::test_gaussians_of_any_shape_have_a_sound_image",
     ),
     Mutation(

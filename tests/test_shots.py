@@ -11,17 +11,17 @@ from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import View, ViewSet
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import beyond_record, develop, plan, sightings
+from heatsplat.shots import shot_frames, sightings, warn_beyond_record, write_shot
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
     scene = make_scene()
-    frames = plan(scene, "view", 0.0, 0, 1)
+    frames = shot_frames(scene, "view", 0.0, 0, 1)
     height, width = frames[0].camera.height, frames[0].camera.width
     seen = torch.ones(height, width, dtype=torch.bool)
     seen[0] = False
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        develop([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
+        write_shot([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
     values = read_temperature(next(tmp_path.glob("tiff/*.tiff")))
     assert np.isnan(values[0]).all()
     assert np.allclose(values[1:], scene.thermal_range.to_celsius(0.5))
@@ -32,10 +32,10 @@ def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
 
 def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
     scene = make_scene()
-    frames = plan(scene, "view", 0.0, 0, 1)
+    frames = shot_frames(scene, "view", 0.0, 0, 1)
     camera = frames[0].camera
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        develop([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
+        write_shot([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
     assert np.isfinite(read_temperature(next(tmp_path.glob("tiff/*.tiff")))).all()
     assert "no training view" not in caplog.text
 
@@ -43,10 +43,22 @@ def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
 def test_moments_beyond_the_record_are_told_apart():
     scene = make_scene()
     first, last = min(scene.train.times_s), max(scene.train.times_s)
-    assert beyond_record(scene, (first + last) / 2) == 0
-    assert beyond_record(scene, last + 60) == pytest.approx(60)
-    assert beyond_record(scene, first - 60) == pytest.approx(60)
-    assert beyond_record(scene, None) == 0
+    assert scene.beyond_record((first + last) / 2) == 0
+    assert scene.beyond_record(last + 60) == pytest.approx(60)
+    assert scene.beyond_record(first - 60) == pytest.approx(60)
+    assert scene.beyond_record(None) == 0
+
+
+def test_a_shot_beyond_the_record_is_warned_of_once(caplog):
+    scene = make_scene()
+    last = max(scene.train.times_s)
+    with caplog.at_level(logging.WARNING, "heatsplat"):
+        assert not warn_beyond_record(scene, shot_frames(scene, "view", last, 0, 2), "nothing")
+        assert not caplog.records
+        assert warn_beyond_record(scene, shot_frames(scene, "view", [last, last + 20.0], 0, 3), "sources are off")
+    (record,) = caplog.records
+    for part in ("2 of 3", f"{last + 10:.6g} to {last + 20:.6g} s", f"to {last:.6g} s", "sources are off"):
+        assert part in record.getMessage()
 
 
 def test_every_training_view_is_a_sighting_on_a_coarse_grid():

@@ -247,7 +247,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.contracts import SceneError
     from heatsplat.runs.run import UNSEEN, load
-    from heatsplat.shots import develop, plan
+    from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
     from heatsplat.training.session import prepare_machine
 
     if config["unseen"] not in UNSEEN:
@@ -256,14 +256,15 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
     )
-    frames = plan(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
+    frames = shot_frames(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
+    warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
     keep = config["unseen"] == "keep"
     images = (
         (trained.module.predict(frame).cpu(), None if keep else trained.seen(frame))
         for frame in track(frames, "rendering")
     )
     options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c")}
-    written = develop(images, frames, trained.scene, output_dir, **options)
+    written = write_shot(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 
 

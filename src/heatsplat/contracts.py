@@ -336,6 +336,13 @@ class SceneData:
         first, last = min(self.train.times_s), max(self.train.times_s)
         return first, last - first if last > first else 1.0
 
+    def beyond_record(self, time_s: float | None) -> float:
+        """Seconds between a moment and the nearest one of the training record; 0 within it, or without times."""
+        if time_s is None or "time" not in self.metadata:
+            return 0.0
+        times = self.train.times_s
+        return max(min(times) - time_s, time_s - max(times), 0.0)
+
     @cached_property
     def extent(self) -> float:
         """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""

@@ -24,7 +24,7 @@ log = logging.getLogger("heatsplat")
 TRAJECTORIES = ("orbit", "path", "test", "train", "view")
 
 
-def plan(
+def shot_frames(
     scene: SceneData,
     trajectory: str = "orbit",
     time: float | Sequence[float] | None = None,
@@ -124,15 +124,26 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     return found
 
 
-def beyond_record(scene: SceneData, time_s: float | None) -> float:
-    """Seconds between a moment and the nearest one of the training record; 0 within it, or without times."""
-    if time_s is None or "time" not in scene.metadata:
-        return 0.0
-    times = scene.train.times_s
-    return max(min(times) - time_s, time_s - max(times), 0.0)
+def warn_beyond_record(scene: SceneData, frames: Sequence[Frame], assumption: str) -> bool:
+    """Whether some frames lie beyond the training record; if so, one warning names them, the record and ``assumption``.
+
+    Args:
+        scene: with the record.
+        frames: of a shot.
+        assumption: of the thermal model beyond the record (``thermal.base.Heat.beyond_record``).
+    """
+    beyond = sorted(frame.time_s for frame in frames if scene.beyond_record(frame.time_s))
+    if beyond:
+        times = scene.train.times_s
+        log.warning(
+            "%d of %d frames (%s s) lie beyond the training record (%.6g to %.6g s): they are predictions, not measurements. "
+            "The model's assumption there: %s", len(beyond), len(frames),
+            " to ".join(f"{moment:.6g}" for moment in sorted({beyond[0], beyond[-1]})), min(times), max(times), assumption,
+        )  # fmt: skip
+    return bool(beyond)
 
 
-def develop(
+def write_shot(
     images: Iterable[tuple[Tensor, Tensor | None]],
     frames: Sequence[Frame],
     scene: SceneData,
@@ -175,7 +186,7 @@ def develop(
             if seen is not None:
                 values, share = values.where(seen, torch.nan), seen.float().mean().item()
             stem = Path(frame.name).stem
-            beyond = beyond_record(scene, frame.time_s)
+            beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
             if tiff:
                 written.append(output_dir / "tiff" / f"{stem}.tiff")

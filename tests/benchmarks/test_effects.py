@@ -11,7 +11,7 @@ from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 
 from benchmarks import effects as study
 from heatsplat.effects import assembly
-from heatsplat.effects.assembly import falls_with
+from heatsplat.effects.assembly import dependents
 from heatsplat.io.results import RunResults
 from heatsplat.studies import child_runs
 
@@ -42,7 +42,7 @@ def commands(monkeypatch):
             on = {"relaxation", "harmonic_source", "agc"}
         for word in command:
             if word.endswith("=off"):
-                on -= falls_with(word.removeprefix("effects.").partition("=")[0])
+                on -= dependents(word.removeprefix("effects.").partition("=")[0])
         results = RunResults(
             run={"parameters": 1000 + 100 * len(on)},
             test={"psnr": 30.0 + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},

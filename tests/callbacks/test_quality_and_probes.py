@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from fake_run import FakeModule, camera, evaluate, events, fit, loader, trainer, wall
+from fake_run import SECONDS, FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
 from heatsplat.callbacks.images import ImagePanels, file_stem
@@ -177,8 +178,28 @@ def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
     module = FakeModule(wall(truth=False), tmp_path)
     evaluate(module, trainer(tmp_path, [TemperatureCurves(times=4)]))
     assert (tmp_path / "renders" / "probes.png").exists()
-    assert list(read_csv(tmp_path / "renders" / "probes.csv")[0]) == ["time_s", *(f"probe {i}" for i in range(1, 7))]
+    columns = list(read_csv(tmp_path / "renders" / "probes.csv")[0])
+    assert columns == ["time_s", "beyond_record_s", *(f"probe {i}" for i in range(1, 7))]
     assert "test/probes" in events(tmp_path).Tags()["images"]
+
+
+def test_moments_beyond_the_training_record_are_counted_and_shaded(tmp_path, monkeypatch):
+    pictures = []
+
+    def keep(figure):
+        pictures.append(figure)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr("heatsplat.callbacks.probes.figure_picture", keep)
+    whole, within = wall(), SECONDS / 2
+    frames = [replace(frame, time_s=min(frame.time_s, within)) for frame in whole.train.frames]
+    scene = replace(whole, train=ViewSet(frames, lambda i: replace(whole.train[i], frame=frames[i])))
+    evaluate(FakeModule(scene, tmp_path), trainer(tmp_path, [TemperatureCurves(times=5)], logger=False))
+    rows = read_csv(tmp_path / "renders" / "probes.csv")
+    assert [row["beyond_record_s"] for row in rows] == pytest.approx([max(row["time_s"] - within, 0) for row in rows])
+    assert rows[-1]["beyond_record_s"] > 0
+    (axes,) = pictures[-1].axes
+    assert "beyond the record" in axes.get_title() and len(axes.patches) == 1
 
 
 def test_progress_says_how_far_it_is(tmp_path, capsys):

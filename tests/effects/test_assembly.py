@@ -133,13 +133,13 @@ def test_a_papers_effects_are_a_selection(paper):
     if paper in ("etgs", "thermogs"):
         thermal.prepare(Synthetic(scene=method["synthetic_preset"], size="tiny").scene)
     own = set(thermal.effects()) | set(sensor.effects())
-    given = assembly.explicit(config("method=auto", f"effects={paper}")["effects"])
+    given = assembly.explicit_choices(config("method=auto", f"effects={paper}")["effects"])
     assert set(given.values()) == {"on"} and set(given) == own - ({"radiation"} if paper == "ravigs" else set())
 
 
 def test_the_selection_of_etgs_is_etgs():
     chosen = config("method=auto", "effects=etgs")
-    on = verdicts(*assembly.explicit(chosen["effects"]), harmonic_source={"frequencies": 6})
+    on = verdicts(*assembly.explicit_choices(chosen["effects"]), harmonic_source={"frequencies": 6})
     found = assembly.assemble(on, chosen["effects"])
     assert found["thermal"]["state"] == config("method=etgs")["thermal"]
     assert found["thermal"]["parts"] == found["sensor"]["parts"] == found["loss"] == {}
@@ -147,7 +147,7 @@ def test_the_selection_of_etgs_is_etgs():
 
 def test_the_selection_of_supirgs_has_its_camera():
     chosen = config("method=auto", "effects=supirgs")
-    found = assembly.assemble(verdicts(*assembly.explicit(chosen["effects"])), chosen["effects"])
+    found = assembly.assemble(verdicts(*assembly.explicit_choices(chosen["effects"])), chosen["effects"])
     own = config("method=supirgs")["sensor"]["parts"]
     assert found["sensor"]["parts"] == {name: part for name, part in own.items() if part is not None}
 
@@ -175,38 +175,38 @@ def names_on(found):
 
 
 def test_what_acts_on_a_changing_temperature_brings_relaxation():
-    found = assembly.reconciled(verdicts("harmonic_source"))
+    found = assembly.reconcile(verdicts("harmonic_source"))
     assert names_on(found) == {"relaxation", "harmonic_source"}
     assert found["relaxation"].reason == "harmonic_source stands on it"
 
 
 def test_recorded_weather_takes_the_place_of_harmonics():
     both = verdicts("relaxation", "harmonic_source", "solar")
-    assert names_on(assembly.reconciled(both)) == {"relaxation", "solar"}
-    assert names_on(assembly.reconciled(both, {"harmonic_source": "on"})) == {"relaxation", "harmonic_source"}
+    assert names_on(assembly.reconcile(both)) == {"relaxation", "solar"}
+    assert names_on(assembly.reconcile(both, {"harmonic_source": "on"})) == {"relaxation", "harmonic_source"}
     with pytest.raises(SceneError, match="effects.harmonic_source=on cannot be had: the recorded weather drives"):
-        assembly.reconciled(both, {"harmonic_source": "on", "solar": "on"})
+        assembly.reconcile(both, {"harmonic_source": "on", "solar": "on"})
 
 
 def test_relaxation_that_is_switched_off_takes_along_what_stands_on_it():
-    found = assembly.reconciled(verdicts("harmonic_source", "agc"), {"relaxation": "off"})
+    found = assembly.reconcile(verdicts("harmonic_source", "agc"), {"relaxation": "off"})
     assert names_on(found) == {"agc"} and found["harmonic_source"].reason == "it stands on relaxation, which is off"
     with pytest.raises(SceneError, match="effects.relaxation=off cannot be had: harmonic_source stands on it"):
-        assembly.reconciled(verdicts("harmonic_source"), {"relaxation": "off", "harmonic_source": "on"})
+        assembly.reconcile(verdicts("harmonic_source"), {"relaxation": "off", "harmonic_source": "on"})
 
 
 def test_what_the_scene_cannot_give_is_refused_where_it_was_asked_for():
     with pytest.raises(SceneError, match="effects.solar=on cannot be had: as measured"):
-        assembly.reconciled(verdicts(), {"solar": "on"})
+        assembly.reconcile(verdicts(), {"solar": "on"})
 
 
 def test_an_opacity_for_each_image_needs_two_images():
     from heatsplat.datamodules.synthetic import Synthetic
 
     scene = Synthetic(scene="static", size="tiny").scene
-    assert assembly.possible(verdicts("thermal_opacity", "agc"), scene) == verdicts("thermal_opacity", "agc")
+    assert assembly.drop_impossible(verdicts("thermal_opacity", "agc"), scene) == verdicts("thermal_opacity", "agc")
     thermal = ViewSet(scene.train.frames, lambda i: replace(scene.train[i], rgb=None))
-    found = assembly.possible(verdicts("thermal_opacity", "agc"), replace(scene, train=thermal))
+    found = assembly.drop_impossible(verdicts("thermal_opacity", "agc"), replace(scene, train=thermal))
     assert names_on(found) == {"agc"} and "has no visible image" in found["thermal_opacity"].reason
 
 
@@ -218,39 +218,42 @@ def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
 
 def test_the_log_tells_verdict_statistic_price_and_reason():
     told = assembly.verdicts_as_dicts(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
-    head, *rows = assembly.lines(told)
+    head, *rows = assembly.verdict_table(told)
     assert head.split() == ["effect", "statistic", "ms/step", "numbers", "reason"] and len(rows) == len(assembly.NAMES)
     of = {row.split()[0]: row.split() for row in rows}
     assert of["agc"] == ["agc", "on", "3", ">", "1", "+0.26", "+2", "N", "+10", "as", "measured"]
     assert of["tone"] == ["tone", "off", "0.5", "≤", "1", "as", "measured"]
 
 
-# Wishes ---------------------------------------------------------------------------------------------------
+# Choices ---------------------------------------------------------------------------------------------------
 
 
-def test_selections_and_single_wishes():
-    assert set(assembly.wishes(config("method=auto")["effects"]).values()) == {"auto"}
-    assert set(assembly.wishes(config("method=auto", "effects=none")["effects"]).values()) == {"off"}
-    one = assembly.wishes(config("method=auto", "effects=all", "effects.agc=off", "effects.tone=auto")["effects"])
+def test_selections_and_single_choices():
+    assert set(assembly.choices(config("method=auto")["effects"]).values()) == {"auto"}
+    assert set(assembly.choices(config("method=auto", "effects=none")["effects"]).values()) == {"off"}
+    one = assembly.choices(config("method=auto", "effects=all", "effects.agc=off", "effects.tone=auto")["effects"])
     assert one == dict.fromkeys(assembly.NAMES, "on") | {"agc": "off", "tone": "auto"}
-    assert assembly.explicit({"solar": True, "agc": False}) == {"solar": "on", "agc": "off"}  # YAML's on and off
+    assert assembly.explicit_choices({"solar": True, "agc": False}) == {
+        "solar": "on",
+        "agc": "off",
+    }  # YAML's on and off
 
 
-def test_wishes_that_cannot_be_are_refused():
+def test_choices_that_cannot_be_are_refused():
     with pytest.raises(SceneError, match="effects.agc must be one of on, off, auto, got 'maybe'"):
-        assembly.wishes(config("method=auto", "effects.agc=maybe")["effects"])
+        assembly.choices(config("method=auto", "effects.agc=maybe")["effects"])
     with pytest.raises(SceneError, match="effects=all chooses the parts of method=auto, but method=etgs has its own"):
-        assembly.chooses(config("method=etgs", "effects=all") | {"name": "etgs"})
+        assembly.chooses_effects(config("method=etgs", "effects=all") | {"name": "etgs"})
     with pytest.raises(
         SceneError, match="effects.harmonic_source=off is asked for.*effects=etgs effects.harmonic_source=off"
     ):
-        assembly.chooses(config("method=etgs", "effects.harmonic_source=off") | {"name": "etgs"})
+        assembly.chooses_effects(config("method=etgs", "effects.harmonic_source=off") | {"name": "etgs"})
     with pytest.raises(SceneError, match="effects=method leaves method=auto without effects"):
-        assembly.chooses(config("method=auto", "effects=method") | {"name": "auto"})
+        assembly.chooses_effects(config("method=auto", "effects=method") | {"name": "auto"})
     with pytest.raises(HydraException, match="sunshine"):
         config("method=auto", "effects.sunshine=on")
-    assert not assembly.chooses(config("method=etgs") | {"name": "etgs"})
-    assert assembly.chooses(config("method=auto") | {"name": "auto"})
+    assert not assembly.chooses_effects(config("method=etgs") | {"name": "etgs"})
+    assert assembly.chooses_effects(config("method=auto") | {"name": "auto"})
 
 
 def test_the_effects_of_a_run_are_those_of_the_catalogue():

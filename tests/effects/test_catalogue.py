@@ -1,4 +1,4 @@
-"""The catalogue and its verdicts: wishes, missing metadata, and scenes in which there is nothing to see."""
+"""The catalogue and its verdicts: choices, missing metadata, and scenes in which there is nothing to see."""
 
 from dataclasses import replace
 
@@ -68,11 +68,11 @@ def test_missing_metadata_rules_out_and_is_named():
     verdicts = decide(scene_of(noise(8), None, points=50))
     assert "lacks time" in verdicts["relaxation"].reason
     assert "lacks thermal_range, time, weather" in verdicts["solar"].reason
-    wished = decide(scene_of(noise(8), None, points=50), {"solar": "on"})["solar"]
-    assert not wished.on and "lacks thermal_range, time, weather" in wished.reason
+    chosen = decide(scene_of(noise(8), None, points=50), {"solar": "on"})["solar"]
+    assert not chosen.on and "lacks thermal_range, time, weather" in chosen.reason
 
 
-def test_wishes_win_over_evidence():
+def test_choices_win_over_evidence():
     scene = scene_of(noise(8), [10.0 * i for i in range(8)], points=50)
     verdicts = decide(scene, {"vignetting": "on", "agc": "off", "tone": "auto"})
     assert verdicts["vignetting"].on and verdicts["vignetting"].reason == "effects.vignetting=on"
@@ -80,7 +80,7 @@ def test_wishes_win_over_evidence():
     assert not verdicts["tone"].on
 
 
-def test_unknown_effects_and_wishes_are_refused():
+def test_unknown_effects_and_choices_are_refused():
     scene = scene_of(noise(2), [0.0, 1.0])
     with pytest.raises(SceneError, match="effects.glow: there is no such effect"):
         decide(scene, {"glow": "on"})

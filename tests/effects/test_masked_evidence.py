@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
-from heatsplat.effects.look import Look
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.observations import observe
 from heatsplat.effects.physical.conduction import _kept
 from heatsplat.effects.physical.point_spread import evidence as point_spread
@@ -60,9 +60,9 @@ def test_observations_leave_out_what_does_not_count():
 
 def test_the_border_of_a_mask_is_no_edge_of_the_scene():
     images, masks = filled(6)
-    evidence = point_spread(Look(scene([torch.eye(4)] * 6, images, masks)))
+    evidence = point_spread(Inspection(scene([torch.eye(4)] * 6, images, masks)))
     assert evidence.statistic is None and evidence.reason.startswith("only 0 edges")
-    assert "only 0 edges" not in point_spread(Look(scene([torch.eye(4)] * 6, images))).reason
+    assert "only 0 edges" not in point_spread(Inspection(scene([torch.eye(4)] * 6, images))).reason
 
 
 def test_a_tripod_that_a_reconstruction_shakes_a_little_stands_still():

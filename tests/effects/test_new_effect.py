@@ -30,13 +30,13 @@ EFFECT = Effect(
     null="residuals do not depend on the side of the image",
     threshold=SHARED_HURDLE,
     adds="one number for each training image",
-    evidence=lambda look: Evidence(2.0, "as the test says", {"start": 0.5}),
+    evidence=lambda inspected: Evidence(2.0, "as the test says", {"start": 0.5}),
     part=Part("camera", "tilt"),
     term=Shared(columns=columns, order=9, kinds=where_moving, numbers=lambda data, kind: data.frames),
     displaces={"agc": "a tilt excludes gains"},
 )
 """
-CONF = {"select": "auto", "tilt": None}  # conf/effects/shared/wishes.yaml
+CONF = {"select": "auto", "tilt": None}  # conf/effects/shared/choices.yaml
 PARTS = {
     "sensor": {"_target_": "Chain", "parts": {"tilt": {"_target_": "Tilt", "start": "scene", "lr": 0.1}, "agc": {}}}
 }
@@ -57,12 +57,12 @@ def tilt(tmp_path, monkeypatch):
 def test_a_file_adds_an_effect(tilt):
     catalogue, assembly = tilt
     assert assembly.NAMES[-1] == "tilt" and len(assembly.NAMES) == 17
-    assert assembly.wishes(CONF | {"tilt": True})["tilt"] == "on"
+    assert assembly.choices(CONF | {"tilt": True})["tilt"] == "on"
     verdict = catalogue._verdict(catalogue.CATALOGUE[-1], SimpleLook(), "auto")
     assert verdict.on and verdict.settings == {"start": 0.5}
     verdicts = {name: catalogue.Verdict(name, False, None, None, "") for name in assembly.NAMES}
     verdicts |= {"tilt": verdict, "agc": catalogue.Verdict("agc", True, 9.0, 1.0, "")}
-    found = assembly.reconciled(verdicts)
+    found = assembly.reconcile(verdicts)
     assert not found["agc"].on and found["agc"].reason == "a tilt excludes gains"
     templates = PARTS | {"states": {"static": {}}, "parts": {}, "clip": "none"}
     assert assembly.assemble(found, templates)["sensor"]["parts"] == {

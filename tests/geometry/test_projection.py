@@ -31,17 +31,17 @@ def scene(count=50, scales=(0.05, 0.5), dtype=torch.float64):
     return [x.to(dtype) for x in (means, quats, sizes, viewmat, K)]
 
 
-def project(means, quats, scales, viewmat, K, blur=0.3):
-    return project_gaussians(means, quats, scales, viewmat, K, *SIZE, blur, 0.3)
+def project(means, quats, scales, viewmat, K, eps2d=0.3):
+    return project_gaussians(means, quats, scales, viewmat, K, *SIZE, eps2d, 0.3)
 
 
-def screen_covariances(means, quats, scales, viewmat, K, blur):
-    """J W covariance Wᵀ Jᵀ + blur, with the Jacobian of ``to_pixels`` by autograd."""
+def screen_covariances(means, quats, scales, viewmat, K, eps2d):
+    """J W covariance Wᵀ Jᵀ + eps2d, with the Jacobian of ``to_pixels`` by autograd."""
     points = to_camera(means, viewmat)
     held = torch.cat([clamped_slopes(points, K, *SIZE, 0.3) * points[:, 2:], points[:, 2:]], dim=1)
     jacobians = torch.stack([torch.autograd.functional.jacobian(lambda p: to_pixels(p, K), p) for p in held])
     jacobians = jacobians @ viewmat[:3, :3]
-    return jacobians @ covariances(quats, scales) @ jacobians.mT + blur * torch.eye(2, dtype=means.dtype)
+    return jacobians @ covariances(quats, scales) @ jacobians.mT + eps2d * torch.eye(2, dtype=means.dtype)
 
 
 def test_points_go_through_the_pinhole():
@@ -74,7 +74,7 @@ def test_variances_and_whitening_are_those_of_the_covariance():
 
 def test_compensation_is_the_ratio_of_determinants():
     arguments = scene()
-    plain, blurred = (torch.linalg.det(screen_covariances(*arguments, blur)) for blur in (0.0, 0.3))
+    plain, blurred = (torch.linalg.det(screen_covariances(*arguments, eps2d)) for eps2d in (0.0, 0.3))
     torch.testing.assert_close(project(*arguments).compensation, (plain / blurred).sqrt())
 
 
@@ -83,7 +83,7 @@ def test_the_view_need_not_be_a_rotation():
     means, quats, scales, viewmat, _ = scene(6)
     viewmat = viewmat + 0.1 * torch.arange(16, dtype=torch.float64).view(4, 4).sin()
     plain, blurred = (
-        torch.linalg.det(screen_covariances(means, quats, scales, viewmat, K, blur)) for blur in (0.0, 0.3)
+        torch.linalg.det(screen_covariances(means, quats, scales, viewmat, K, eps2d)) for eps2d in (0.0, 0.3)
     )
     torch.testing.assert_close(project(means, quats, scales, viewmat, K).compensation, (plain / blurred).sqrt())
 

@@ -72,37 +72,37 @@ def test_detail_is_what_averages_lose():
     assert averaged(spike, 3)[0, 0] == 0 and averaged(torch.ones(5, 5, 1), 3)[0, 0] == 1
 
 
-def test_confidence_falls_where_the_teacher_departs_from_the_record():
+def test_confidence_falls_where_the_teacher_departs_from_the_target():
     term = HighFrequency(lambda: Interpolation("lanczos"))
-    record = noise()
-    enlarged = resampled(record, FACTOR * HEIGHT, FACTOR * WIDTH, "bilinear")
-    assert torch.equal(term.confidence(enlarged, record), torch.ones(FACTOR * HEIGHT, FACTOR * WIDTH, 1))
-    brighter = term.confidence(enlarged + 0.1, record)
+    target = noise()
+    enlarged = resampled(target, FACTOR * HEIGHT, FACTOR * WIDTH, "bilinear")
+    assert torch.equal(term.confidence(enlarged, target), torch.ones(FACTOR * HEIGHT, FACTOR * WIDTH, 1))
+    brighter = term.confidence(enlarged + 0.1, target)
     assert torch.allclose(brighter, torch.full_like(brighter, np.exp(-1.0)), rtol=1e-4)  # exp(-10 * 0.1), same slopes
     slope = torch.arange(FACTOR * WIDTH)[None, :, None] * 0.01
-    sloped = term.confidence(enlarged + slope, record)
+    sloped = term.confidence(enlarged + slope, target)
     assert sloped[20, 30].item() == pytest.approx(np.exp(-10 * 0.30 - 5 * 0.01), rel=1e-3)
     assert sloped.min() > 0 and sloped.max() <= 1
 
 
 def test_the_truth_costs_nothing_and_a_blurred_one_does_with_a_gradient_towards_it():
     fine = smooth()
-    record = resampled(fine, HEIGHT, WIDTH, "bicubic")
+    target = resampled(fine, HEIGHT, WIDTH, "bicubic")
     term = HighFrequency(lambda: Oracle(fine))
-    assert term(inputs(fine, record)).item() == pytest.approx(0.0, abs=2e-4)  # answers are kept in half precision
+    assert term(inputs(fine, target)).item() == pytest.approx(0.0, abs=2e-4)  # answers are kept in half precision
     blurred = averaged(fine, 9).requires_grad_()
-    loss = term(inputs(blurred, record))
+    loss = term(inputs(blurred, target))
     loss.backward()
     better = (blurred - 0.5 * blurred.grad / blurred.grad.abs().max()).detach()
     assert loss > 1e-3 and blurred.grad.isfinite().all()
-    assert term(inputs(better * 0.02 + blurred.detach() * 0.98, record)) < loss
+    assert term(inputs(better * 0.02 + blurred.detach() * 0.98, target)) < loss
 
 
 def test_levels_do_not_matter_only_detail_does():
     fine = smooth()
-    record = resampled(fine, HEIGHT, WIDTH, "bicubic")
+    target = resampled(fine, HEIGHT, WIDTH, "bicubic")
     term = HighFrequency(lambda: Oracle(fine))
-    assert term(inputs(fine + 0.3, record)).item() == pytest.approx(0.0, abs=2e-4)
+    assert term(inputs(fine + 0.3, target)).item() == pytest.approx(0.0, abs=2e-4)
 
 
 def test_the_teacher_is_asked_once_per_image():
@@ -116,10 +116,10 @@ def test_the_teacher_is_asked_once_per_image():
 def test_near_masked_pixels_nothing_counts():
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[5, 6] = False
-    record = noise()
-    record[5, 6] = float("nan")
+    target = noise()
+    target[5, 6] = float("nan")
     prediction = smooth(seed=2).requires_grad_()
-    loss = HighFrequency(lambda: Interpolation("lanczos"))(inputs(prediction, record, mask))
+    loss = HighFrequency(lambda: Interpolation("lanczos"))(inputs(prediction, target, mask))
     loss.backward()
     assert loss.isfinite() and prediction.grad.isfinite().all()
     assert prediction.grad[20:24, 24:28].abs().max() < prediction.grad.abs().max() * 0.5

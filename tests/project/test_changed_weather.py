@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ from heatsplat import cli
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.runs import run
-from heatsplat.shots import plan
+from heatsplat.shots import shot_frames
 from heatsplat.training.module import CHECKPOINT_KEY
 
 
@@ -41,7 +42,8 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
         return torch.full((8, 8, 1), 0.5)
 
     data = Yard()
-    module = SimpleNamespace(thermal=SimpleNamespace(needs=frozenset(needs)), predict=predict)
+    heat = SimpleNamespace(needs=frozenset(needs), beyond_record="nothing changes")
+    module = SimpleNamespace(thermal=heat, predict=predict)
     stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
@@ -49,7 +51,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
     monkeypatch.setattr(run, "restore", lambda *_: None)
     monkeypatch.setattr("heatsplat.training.session.prepare_machine", lambda threads: None)
     options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", "unseen=keep", *overrides)
-    cli.render.__wrapped__.__wrapped__.__wrapped__(compose(options, "render"), folder)
+    inspect.unwrap(cli.render)(compose(options, "render"), folder)
     return seen, data.scene
 
 
@@ -73,13 +75,13 @@ def test_a_model_without_weather_says_that_it_changes_nothing(monkeypatch, tmp_p
 
 def test_a_moment_outside_the_record_is_refused():
     with pytest.raises(SceneError, match="there is no weather for second 1e.06: the record runs from -7200 to 72000 s"):
-        plan(make_scene(), "view", 1e6, 0, 1)
+        shot_frames(make_scene(), "view", 1e6, 0, 1)
 
 
 def test_without_a_record_frames_keep_what_they_had():
     bare = make_scene()
     scene = SceneData(bare.name, bare.train, bare.val, bare.test, bare.points)
-    assert [f.environment for f in plan(scene, "view", 10.0, 0, 2)] == [None, None]
+    assert [f.environment for f in shot_frames(scene, "view", 10.0, 0, 2)] == [None, None]
 
 
 def test_a_data_set_without_weather_refuses_the_choice(monkeypatch):

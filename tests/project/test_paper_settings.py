@@ -169,7 +169,7 @@ PAPERS = {
     | {
         "super_resolution": (4, "x4"),
         f"{TERM}.factor": (4, "x4"),
-        f"{TERM}.record_weight": (0.6, "train.py, the commented line"),
+        f"{TERM}.target_weight": (0.6, "train.py, the commented line"),
         f"{TERM}.sr_only": (False, "the paper: both terms"),
         f"{TERM}.kernel": ("area", "average pooling"),
         f"{TERM}.dssim_weight": (0.2, "3DGS"),

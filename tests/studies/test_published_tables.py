@@ -17,7 +17,7 @@ from running import compose_run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.studies.finished import Runs
-from heatsplat.studies.published import Plan, Run, make_plan
+from heatsplat.studies.published import Reproduction, Run, reproduction_of
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,12 +42,12 @@ def rows_of(config: dict) -> dict:
     ]
 
 
-def plan_of(
+def reproduced(
     name: str, root: Path | None = None, given: tuple[str, ...] = (), have: Collection[str] = METHODS, **changes: object
-) -> Plan:
-    """The plan where heatsplat has the methods ``have``."""
+) -> Reproduction:
+    """The reproduction where heatsplat has the methods ``have``."""
     config = config_of(name, **changes)
-    return make_plan(config, None if root is None else str(root), have, rows_of(config), given)
+    return reproduction_of(config, None if root is None else str(root), have, rows_of(config), given)
 
 
 def put(root: Path, marker: str, *scenes: str) -> Path:
@@ -63,24 +63,27 @@ def after(run: Run) -> list[str]:
 
 def everything(root: Path, name: str) -> Path:
     """A root with an empty folder for every scene that the table wants."""
-    plan = plan_of(name)
-    if plan.source:
-        put(root, plan.source.any[0], *plan.missing)
+    reproduction = reproduced(name)
+    if reproduction.source:
+        put(root, reproduction.source.any[0], *reproduction.missing)
     return root
 
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_every_table_is_planned_and_composes(path, tmp_path):
+def test_every_table_is_filled_and_composes(path, tmp_path):
     name = path.stem.removeprefix("table_")
-    plan = plan_of(name, everything(tmp_path, name), have=ALL_METHODS)
-    assert not plan.missing and (plan.runs or not plan.source)
-    assert {row for row in plan.rows if row not in plan.absent} == {(run.method, run.setting) for run in plan.runs}
-    if config_of(name)["ablation"] or not plan.source:
+    reproduction = reproduced(name, everything(tmp_path, name), have=ALL_METHODS)
+    assert not reproduction.missing and (reproduction.runs or not reproduction.source)
+    trained = {(run.method, run.setting) for run in reproduction.runs}
+    assert {row for row in reproduction.rows if row not in reproduction.absent} == trained
+    if config_of(name)["ablation"] or not reproduction.source:
         return  # composed by the slow test
-    run = next(run for run in plan.runs if run.method == plan.paper)
+    run = next(run for run in reproduction.runs if run.method == reproduction.paper)
     composed = compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
-    assert composed.table.paper == plan.paper and composed.data.scene == run.folder
-    assert composed.data._target_.split(".")[2] == {"ti3dgs_own": "ti_nsd"}.get(plan.source.key, plan.source.key)
+    assert composed.table.paper == reproduction.paper and composed.data.scene == run.folder
+    assert composed.data._target_.split(".")[2] == {"ti3dgs_own": "ti_nsd"}.get(
+        reproduction.source.key, reproduction.source.key
+    )
     assert composed.max_steps == (7000 if run.setting == "7k" else 30000)
 
 
@@ -88,9 +91,9 @@ def test_every_table_is_planned_and_composes(path, tmp_path):
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_every_row_of_every_table_composes_as_a_stored_config_its_own(path, tmp_path):
     name = path.stem.removeprefix("table_")
-    plan = plan_of(name, everything(tmp_path, name), have=ALL_METHODS)
-    first = {run.row: run for run in reversed(plan.runs)}
-    assert compose_run(tmp_path, f"experiment={path.stem}").table.paper == plan.paper
+    reproduction = reproduced(name, everything(tmp_path, name), have=ALL_METHODS)
+    first = {run.row: run for run in reversed(reproduction.runs)}
+    assert compose_run(tmp_path, f"experiment={path.stem}").table.paper == reproduction.paper
     made = [
         {
             key: value
@@ -105,26 +108,29 @@ def test_every_row_of_every_table_composes_as_a_stored_config_its_own(path, tmp_
 def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
     root = put(tmp_path / "RHD", "thermal/sparse", "Cooling-Bench", "cooling_dumbbels", "my_bike")
     (root / "heat_transfer").mkdir()  # no scene: nothing in it
-    plan = plan_of("etgs_1", root, folders={"cooling_ebike": "my_bike"})
-    found = {run.scene: run.folder for run in plan.runs}
+    reproduction = reproduced("etgs_1", root, folders={"cooling_ebike": "my_bike"})
+    found = {run.scene: run.folder for run in reproduction.runs}
     assert found == {
         "cooling_bench": "Cooling-Bench",
         "cooling_dumbbells": "cooling_dumbbels",
         "cooling_ebike": "my_bike",
     }
-    assert "heat_transfer" in plan.missing and len(plan.missing) == 7
-    assert [run.row for run in plan.runs] == ["3dgs"] * 3 + ["ntr_gaussian"] * 3 + ["etgs"] * 3
-    assert plan.runs[-1].overrides[0] == "method=etgs" and "data.scene='Cooling-Bench'" in plan.runs[-2].overrides
+    assert "heat_transfer" in reproduction.missing and len(reproduction.missing) == 7
+    assert [run.row for run in reproduction.runs] == ["3dgs"] * 3 + ["ntr_gaussian"] * 3 + ["etgs"] * 3
+    assert (
+        reproduction.runs[-1].overrides[0] == "method=etgs"
+        and "data.scene='Cooling-Bench'" in reproduction.runs[-2].overrides
+    )
 
 
 def test_a_run_on_an_unseen_scene_comes_after_one_on_all_others(tmp_path):
-    plan = plan_of("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S3", "S4"))
+    reproduction = reproduced("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S3", "S4"))
     rows = ["ntr_gaussian_cross_time", "thermogs_cross_scene", "thermogs_cross_time"]
-    assert [run.row for run in plan.runs] == [row for row in rows for _ in range(4)]
-    assert plan.absent["ntr_gaussian", "cross_scene"] == "its networks are of one scene"
-    assert plan.absent["thermalgs", "cross_scene"] == "its features are of one scene"
-    assert {run.after for run in plan.runs if run.setting == "cross_time"} == {None}
-    second = plan.runs[5]
+    assert [run.row for run in reproduction.runs] == [row for row in rows for _ in range(4)]
+    assert reproduction.absent["ntr_gaussian", "cross_scene"] == "its networks are of one scene"
+    assert reproduction.absent["thermalgs", "cross_scene"] == "its features are of one scene"
+    assert {run.after for run in reproduction.runs if run.setting == "cross_time"} == {None}
+    second = reproduction.runs[5]
     assert second.job(["max_steps=5"]) == [
         "max_steps=5", "method=thermogs", "data.scene='S2'", "row='thermogs_cross_scene'"
     ]  # fmt: skip
@@ -132,35 +138,35 @@ def test_a_run_on_an_unseen_scene_comes_after_one_on_all_others(tmp_path):
         "data.root=/x", "+data.each.latitude=47", "data.each.altitude_m=9", "seed=1", "method=thermogs", "data=scenes",
         "data@data.each=thermo", "data.scenes=['S1','S3','S4']", "row='thermogs_cross_scene_others'",
     ]  # fmt: skip
-    told = plan.told()
+    told = reproduction.summary()
     assert "12 runs (3 rows x 4 of 4 scenes)" in told
     assert "Before them, 4 runs: thermogs_cross_scene_others on S2+S3+S4, " in told
-    more = plan_of("thermogs_2", tmp_path, methods=["energy_balance"])
+    more = reproduced("thermogs_2", tmp_path, methods=["energy_balance"])
     assert more.absent["energy_balance", "cross_scene"] == "nothing of it is shared by scenes"
 
 
 def test_a_scene_is_not_left_out_while_others_are_not_on_disk(tmp_path):
-    plan = plan_of("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S4"), scenes=["thermo_s1"])
-    assert [run.row for run in plan.runs] == ["ntr_gaussian_cross_time", "thermogs_cross_time"]
+    reproduction = reproduced("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S4"), scenes=["thermo_s1"])
+    assert [run.row for run in reproduction.runs] == ["ntr_gaussian_cross_time", "thermogs_cross_time"]
     reason = "Not run: thermogs_cross_scene on thermo_s1, which comes after a run on all the other scenes; thermo_s3 is"
-    assert reason in plan.told() and reason in markdown(plan, compare(plan, {}))
+    assert reason in reproduction.summary() and reason in markdown(reproduction, compare(reproduction, {}))
 
 
 def test_unseen_times_are_means_over_scenes_and_unseen_scenes_stand_alone(tmp_path):
-    plan = plan_of("thermogs_2", everything(tmp_path, "thermogs_2"))
+    reproduction = reproduced("thermogs_2", everything(tmp_path, "thermogs_2"))
     found = {}
-    for i, scene in enumerate(plan.source.scenes):
+    for i, scene in enumerate(reproduction.source.scenes):
         found |= results(scene, "thermogs_cross_time", psnr=30.0 + i)
         found |= results(scene, "thermogs_cross_scene", psnr=20.0 + i)
-    lines = {(line.scene, line.setting): line for line in compare(plan, found) if line.method == "thermogs"}
+    lines = {(line.scene, line.setting): line for line in compare(reproduction, found) if line.method == "thermogs"}
     mean, third = lines["thermo_s1_s4", "cross_time"], lines["thermo_s3", "cross_scene"]
     assert mean.ours["psnr"] == 31.5 and mean.printed["psnr"].printed == "31.83"
     assert third.ours["psnr"] == 22.0 and third.printed["psnr"].printed == "26.03" and len(lines) == 5
 
 
 def test_all_that_is_missing_is_told_in_one_message(tmp_path):
-    told = plan_of("etgs_1").told(lpips_weights=str(tmp_path / "none.pth"))
-    for scene in plan_of("etgs_1").source.scenes:
+    told = reproduced("etgs_1").summary(lpips_weights=str(tmp_path / "none.pth"))
+    for scene in reproduced("etgs_1").source.scenes:
         assert scene in told
     for text in (
         "data.root is not set",
@@ -173,43 +179,49 @@ def test_all_that_is_missing_is_told_in_one_message(tmp_path):
         "data.root=/data/rhd",
     ):
         assert text in told, text
-    gone = plan_of("ravigs_1", tmp_path / "gone").told()
+    gone = reproduced("ravigs_1", tmp_path / "gone").summary()
     assert f"there is no folder {tmp_path / 'gone'}" in gone and "zenodo.org/records/15609062" in gone
-    some = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench")).told()
+    some = reproduced("etgs_1", put(tmp_path, "sparse", "cooling_bench")).summary()
     assert "3 runs (3 rows x 1 of 10 scenes)" in some and "Missing: 9 scenes" in some and f"not in {tmp_path}" in some
 
 
 def test_tables_of_facts_train_nothing_and_say_so():
     for name in ("etgs_5", "thermogs_1", "thermogs_7", "thermogs_8"):
-        plan = plan_of(name)
-        assert not plan.runs and not plan.missing and "nothing of this table is trained" in plan.told()
-    text = markdown(plan_of("thermogs_7"), compare(plan_of("thermogs_7"), {}))
+        reproduction = reproduced(name)
+        assert (
+            not reproduction.runs
+            and not reproduction.missing
+            and "nothing of this table is trained" in reproduction.summary()
+        )
+    text = markdown(reproduced("thermogs_7"), compare(reproduced("thermogs_7"), {}))
     assert "no data set on disk has the true materials" in text and "| – / " in text
 
 
 def test_what_is_asked_for_limits_the_runs_and_not_the_table(tmp_path):
     root = put(tmp_path, "images", "apples", "wall", "bridge")
-    plan = plan_of("ti3dgs_i", root, methods=["ti3dgs"], settings=["7k"], scenes=["wall"])
-    assert [(run.method, run.setting, run.scene) for run in plan.runs] == [("ti3dgs", "7k", "wall")]
-    assert plan.runs[0].overrides == ("method=ti3dgs", "max_steps=7000", "data.scene='wall'")
-    assert plan.absent["ti3dgs", "30k"] == "not asked for" and ("plenoxels", "") in plan.rows
-    grouped = plan_of("ti3dgs_iv", root, scenes=["ti_nsd_outdoor"])
+    reproduction = reproduced("ti3dgs_i", root, methods=["ti3dgs"], settings=["7k"], scenes=["wall"])
+    assert [(run.method, run.setting, run.scene) for run in reproduction.runs] == [("ti3dgs", "7k", "wall")]
+    assert reproduction.runs[0].overrides == ("method=ti3dgs", "max_steps=7000", "data.scene='wall'")
+    assert reproduction.absent["ti3dgs", "30k"] == "not asked for" and ("plenoxels", "") in reproduction.rows
+    grouped = reproduced("ti3dgs_iv", root, scenes=["ti_nsd_outdoor"])
     assert {run.scene for run in grouped.runs} == {"bridge"} and len(grouped.missing) == 6
 
 
 def test_the_command_line_wins_over_the_settings_of_the_table(tmp_path):
     root = put(tmp_path, "images", "wall")
     for given in (("max_steps",), ("debug",)):
-        assert all("max_steps" not in text for run in plan_of("ti3dgs_i", root, given).runs for text in run.overrides)
+        assert all(
+            "max_steps" not in text for run in reproduced("ti3dgs_i", root, given).runs for text in run.overrides
+        )
 
 
 def test_methods_beyond_the_paper_join_its_table(tmp_path):
-    plan = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench"), methods=["etgs", "energy_balance"])
-    assert [run.row for run in plan.runs] == ["etgs", "energy_balance"]
-    lines = compare(plan, {("energy_balance", "cooling_bench"): runs("energy_balance", "x", psnr=39.0)})
+    reproduction = reproduced("etgs_1", put(tmp_path, "sparse", "cooling_bench"), methods=["etgs", "energy_balance"])
+    assert [run.row for run in reproduction.runs] == ["etgs", "energy_balance"]
+    lines = compare(reproduction, {("energy_balance", "cooling_bench"): runs("energy_balance", "x", psnr=39.0)})
     (line,) = (line for line in lines if line.method == "energy_balance" and line.scene == "cooling_bench")
     assert line.ours == {"psnr": 39.0} and not line.printed
-    assert "| cooling_bench | energy_balance | 39.00 / – | – | – |" in markdown(plan, lines)
+    assert "| cooling_bench | energy_balance | 39.00 / – | – | – |" in markdown(reproduction, lines)
 
 
 @pytest.mark.parametrize(
@@ -230,24 +242,25 @@ def test_methods_beyond_the_paper_join_its_table(tmp_path):
 )
 def test_what_does_not_exist_is_named_with_what_does(name, given, changes, message):
     with pytest.raises(SceneError, match=message):
-        plan_of(name, None, given, **changes)
+        reproduced(name, None, given, **changes)
 
 
 @pytest.mark.parametrize("knob", ["seed=0,1", "optim.decay=1.0,0.5"])
 def test_every_job_of_a_table_has_a_folder_of_its_own(knob, tmp_path):
     """Names are cut, and a seed or a knob may stand behind the cut; without their own folders, jobs are taken for done."""
     root = everything(tmp_path, "ravigs_4")
-    plan = plan_of("ravigs_4", root, settings=["baseline", "grad"], scenes=["double_robot"])
+    reproduction = reproduced("ravigs_4", root, settings=["baseline", "grad"], scenes=["double_robot"])
     key, _, values = knob.partition("=")
     folders = []
-    for run in plan.runs:
+    for run in reproduction.runs:
         for value in values.split(","):
             given = ["max_steps=3000", f"{key}={value}", f"data.root={root}", "callbacks.images=null"]
             compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
             folders.append(HydraConfig.get().sweep.subdir)
     assert len(folders) == 4 == len(set(folders))
     assert all(
-        folder.startswith(f"{run.row}_double_robot_") for folder, run in zip(folders[::2], plan.runs, strict=True)
+        folder.startswith(f"{run.row}_double_robot_")
+        for folder, run in zip(folders[::2], reproduction.runs, strict=True)
     )
     assert max(len(folder.encode()) for folder in folders) < 200
     compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
@@ -256,24 +269,26 @@ def test_every_job_of_a_table_has_a_folder_of_its_own(knob, tmp_path):
 
 def test_runs_of_one_row_with_other_settings_have_lines_of_their_own(tmp_path):
     """A folder that two commands filled."""
-    plan = plan_of("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
+    reproduction = reproduced("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
     found = [
         runs("etgs", "cooling_bench", "max_steps=300", psnr=38.0),
         runs("etgs", "cooling_bench", "max_steps=3000", psnr=39.0),
         runs("3dgs", "cooling_bench", psnr=30.0),
     ]
-    lines = compare_all(plan, found)
-    text = markdown(plan, lines)
+    lines = compare_all(reproduction, found)
+    text = markdown(reproduction, lines)
     assert "| cooling_bench | etgs, max_steps=300 | 38.00 / 38.25 (-0.25) |" in text
     assert "| cooling_bench | etgs, max_steps=3000 | 39.00 / 38.25 (+0.75) |" in text
     assert "| cooling_bench | 3dgs | 30.00 / " in text and "| cooling_bench | mip_splatting | – / " in text
-    assert len([line for line in lines if line.scene == "cooling_bench"]) == 1 + len(compare_at(plan, "cooling_bench"))
+    assert len([line for line in lines if line.scene == "cooling_bench"]) == 1 + len(
+        compare_at(reproduction, "cooling_bench")
+    )
     assert sum(line.scene == "mean of the scenes that ran" for line in lines) == 3
-    assert compare_all(plan, found[2:]) == compare(plan, {("3dgs", "cooling_bench"): found[2]})
+    assert compare_all(reproduction, found[2:]) == compare(reproduction, {("3dgs", "cooling_bench"): found[2]})
 
 
-def compare_at(plan: Plan, scene: str) -> list:
-    return [line for line in compare(plan, {}) if line.scene == scene]
+def compare_at(reproduction: Reproduction, scene: str) -> list:
+    return [line for line in compare(reproduction, {}) if line.scene == scene]
 
 
 def runs(row: str, scene: str, other: str = "", **values: float | list[float]) -> Runs:
@@ -286,10 +301,10 @@ def results(scene: str, row: str, **values: float | list[float]) -> dict:
 
 
 def test_ours_stands_beside_the_printed_value_with_the_difference_and_its_cost(tmp_path):
-    plan = plan_of("etgs_1", put(tmp_path, "sparse", "cooling_bench", "cooling_ebike"))
+    reproduction = reproduced("etgs_1", put(tmp_path, "sparse", "cooling_bench", "cooling_ebike"))
     found = results("cooling_bench", "etgs", psnr=[38.0, 39.0], ssim=0.98, train_seconds=100.0, gaussians=1000.0)
     found |= results("cooling_ebike", "etgs", psnr=[40.0, 41.0], ssim=0.99, train_seconds=200.0, gaussians=3000.0)
-    lines = {(line.scene, line.method): line for line in compare(plan, found)}
+    lines = {(line.scene, line.method): line for line in compare(reproduction, found)}
     bench = lines["cooling_bench", "etgs"]
     assert bench.printed["psnr"].printed == "38.25" and bench.difference("psnr") == pytest.approx(0.25)
     assert bench.seeds == 2 and bench.spread["psnr"] == pytest.approx(0.5**0.5)
@@ -297,7 +312,7 @@ def test_ours_stands_beside_the_printed_value_with_the_difference_and_its_cost(t
     ran = lines["mean of the scenes that ran", "etgs"]
     assert ran.ours["psnr"] == 39.5 and ran.theirs["psnr"] == pytest.approx((38.25 + 41.67) / 2)
     assert ran.cost == {"train_seconds": 150.0, "gaussians": 2000.0} and ran.label.endswith("(2 of 10)")
-    text = markdown(plan, list(lines.values()))
+    text = markdown(reproduction, list(lines.values()))
     assert (
         "| cooling_bench | etgs | 38.50 ± 0.71 / 38.25 (+0.25) | 0.9800 / 0.983 (-0.0030) | – / 0.050 | 100.0 | 1,000 |"
         in text
@@ -306,11 +321,11 @@ def test_ours_stands_beside_the_printed_value_with_the_difference_and_its_cost(t
 
 
 def test_an_average_over_all_scenes_is_their_mean(tmp_path):
-    plan = plan_of("etgs_1", everything(tmp_path, "etgs_1"))
+    reproduction = reproduced("etgs_1", everything(tmp_path, "etgs_1"))
     found = {}
-    for i, scene in enumerate(plan.source.scenes):
+    for i, scene in enumerate(reproduction.source.scenes):
         found |= results(scene, "3dgs", psnr=30.0 + i)
-    lines = [line for line in compare(plan, found) if line.method == "3dgs"]
+    lines = [line for line in compare(reproduction, found) if line.method == "3dgs"]
     average = next(line for line in lines if line.scene == "average")
     assert average.ours["psnr"] == 34.5 and average.difference("psnr") == pytest.approx(34.5 - 32.16)
     assert not any(line.scene == "mean of the scenes that ran" for line in lines)
@@ -318,15 +333,15 @@ def test_an_average_over_all_scenes_is_their_mean(tmp_path):
 
 def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
     root = put(tmp_path, "images", "apples", "wall", "UAV1")
-    plan = plan_of("supirgs_3", root)
+    reproduction = reproduced("supirgs_3", root)
     found = results("apples", "3dgs", train_seconds=600.0, render_fps=10.0) | results(
         "wall", "3dgs", train_seconds=1200.0, render_fps=30.0
     )
-    line = next(line for line in compare(plan, found) if line.method == "3dgs")
+    line = next(line for line in compare(reproduction, found) if line.method == "3dgs")
     assert line.ours == {"train_min": 15.0, "fps": 20.0} and line.label == "(scenes not named) (2 of 20)"
-    direct = [run for run in plan.runs if run.method == "3dgs"]
+    direct = [run for run in reproduction.runs if run.method == "3dgs"]
     assert len(direct) == 3 and direct[0].overrides[0] == "method=direct_3dgs"
-    tones = plan_of("supirgs_1", root)
+    tones = reproduced("supirgs_1", root)
     found = (
         results("apples", "supirgs", psnr=30.0)
         | results("wall", "supirgs", psnr=32.0)
@@ -452,13 +467,13 @@ def test_without_data_nothing_trains_and_dry_runs_tell_only(tmp_path):
 
 
 def test_a_run_that_failed_is_named_in_the_comparison(tmp_path):
-    plan = plan_of("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
+    reproduction = reproduced("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
     job = tmp_path / "sweep" / "etgs_cooling_bench_" / ".hydra"
     job.mkdir(parents=True)
     (job / "overrides.yaml").write_text(yaml.safe_dump(["row='etgs'", "data.scene='cooling_bench'"]))
     (job / "config.yaml").write_text(yaml.safe_dump({"data": {"scene": "cooling_bench"}}))
     (job.parent / "FAILED").write_text("Traceback\nSceneError: no points\n")
-    write_comparison(tmp_path / "sweep", plan)
+    write_comparison(tmp_path / "sweep", reproduction)
     text = (tmp_path / "sweep" / "comparison.md").read_text()
     assert "## Jobs without a result\n\n- etgs on cooling_bench: SceneError: no points" in text
 
@@ -481,8 +496,8 @@ def test_tables_of_every_data_set_are_filled(name, layout, scene, metrics, tmp_p
     root = write_fake(layout, tmp_path / "data", scene)
     short = [text for text in SHORT if "downscale" not in text]  # 4 divides the images' sides
     output = command(f"experiment=table_{name}", f"data.root={root}", *short, f"hydra.sweep.dir={tmp_path}/sweep")
-    plan = plan_of(name, root, have=ALL_METHODS)
-    assert len({run.folder for run in plan.runs}) == 1 and "Jobs without a result" not in output
+    reproduction = reproduced(name, root, have=ALL_METHODS)
+    assert len({run.folder for run in reproduction.runs}) == 1 and "Jobs without a result" not in output
     with open(tmp_path / "sweep" / "comparison.csv", newline="") as file:
         ours = {(row["method"], row["setting"], row["metric"]) for row in csv.DictReader(file) if row["ours"]}
-    assert {(run.method, run.setting, metric) for run in plan.runs for metric in metrics} <= ours
+    assert {(run.method, run.setting, metric) for run in reproduction.runs for metric in metrics} <= ours

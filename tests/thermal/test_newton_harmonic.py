@@ -84,6 +84,50 @@ def test_values_are_the_closed_form_in_seconds_and_celsius():
     torch.testing.assert_close(model.temperature(splats, time_s).detach(), expected + 273.15, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("param", ["rate", "faithful"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_beyond_the_record_sources_are_off_and_temperatures_relax(dtype, param):
+    """Half a record later a sum of sines has bodies far below the ambient temperature that were above it at the end."""
+    model, splats = ready(dtype=dtype, param=param, clip="none")
+    with torch.no_grad():
+        splats["initial_state"].fill_(0.9)
+        splats["source_gains"][:, 0, 0] = -torch.linspace(5.0, 9.0, len(splats))  # cools in the first half, then heats
+        splats["source_gains"][:, 1, 0] = 4.0
+        ambient, rate = model.ambient.to(dtype), model._rate(splats)
+    end = model.features(splats, Query(time_s=SPAN_S))[:, 0].detach()
+    assert end.min() > ambient
+    for after_s in (1e-3, 60.0, SPAN_S, 100 * SPAN_S):
+        value = model.features(splats, Query(time_s=SPAN_S + after_s))[:, 0]
+        torch.testing.assert_close(value, ambient + (end - ambient) * torch.exp(-rate * after_s / SPAN_S))
+        assert value.min() >= ambient - 1e-6
+        assert not value.requires_grad  # no image shows that moment
+    sines = model._recorded(splats, 1.5, None)
+    assert sines.min() < ambient - 0.1
+    ids = torch.tensor([4, 1])
+    some = model.features(splats, Query(ids, time_s=2 * SPAN_S))
+    assert torch.equal(some, model.features(splats, Query(time_s=2 * SPAN_S))[ids])
+
+
+@pytest.mark.parametrize("end_s", [0.0, SPAN_S])
+def test_nothing_jumps_at_the_ends_of_the_record(end_s):
+    model, splats = ready(dtype=torch.float64, clip="none")
+    stir(splats, 0.1)
+    at = [model.features(splats, Query(time_s=end_s + step)) for step in (-1e-6, 0.0, 1e-6)]
+    torch.testing.assert_close(at[0], at[1], atol=1e-6, rtol=0)
+    torch.testing.assert_close(at[2], at[1], atol=1e-6, rtol=0)
+
+
+def test_before_the_record_temperatures_come_from_at_most_one_time_constant_back():
+    model, splats = ready(clip="none")
+    with torch.no_grad():
+        splats["source_gains"][:] = 3.0
+        start, rate = splats["initial_state"].clone(), model._rate(splats)
+    value = model.features(splats, Query(time_s=-0.1 * SPAN_S))[:, 0]
+    torch.testing.assert_close(value, model.ambient + (start - model.ambient) * torch.exp(0.1 * rate))
+    long_before = model.features(splats, Query(time_s=-100 * SPAN_S))[:, 0]
+    torch.testing.assert_close(long_before, model.ambient + (start - model.ambient) * math.e)
+
+
 def test_frequencies_span_one_cycle_to_the_half_power_point():
     model, _ = ready(tau_min_s=10.0)
     assert model.omega.shape == (24,)
@@ -295,7 +339,9 @@ def test_extreme_rates_stay_finite(log_rate):
     with torch.no_grad():
         splats["log_rate"].fill_(log_rate)
         splats["source_gains"].fill_(0.1)
-    for time_s in (-SPAN_S, 0.0, 1e-3, SPAN_S):
+    for time_s in (-100 * SPAN_S, -SPAN_S, 2 * SPAN_S, 100 * SPAN_S):  # beyond the record there is no gradient
+        assert model.features(splats, Query(time_s=time_s)).isfinite().all()
+    for time_s in (0.0, 1e-3, SPAN_S):
         splats.zero_grad()
         emitted = model.features(splats, Query(time_s=time_s))
         emitted.sum().backward()

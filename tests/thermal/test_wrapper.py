@@ -12,6 +12,7 @@ import heatsplat.thermal
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import AtmosphericField
+from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.conduction import Conducting
@@ -36,6 +37,7 @@ class Probe(ThermalModel):
 
     needs = frozenset({"time", "ambient"})
     narrowest_range_k = 0.25
+    beyond_record = "it probes on"
 
     def __init__(self, modality="thermal"):
         super().__init__()
@@ -162,6 +164,45 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert torch.equal(model.prior(splats)["probed"], splats.means[:, 1])
     assert model.effects()["probing"] == {"how": "deep"}
     assert model.cost >= 10**9
+    assert (
+        model.beyond_record.startswith("it probes on") and "emits" not in model.beyond_record
+    )  # a companion is silent
+
+
+def test_wrappers_and_parts_say_what_they_assume_beyond_the_record():
+    scene = make_scene()
+    air = Attenuation()
+    air.prepare(scene)
+    model = Conducting(Composed(NewtonHarmonic(), {"air": air, "reflection": Reflection()}))
+    state, of_air, of_neighbours = model.beyond_record.split("; ")
+    assert (state, of_air) == (NewtonHarmonic.beyond_record, air.beyond_record)
+    assert "nearest" in of_air and "neighbours" in of_neighbours
+    untimed = AtmosphericField(Static())
+    untimed.prepare(make_scene(timed=False))
+    assert untimed.beyond_record == Static.beyond_record
+
+
+@pytest.mark.parametrize(
+    "build", [TimeMlp, lambda inner: HexPlane(inner, heads=["radiance"]), AtmosphericField, ImagingField]
+)
+@pytest.mark.parametrize(("beyond_s", "nearest_s"), [(-40.0, 0.0), (99.0, 15.0)])
+def test_a_field_over_time_holds_its_ends_beyond_the_record(build, beyond_s, nearest_s):
+    model = build(Static(floor=False))
+    model.prepare(make_scene())
+    generator = torch.Generator().manual_seed(1)
+    declared = model.per_gaussian(Seeds(torch.randn(COUNT, 3, generator=generator), torch.rand(COUNT, 1), generator))
+    tensors = {"means": torch.randn(COUNT, 3, generator=generator), "log_scales": torch.zeros(COUNT, 3)}
+    tensors |= {"quats": torch.ones(COUNT, 4), "opacity_logits": torch.zeros(COUNT, 1)}
+    splats = Splats(tensors | {name: item.initial for name, item in declared.items()})
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+
+    def at(time_s):
+        return model.features(splats, Query(None, CAMERA, time_s, 1))
+
+    assert torch.equal(at(beyond_s), at(nearest_s))
+    assert not torch.equal(at(5.0), at(nearest_s))
 
 
 def test_what_the_model_inside_is_told_comes_in(wrapped):

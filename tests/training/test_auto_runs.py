@@ -27,12 +27,12 @@ def scene_says(monkeypatch):
     """Replaces the looking at the scene by verdicts that are known; counts how often it is asked."""
     asked = []
 
-    def decide(scene, wishes):
-        asked.append(dict(wishes))
+    def decide(scene, choices):
+        asked.append(dict(choices))
         on = {"on": True, "off": False}
         return {
-            name: Verdict(name, on.get(wish, name in PRESENT), 4.0 if name in PRESENT else 0.1, 1.0, "as known")
-            for name, wish in wishes.items()
+            name: Verdict(name, on.get(choice, name in PRESENT), 4.0 if name in PRESENT else 0.1, 1.0, "as known")
+            for name, choice in choices.items()
         }
 
     monkeypatch.setitem(sys.modules, "heatsplat.effects.catalogue", SimpleNamespace(decide=decide))

@@ -40,7 +40,8 @@ class TemperatureCurves(pl.Callback):
     The model's curve is the value of the rendered pixel on which the probe falls, seen from one validation camera at
     all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
     of the probe, each from its own camera. Probes are the scene's, or points of its cloud spread over the image. Models
-    that know no time, and scenes without times, have no curves.
+    that know no time, and scenes without times, have no curves. Moments beyond the training record, of test views, are
+    shaded and counted in the table's column "beyond_record_s".
 
     Args:
         count: how many probes to draw at most.
@@ -83,7 +84,8 @@ class TemperatureCurves(pl.Callback):
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
         names = [probe.name for probe in self._probes]
         title = f"{scene.name}, step {step}"
-        picture = figure_picture(_figure(times.numpy(), names, model, truth, dots, unit, title))
+        record = min(scene.train.times_s), max(scene.train.times_s)
+        picture = figure_picture(_figure(times.numpy(), record, names, model, truth, dots, unit, title))
         write_png(module.output_dir / "renders" / "probes.png", picture)
         self._write(module, times.tolist(), model, truth)
         writer = board(module)
@@ -106,8 +108,10 @@ class TemperatureCurves(pl.Callback):
         self, module: pl.LightningModule, times: list[float], model: np.ndarray, truth: np.ndarray | None
     ) -> None:
         names = [probe.name for probe in self._probes]
-        columns = ["time_s", *names, *([] if truth is None else [f"truth of {name}" for name in names])]
-        stacked = np.concatenate([[times], model, *([] if truth is None else [truth])])
+        beyond = [module.scene.beyond_record(time) for time in times]
+        columns = ["time_s", "beyond_record_s", *names]
+        columns += [] if truth is None else [f"truth of {name}" for name in names]
+        stacked = np.concatenate([[times, beyond], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
         write_csv(module.output_dir / "renders" / "probes.csv", rows)
 
@@ -195,6 +199,7 @@ def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float]
 
 def _figure(
     times: np.ndarray,
+    record: tuple[float, float],
     names: Sequence[str],
     model: np.ndarray,
     truth: np.ndarray | None,
@@ -202,13 +207,17 @@ def _figure(
     unit: str,
     title: str,
 ) -> Figure:
-    """Curves of all probes: lines are the model, dashes the truth, dots what images recorded."""
+    """Curves of all probes: lines are the model, dashes the truth, dots what images recorded; shaded beyond the record."""
     span = times[-1] - times[0]
     divisor, word = next(
         (d, w) for limit, d, w in ((300, 1, "s"), (3 * 3600, 60, "min"), (np.inf, 3600, "h")) if span < limit
     )
     figure = Figure(figsize=(9, 4.2), dpi=110, layout="constrained")
     axes = figure.add_subplot()
+    outside = [(times[0], record[0]), (record[1], times[-1])]
+    outside = [(start, end) for start, end in outside if start < end]
+    for start, end in outside:
+        axes.axvspan(start / divisor, end / divisor, color="0.9", linewidth=0, zorder=0)
     for i, curve in enumerate(model):
         color = f"C{i}"
         axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=names[i])
@@ -218,6 +227,7 @@ def _figure(
             axes.scatter(np.asarray(dots[i][0]) / divisor, dots[i][1], color=color, s=9, alpha=0.55, linewidths=0)
     against = "dashes: truth" if truth is not None else "dots: training images" if dots else "no truth known"
     axes.set(xlabel=f"time ({word})", ylabel=f"temperature ({unit})" if unit == "°C" else unit)
+    against += "; grey: beyond the record" if outside else ""
     axes.set_title(f"{title}   (lines: model, {against})", fontsize=10)
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8, ncols=2, framealpha=0.7)

@@ -8,44 +8,46 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
-from heatsplat.effects.base import SLOTS, WISHES, Effect, Verdict
+from heatsplat.effects.base import CHOICES, SLOTS, Effect, Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 
 NAMES = tuple(effect.name for effect in CATALOGUE)
-SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each wishes of an effect of which nothing is said
+SELECTIONS = {"auto": "auto", "all": "on", "none": "off"}  # what each chooses for an effect of which nothing is said
 PAPERS = "etgs, ravigs, ti3dgs, thermogs, supirgs"  # selections of the group "effects" that are a paper's
 SCENE_SAYS = "scene"  # value of a setting that the evidence chooses; without evidence it is the class's own default
 
 
-def wishes(effects: Mapping[str, Any]) -> dict[str, str]:
-    """Wish for every effect, "on", "off" or "auto", of the group "effects" of a configuration.
+def choices(effects: Mapping[str, Any]) -> dict[str, str]:
+    """Choice for every effect, "on", "off" or "auto", of the group "effects" of a configuration.
 
     Raises:
-        SceneError: a wish or the selection is unknown.
+        SceneError: a choice or the selection is unknown.
     """
     if effects["select"] not in SELECTIONS:
         raise SceneError(f"effects.select must be one of {', '.join(SELECTIONS)}, got '{effects['select']}'")
-    return dict.fromkeys(NAMES, SELECTIONS[effects["select"]]) | explicit(effects)
+    return dict.fromkeys(NAMES, SELECTIONS[effects["select"]]) | explicit_choices(effects)
 
 
-def explicit(effects: Mapping[str, Any]) -> dict[str, str]:
-    """Wishes that were given for single effects.
+def explicit_choices(effects: Mapping[str, Any]) -> dict[str, str]:
+    """Choices that were given for single effects.
 
     Raises:
         SceneError: one is unknown.
     """
     given = {}
     for name in NAMES:
-        wish = effects.get(name)
-        wish = {True: "on", False: "off"}.get(wish, wish) if isinstance(wish, bool) else wish  # YAML reads on as true
-        if wish is not None:
-            if wish not in WISHES:
-                raise SceneError(f"effects.{name} must be one of {', '.join(WISHES)}, got '{wish}'")
-            given[name] = wish
+        choice = effects.get(name)
+        choice = (
+            {True: "on", False: "off"}.get(choice, choice) if isinstance(choice, bool) else choice
+        )  # YAML reads on as true
+        if choice is not None:
+            if choice not in CHOICES:
+                raise SceneError(f"effects.{name} must be one of {', '.join(CHOICES)}, got '{choice}'")
+            given[name] = choice
     return given
 
 
-def chooses(config: Mapping[str, Any]) -> bool:
+def chooses_effects(config: Mapping[str, Any]) -> bool:
     """Whether a run's configuration leaves the effects to be chosen.
 
     Raises:
@@ -63,18 +65,18 @@ def chooses(config: Mapping[str, Any]) -> bool:
             f"effects={effects['select']} chooses the parts of method=auto, but method={method} has its own; "
             "give method=auto, or leave effects out."
         )
-    idle = {} if chosen else explicit(effects)
+    idle = {} if chosen else explicit_choices(effects)
     if idle:
-        name, wish = next(iter(idle.items()))
+        name, choice = next(iter(idle.items()))
         raise SceneError(
-            f"effects.{name}={wish} is asked for, but method={method} simulates what its paper does. Give method=auto with "
-            f"that paper's selection and your wish, such as method=auto effects=etgs effects.{name}={wish} ({PAPERS}), "
+            f"effects.{name}={choice} is asked for, but method={method} simulates what its paper does. Give method=auto with "
+            f"that paper's selection and your choice, such as method=auto effects=etgs effects.{name}={choice} ({PAPERS}), "
             "or the method's own options (thermal.*, sensor.*)."
         )
     return chosen
 
 
-def possible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
+def drop_impossible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
     """The verdicts, with those effects off for which the scene lacks more than metadata."""
     found = dict(verdicts)
     for name in _on(verdicts):
@@ -84,7 +86,7 @@ def possible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Ver
     return found
 
 
-def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None = None) -> dict[str, Verdict]:
+def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None = None) -> dict[str, Verdict]:
     """Verdicts that can be simulated together, in the order of NAMES; what was changed says so in its reason.
 
     Of effects that exclude each other the one goes that the others displace, unless it was asked for and they were not.
@@ -92,7 +94,7 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
 
     Args:
         verdicts: one for every name.
-        given: wishes for single effects (``explicit``), which win over what the scene says.
+        given: choices for single effects (``explicit_choices``), which win over what the scene says.
 
     Raises:
         SceneError: what was asked for cannot be had in this scene, or not together.
@@ -108,8 +110,8 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
             raise SceneError(f"effects.{name}={given[name]} cannot be had: {reason}; leave it out or change the other")
         found[name] = replace(found[name], on=on, reason=reason)
 
-    for name, wish in given.items():
-        if wish == "on" and not found[name].on:
+    for name, choice in given.items():
+        if choice == "on" and not found[name].on:
             raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}; add that, or leave it out")
     for name in _on(found):
         others = [other for other in _on(found) if name in _effect(other).displaces]
@@ -128,14 +130,14 @@ def reconciled(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None 
     return found
 
 
-def falls_with(name: str) -> frozenset[str]:
+def dependents(name: str) -> frozenset[str]:
     """The effect and those that stand on it."""
     return frozenset({name, *(effect.name for effect in CATALOGUE if effect.stands_on == name)})
 
 
 def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
     """The verdicts with one effect off, and with it those that stand on it."""
-    gone = falls_with(name)
+    gone = dependents(name)
     return {other: replace(verdict, on=verdict.on and other not in gone) for other, verdict in verdicts.items()}
 
 
@@ -211,7 +213,7 @@ def asked(config: Mapping[str, Any]) -> dict[str, Any]:
     return deepcopy({"effects": effects, "loss": config["loss"]})
 
 
-def changed(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
+def changed_keys(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
     """Keys of what was asked for (``asked``) that differ between a configuration and that of an earlier run.
 
     Whole numbers do not count where "max_steps" differs: many are shares of it.
@@ -259,7 +261,7 @@ def verdicts_as_dicts(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]
     return {name: asdict(verdict) | _plain_price(prices.get(name)) for name, verdict in verdicts.items()}
 
 
-def lines(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def verdict_table(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """A table for the log of what ``verdicts_as_dicts`` says: effect, verdict, statistic and threshold, price, reason."""
     rows = [("effect", "", "statistic", "ms/step", "numbers", "reason")]
     for name, verdict in verdicts.items():

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 from heatsplat.contracts import SceneData
 
 if TYPE_CHECKING:
+    from heatsplat.effects.inspection import Inspection
     from heatsplat.effects.joint.terms import Term
-    from heatsplat.effects.look import Look
 
 STAGES = ("state", "emission", "path", "visibility", "sensor")  # in the order in which heat meets them
-WISHES = ("on", "off", "auto")
+CHOICES = ("on", "off", "auto")
 # Where a part stands in a configuration -> where its settings stand in the group "effects" of a configuration.
 SLOTS = {
     "state": ("states",),  # the last one that is called for
@@ -93,7 +93,7 @@ class Effect:
     null: str
     threshold: float
     adds: str
-    evidence: Callable[[Look], Evidence]
+    evidence: Callable[[Inspection], Evidence]
     part: Part
     term: Term | None = None
     stands_on: str | None = None

@@ -11,8 +11,8 @@ from types import ModuleType
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import physical
-from heatsplat.effects.base import STAGES, WISHES, Effect, Verdict
-from heatsplat.effects.look import Look
+from heatsplat.effects.base import CHOICES, STAGES, Effect, Verdict
+from heatsplat.effects.inspection import Inspection
 
 log = logging.getLogger(__name__)
 
@@ -27,38 +27,38 @@ def effects_in(package: ModuleType) -> tuple[Effect, ...]:
 CATALOGUE = effects_in(physical)
 
 
-def decide(scene: SceneData, wishes: Mapping[str, str] = {}) -> dict[str, Verdict]:  # noqa: B006
+def decide(scene: SceneData, choices: Mapping[str, str] = {}) -> dict[str, Verdict]:  # noqa: B006
     """A verdict on every effect of the catalogue, in its order.
 
     Args:
         scene: looked at through its training views only.
-        wishes: "on", "off" or "auto" by name of effect; auto where nothing is said. An effect for which the scene lacks
-            metadata is off, whatever is wished, and its reason names what is missing.
+        choices: "on", "off" or "auto" by name of effect; auto where nothing is said. An effect for which the scene lacks
+            metadata is off, whatever is chosen, and its reason names what is missing.
 
     Raises:
-        SceneError: a wish is for an unknown effect, or is none of on, off and auto.
+        SceneError: a choice is for an unknown effect, or is none of on, off and auto.
     """
     names = [effect.name for effect in CATALOGUE]
-    for name, wish in wishes.items():
+    for name, choice in choices.items():
         if name not in names:
             raise SceneError(f"effects.{name}: there is no such effect; the catalogue has {', '.join(names)}")
-        if wish not in WISHES:
-            raise SceneError(f"effects.{name} must be one of {', '.join(WISHES)}, got '{wish}'")
-    look = Look(scene, CATALOGUE)
-    verdicts = {effect.name: _verdict(effect, look, wishes.get(effect.name, "auto")) for effect in CATALOGUE}
+        if choice not in CHOICES:
+            raise SceneError(f"effects.{name} must be one of {', '.join(CHOICES)}, got '{choice}'")
+    inspected = Inspection(scene, CATALOGUE)
+    verdicts = {effect.name: _verdict(effect, inspected, choices.get(effect.name, "auto")) for effect in CATALOGUE}
     for verdict in verdicts.values():
         log.debug("%s", verdict)
     return verdicts
 
 
-def _verdict(effect: Effect, look: Look, wish: str) -> Verdict:
-    missing = sorted(effect.needs - look.scene.metadata)
-    if missing and wish != "off":
+def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
+    missing = sorted(effect.needs - inspected.scene.metadata)
+    if missing and choice != "off":
         return Verdict(effect.name, False, None, None, f"the scene lacks {', '.join(missing)}, which it needs")
-    if wish == "off":
+    if choice == "off":
         return Verdict(effect.name, False, None, None, f"effects.{effect.name}=off")
-    evidence = effect.evidence(look)
-    if wish == "on":
+    evidence = effect.evidence(inspected)
+    if choice == "on":
         return Verdict(effect.name, True, None, None, f"effects.{effect.name}=on", evidence.settings)
     known = evidence.statistic is not None and math.isfinite(evidence.statistic)
     on = known and evidence.statistic > effect.threshold

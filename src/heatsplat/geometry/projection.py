@@ -96,10 +96,10 @@ def project_gaussians(
     K: Tensor,
     width: int,
     height: int,
-    blur: float,
+    eps2d: float,
     margin: float,
 ) -> ScreenGaussians:
-    """Screen Gaussians of n Gaussians in front of the camera: J W Σ Wᵀ Jᵀ + blur I, in a form that does not cancel.
+    """Screen Gaussians of n Gaussians in front of the camera: J W Σ Wᵀ Jᵀ + eps2d I, in a form that does not cancel.
 
     The rows of J W R diag(s) are two vectors u and w of three numbers each. Their inner products are the covariance,
     and |u x w|² is its determinant (Cauchy-Binet), a sum of squares where u·u w·w - (u·w)² would cancel for needles.
@@ -113,7 +113,7 @@ def project_gaussians(
         means, quats, scales: [n, 3], [n, 4] wxyz and not zero, [n, 3] semi-axes; camera z must not be zero.
         viewmat, K: [4, 4] and [3, 3].
         width, height: image size in pixels; it bounds the Jacobian.
-        blur: pixels² added to both variances.
+        eps2d: pixels² added to both variances.
         margin: see ``clamped_slopes``.
     """
     view = viewmat[:3, :3]
@@ -133,10 +133,10 @@ def project_gaussians(
     cross = (fx * fy)[:, None] * areas * torch.einsum("ni,nij->nj", normals, rotations)
 
     plain_xx, plain_yy = u.square().sum(1), w.square().sum(1)
-    xx, yy, xy = plain_xx + blur, plain_yy + blur, (u * w).sum(1)
+    xx, yy, xy = plain_xx + eps2d, plain_yy + eps2d, (u * w).sum(1)
     # Everything is divided by yy before it is squared or summed: determinants of large Gaussians overflow in float32.
     cross = cross / yy.sqrt()[:, None]
-    remainder = cross.square().sum(1) + blur * (plain_xx / yy + 1)  # det / yy, the variance of x given y
+    remainder = cross.square().sum(1) + eps2d * (plain_xx / yy + 1)  # det / yy, the variance of x given y
     whitening = torch.stack([remainder.rsqrt(), xy / yy, yy.rsqrt()], dim=1)
     # norm() has gradient zero at zero, where the square root has none (a disc seen from its edge).
     compensation = cross.norm(dim=1) * remainder.rsqrt()

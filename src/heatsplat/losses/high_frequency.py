@@ -19,14 +19,14 @@ from heatsplat.losses.teacher import Teacher, TeacherImages
 class HighFrequency:
     """The mean of W |H(prediction) - H(teacher)| on the fine grid of the prediction (SupIR-GS, Eq. 9-10).
 
-    H is what lies between two averages and W, the confidence, falls where the teacher departs from the record. Both are
+    H is what lies between two averages and W, the confidence, falls where the teacher departs from the target. Both are
     made once per training image and kept in half precision (4 bytes per pixel and channel). Where a masked pixel of the
-    record is near, nothing counts.
+    target is near, nothing counts.
 
     Args:
         teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
         factor: how much finer than the training images the prediction is.
-        gamma_pixel, gamma_gradient: how fast confidence falls with |teacher - enlarged record| and with the sum of the
+        gamma_pixel, gamma_gradient: how fast confidence falls with |teacher - enlarged target| and with the sum of the
             differences of their slopes per pixel.
         inner, outer: sides of the averaging windows of H, odd; 1 is the image itself.
 
@@ -51,7 +51,7 @@ class HighFrequency:
             )
         self.factor = factor
         self._teacher_images = TeacherImages(
-            teacher, factor, lambda fine, record: (self.detail(fine), self.confidence(fine, record))
+            teacher, factor, lambda fine, target: (self.detail(fine), self.confidence(fine, target))
         )
         self.gamma_pixel, self.gamma_gradient = gamma_pixel, gamma_gradient
         self.inner, self.outer = inner, outer
@@ -76,7 +76,7 @@ class HighFrequency:
         return averaged(image, self.inner) - averaged(image, self.outer)
 
     def confidence(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """W of a teacher's image [fH, fW, C] of a record [H, W, C], [fH, fW, 1] in (0, 1]."""
+        """W of a teacher's image [fH, fW, C] of a target [H, W, C], [fH, fW, 1] in (0, 1]."""
         enlarged = resampled(coarse, *fine.shape[:2], "bilinear")
         slopes = zip(sobel(fine), sobel(enlarged), strict=True)
         gradient = sum((a - b).abs() for a, b in slopes) / GAIN

@@ -1,4 +1,4 @@
-"""Comparing a finely rendered image with a coarsely recorded one, on the grid of the record."""
+"""Comparing a finely rendered image with a coarsely recorded one, on the grid of the target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class OnTargetGrid:
 
     Args:
         term: what compares.
-        kernel: how the prediction shrinks, as the record lost its resolution: "bicubic" for images made by
+        kernel: how the prediction shrinks, as the target lost its resolution: "bicubic" for images made by
             ``data.degrade=lr4``, "area" for ``area4`` and as a fair guess for a real sensor.
 
     Raises:

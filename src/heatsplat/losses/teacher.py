@@ -77,7 +77,7 @@ class TeacherImages:
     Args:
         teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
         factor: how much finer than the training images the teacher's are.
-        made: of a teacher's image [factor H, factor W, C] and the record [H, W, C] that it is of, what is kept.
+        made: of a teacher's image [factor H, factor W, C] and the target [H, W, C] that it is of, what is kept.
     """
 
     def __init__(
@@ -108,9 +108,9 @@ class TeacherImages:
         """What is kept of a training image; the teacher is asked when it is first seen, with 0 for masked pixels."""
         key = view.frame.frame_id
         if key not in self._made:
-            record = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
-            fine = self._loaded()(record, view.frame, self.factor)
-            self._made[key] = tuple(kept.half() for kept in self._make(fine, record))
+            target = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
+            fine = self._loaded()(target, view.frame, self.factor)
+            self._made[key] = tuple(kept.half() for kept in self._make(fine, target))
         return self._made[key]
 
     def _loaded(self) -> Teacher:

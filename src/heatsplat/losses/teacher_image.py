@@ -1,4 +1,4 @@
-"""SRGS's loss: the fine prediction is to look like a teacher's image, and, made small, like the record."""
+"""SRGS's loss: the fine prediction is to look like a teacher's image, and, made small, like the target."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
-class TaughtAndRecorded:
-    """(1 - w) L(prediction, teacher) + w L(small prediction, record), L = 0.8 L1 + 0.2 (1 - SSIM) (Feng et al. 2024).
+class TeacherAndTarget:
+    """(1 - w) L(prediction, teacher) + w L(small prediction, target), L = 0.8 L1 + 0.2 (1 - SSIM) (Feng et al. 2024).
 
-    The terms are "teacher/l1", "teacher/dssim", "record/l1" and "record/dssim", weighted; a share of zero leaves its pair
-    out. Near masked pixels of the record the teacher's image does not count: there it is a guess from half a picture.
+    The terms are "teacher/l1", "teacher/dssim", "target/l1" and "target/dssim", weighted; a share of zero leaves its pair
+    out. Near masked pixels of the target the teacher's image does not count: there it is a guess from half a picture.
 
     Args:
         teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
         factor: how much finer than the training images the prediction is.
-        record_weight: w in [0, 1].
+        target_weight: w in [0, 1].
         sr_only: learns from the teacher alone, as the published repository does; w then counts as 0.
         kernel: how the prediction is made small ("area": averages, as published).
         dssim_weight: share of SSIM in L.
@@ -36,34 +36,34 @@ class TaughtAndRecorded:
         self,
         teacher: Callable[[], Teacher],
         factor: int = 4,
-        record_weight: float = 0.6,
+        target_weight: float = 0.6,
         sr_only: bool = False,
         kernel: str = "area",
         dssim_weight: float = 0.2,
     ) -> None:
-        if not 0.0 <= record_weight <= 1.0 or factor < 1:
+        if not 0.0 <= target_weight <= 1.0 or factor < 1:
             raise ValueError(
-                f"record_weight is a share of the loss in [0, 1] and factor at least 1, got {record_weight}, {factor}"
+                f"target_weight is a share of the loss in [0, 1] and factor at least 1, got {target_weight}, {factor}"
             )
         self.factor = factor
-        self.record_weight = 0.0 if sr_only else record_weight
+        self.target_weight = 0.0 if sr_only else target_weight
         self._compare = Photometric(dssim_weight)
-        self._on_record = OnTargetGrid(self._compare, kernel)
-        self._teacher_images = TeacherImages(teacher, factor, lambda fine, record: (fine,))
+        self._on_target = OnTargetGrid(self._compare, kernel)
+        self._teacher_images = TeacherImages(teacher, factor, lambda fine, target: (fine,))
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Asks the teacher for the images of a scene (``TeacherImages.prepare``), unless w = 1 asks for none."""
-        return self._teacher_images.prepare(scene, modality) if self.record_weight < 1.0 else {}
+        return self._teacher_images.prepare(scene, modality) if self.target_weight < 1.0 else {}
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         check_fineness(inputs, self.factor)
         terms: dict[str, Tensor] = {}
-        if self.record_weight < 1.0:
+        if self.target_weight < 1.0:
             (fine,) = (kept.to(inputs.prediction) for kept in self._teacher_images.of(inputs.view, inputs.target))
             mask = None if inputs.mask is None else counted_finely(inputs.mask, self.factor)
             taught = self._compare(replace(inputs, target=fine, mask=mask))
-            terms |= {f"teacher/{name}": (1.0 - self.record_weight) * value for name, value in taught.items()}
-        if self.record_weight > 0.0:
-            recorded = self._on_record(inputs)
-            terms |= {f"record/{name}": self.record_weight * value for name, value in recorded.items()}
+            terms |= {f"teacher/{name}": (1.0 - self.target_weight) * value for name, value in taught.items()}
+        if self.target_weight > 0.0:
+            reduced = self._on_target(inputs)
+            terms |= {f"target/{name}": self.target_weight * value for name, value in reduced.items()}
         return terms

@@ -36,7 +36,7 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
         config = config | {"budget": seconds_of(config["budget"])}
         if "max_steps" in keys_of(config["overrides"]):
             raise SceneError("budget chooses the number of steps, and max_steps gives it: leave out one of them")
-    if assembly.chooses(config):
+    if assembly.chooses_effects(config):
         replaced = ("thermal.", "thermal=", "sensor.", "sensor=")
         idle = [text for text in config["overrides"] if text.lstrip("+~").startswith(replaced)]
         if idle:

@@ -9,7 +9,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
-from heatsplat.runs.vocabulary import known
+from heatsplat.runs.trust import trusted
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
 
@@ -106,7 +106,7 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 def _measured(stored: Mapping[str, Any], path: Path | str, *keys: str) -> dict[str, Any]:
     """What an earlier run found out, of which the parts of this one will be built."""
-    return known({key: stored[key] for key in keys if key in stored}, path)
+    return trusted({key: stored[key] for key in keys if key in stored}, path)
 
 
 def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
@@ -127,8 +127,8 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
             raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
         config = config | _measured(stored, ckpt, "budget")
     config = config | _measured(stored, ckpt, "scene")
-    if "verdicts" in stored and assembly.chooses(config):
-        changed = assembly.changed(config, stored)
+    if "verdicts" in stored and assembly.chooses_effects(config):
+        changed = assembly.changed_keys(config, stored)
         if changed:
             raise SceneError(
                 f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -25,9 +25,9 @@ from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
 from heatsplat.runs.folder import locked, results_in
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
+from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
-from heatsplat.runs.vocabulary import known
-from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.module import SplatTraining
 from heatsplat.training.session import fit, prepare_machine, restore
@@ -138,6 +138,7 @@ class Trained:
     module: SplatTraining
     data: Any
     checkpoint: dict[str, Any]
+    _warned: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     @property
     def scene(self) -> SceneData:
@@ -146,6 +147,8 @@ class Trained:
 
     def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
         """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
+
+        The first moment beyond the training record is warned of: it is a prediction.
 
         Args:
             camera: where from; a frame of the scene (``scene.test.frames[0]``) has a camera and a time of its own.
@@ -160,6 +163,8 @@ class Trained:
             raise ValueError(f"unseen must be one of {', '.join(UNSEEN)}, got '{unseen}'")
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
+        if not self._warned and warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record):
+            self._warned.add("beyond the record")
         image = self.module.predict(frame)[..., 0].cpu()
         image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
         return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
@@ -195,7 +200,7 @@ def load(
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
-        trust: classes of yours that the checkpoint may name, fully dotted (``runs.vocabulary.known``).
+        trust: classes of yours that the checkpoint may name, fully dotted (``runs.trust.trusted``).
 
     Raises:
         SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no
@@ -204,7 +209,7 @@ def load(
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
     loaded = load_checkpoint(checkpoint)
-    config = known(stored_config(loaded), checkpoint, trust)
+    config = trusted(stored_config(loaded), checkpoint, trust)
     if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
     changed = {key: value for key, value in (data or {}).items() if value is not None}

@@ -22,7 +22,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
 
     The same configuration where nothing is left to be chosen, or an earlier run has chosen.
     """
-    if "verdicts" in config or not assembly.chooses(config):
+    if "verdicts" in config or not assembly.chooses_effects(config):
         return config
     verdicts, costs = decide_effects(config["effects"], scene), {}
     if config["effects"]["price"]:
@@ -37,20 +37,20 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
             maker(verdicts), leaving, scene, config["max_steps"], device_of(config["trainer"]["accelerator"])
         )
     found = assembly.verdicts_as_dicts(verdicts, costs)
-    for line in assembly.lines(found):
+    for line in assembly.verdict_table(found):
         log.info("%s", line)
     return config | {"verdicts": found}
 
 
 def decide_effects(effects: Mapping[str, Any], scene: SceneData) -> dict[str, Verdict]:
-    """Verdicts on all effects in a scene that can be simulated together, as the group "effects" of a configuration wishes."""
+    """Verdicts on all effects in a scene that can be simulated together, as the group "effects" of a configuration chooses."""
     from heatsplat.effects.catalogue import (
         decide,  # here, because it is many modules and most runs leave nothing to choose
     )
 
     log.info("looking at scene %s for the effects that it calls for", scene.name)
-    seen = decide(scene, assembly.wishes(effects))
-    return assembly.reconciled(assembly.possible(seen, scene), assembly.explicit(effects))
+    seen = decide(scene, assembly.choices(effects))
+    return assembly.reconcile(assembly.drop_impossible(seen, scene), assembly.explicit_choices(effects))
 
 
 def filled(config: dict[str, Any]) -> dict[str, Any]:

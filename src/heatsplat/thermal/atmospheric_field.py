@@ -136,6 +136,11 @@ class AtmosphericField(Wrapper):
         products = sum(layer.weight.numel() for layer in (*self.layers, self.head))
         return super().cost + products + 6 * self.position_frequencies + 20  # the code, and the formula itself
 
+    @property
+    def own_beyond_record(self) -> str:
+        timed = self.time != "none" and not self.by_index
+        return "the field stays as at the nearest moment of the record" if timed else ""
+
     # The field ------------------------------------------------------------------------------------------
 
     def factor(self, means: Tensor, query: Query) -> Tensor:
@@ -182,7 +187,7 @@ class AtmosphericField(Wrapper):
                 0.5  # a view that no one took has no index of its own: it is shown as at the middle of the record
             )
         else:
-            fraction = self.clock.spans(moment)
+            fraction = self.clock.within(moment)
         when = torch.tensor([[fraction]], dtype=torch.float64, device=self.start.device)
         return octaves(when, self.time_frequencies)[0].to(self.head.weight)
 

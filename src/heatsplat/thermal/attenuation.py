@@ -48,6 +48,7 @@ class Attenuation(HeatPart):
         self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
         if moments > 0:
             self.clock = Clock()
+            self.beyond_record = "the air stays as at the nearest moment of the record"
 
     def prepare(self, scene: SceneData) -> None:
         centers = torch.stack([frame.camera.center for frame in scene.train.frames])
@@ -84,7 +85,7 @@ class Attenuation(HeatPart):
     def _log_depth_at(self, time_s: float | None) -> Tensor:
         if self.moments == 0:
             return self.log_depth[0]
-        place = min(max(self.clock.spans(time_s), 0.0), 1.0) * (self.moments - 1)
+        place = self.clock.within(time_s) * (self.moments - 1)
         before = min(int(place), self.moments - 2)
         return torch.lerp(self.log_depth[before], self.log_depth[before + 1], place - before)
 

@@ -43,6 +43,8 @@ class Conducting(Wrapper):
         ValueError: an option is out of its range.
     """
 
+    own_beyond_record = "heat goes on flowing between neighbours"
+
     def __init__(
         self,
         state: ThermalModel,

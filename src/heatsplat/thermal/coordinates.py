@@ -42,6 +42,10 @@ class Clock(nn.Module):
         first, span = self.record.tolist()
         return (float(time_s) - first) / span
 
+    def within(self, time_s: float | None) -> float:
+        """As ``spans``, of the moment of the record that is nearest: 0 to 1."""
+        return min(max(self.spans(time_s), 0.0), 1.0)
+
 
 class Box(nn.Module):
     """The cube about the central 98 % of a scene's points: centre, and edge in world units."""

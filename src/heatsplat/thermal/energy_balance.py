@@ -76,6 +76,7 @@ class EnergyBalance(ThermalModel):
 
     needs = frozenset({"time", "weather", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
+    beyond_record = "the recorded weather drives the balance of heat on, and without weather there is no answer"
 
     def __init__(
         self,

@@ -119,6 +119,7 @@ class EnergyNetwork(ThermalModel):
     """
 
     narrowest_range_k = KELVIN_RANGE
+    beyond_record = "the network sees the weather of that moment, and a clock of the record stays at its nearest moment"
 
     def __init__(
         self,
@@ -435,12 +436,11 @@ class EnergyNetwork(ThermalModel):
 
     def _moment(self, time_s: float) -> Tensor:
         """Encoded time and weather of a moment, as the network sees them."""
-        spans = self.clock.spans(time_s)
         mean, scale = self.weather_mean.cpu(), self.weather_scale.cpu()
         weather = torch.where(scale > 0, (columns_at(self.weather, time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
         if self.time != "none":
-            share = spans if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
+            share = self.clock.within(time_s) if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
             parts.append(octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0])
         return torch.cat(parts).to(self.network.own.weight)
 

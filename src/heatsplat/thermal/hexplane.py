@@ -66,6 +66,8 @@ class HexPlane(Wrapper):
         ValueError: a head is unknown, there is none, or a size is not positive.
     """
 
+    own_beyond_record = "what the planes change stays as at the nearest moment of the record"
+
     def __init__(
         self,
         emission: ThermalModel,
@@ -210,21 +212,21 @@ class HexPlane(Wrapper):
         Raises:
             ValueError: there is no time.
         """
-        spans = self.clock.spans(time_s)
+        share = self.clock.within(time_s)
         places = (means - self.center) / self.reach
         flat = torch.stack([places[:, pair] for pair in PAIRS])[:, :, None]  # [3, n, 1, 2]
         along = torch.stack((places.T, torch.zeros_like(places.T)), 2)[:, :, None]
         samples = []
         for space, time in zip(self.space, self.time, strict=True):
-            planes, lines = _sampled(space, flat), _sampled(self._at(time, spans), along)
+            planes, lines = _sampled(space, flat), _sampled(self._at(time, share), along)
             product = planes[0] * planes[1] * planes[2] * lines[0] * lines[1] * lines[2]
             samples.append(product)
         return self.trunk(torch.cat(samples).T)
 
-    def _at(self, planes: Tensor, spans: float) -> Tensor:
-        """Time planes [3, C, nodes, R] at a time: lines [3, C, 1, R]. All Gaussians share the time, so it comes first."""
+    def _at(self, planes: Tensor, share: float) -> Tensor:
+        """Time planes [3, C, nodes, R] at a share of the record: lines [3, C, 1, R]. All Gaussians share it: it comes first."""
         nodes = planes.shape[2]
-        place = min(max(spans, 0.0), 1.0) * (nodes - 1)
+        place = share * (nodes - 1)
         before = min(int(place), nodes - 2)
         return torch.lerp(planes[:, :, before], planes[:, :, before + 1], place - before)[:, :, None]
 

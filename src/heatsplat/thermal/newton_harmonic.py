@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 from heatsplat.physics.fused import visible_temperature
+from heatsplat.physics.relaxation import relax
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
@@ -65,6 +66,7 @@ class NewtonHarmonic(ThermalModel):
     """
 
     needs = frozenset({"time"})
+    beyond_record = "heat sources are off, and every Gaussian relaxes to the ambient temperature at its own rate"
 
     def __init__(
         self,
@@ -185,15 +187,34 @@ class NewtonHarmonic(ThermalModel):
         return None if self.range.bounds is None else self.range.kelvin(self._state(splats, time_s, None))
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
-        """Temperature in image units of the Gaussians ``ids``, [n], not clipped."""
+        """Temperature in image units of the Gaussians ``ids``, [n], not clipped.
+
+        A sum of harmonics says nothing of a source outside the record that it was fitted to. There only relaxation is left,
+        from the state at the end of the record and towards that at its start (``physics.relaxation`` bounds how far back).
+        """
+        spans, within = self.clock.spans(time_s), self.clock.within(time_s)
+        if spans == within:
+            return self._recorded(splats, spans, ids)
+        with torch.no_grad():
+            state = self._recorded(splats, within, ids)
+            beyond = torch.tensor(spans - within, dtype=torch.float64, device=state.device)
+            return relax(beyond, self.ambient, state, Query(ids).rows(self._rate(splats)))
+
+    def _rate(self, splats: Splats) -> Tensor:
+        """h/C of every Gaussian per span, [N]."""
         faithful = self.param == "faithful"
         log_rate = splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"]
+        return log_rate.clamp(*LOG_RATES).exp()
+
+    def _recorded(self, splats: Splats, spans: float, ids: Tensor | None) -> Tensor:
+        """As ``_state`` at a time within the record, counted in spans."""
+        faithful = self.param == "faithful"
         source = self.omega.numel() > 0
         return visible_temperature(
-            torch.tensor(self.clock.spans(time_s), dtype=torch.float64, device=self.omega.device),
+            torch.tensor(spans, dtype=torch.float64, device=self.omega.device),
             self.ambient,
             splats["initial_state"],
-            log_rate.clamp(*LOG_RATES).exp(),
+            self._rate(splats),
             self.omega,
             splats["source_gains"] if source else None,
             torch.exp(-splats["log_capacity"]) if faithful and source else None,

@@ -49,6 +49,7 @@ class NtrGaussian(ThermalModel):
 
     needs = frozenset({"time", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
+    beyond_record = "temperatures stay as at the nearest moment of the record"
 
     def __init__(
         self,
@@ -152,7 +153,8 @@ class NtrGaussian(ThermalModel):
     # The integral ---------------------------------------------------------------------------------------
 
     def _units(self, splats: Splats, ids: Tensor | None, time_s: float) -> Tensor:
-        """Temperatures [n] in image units at ``time_s``."""
+        """Temperatures [n] in image units at the moment of the record that is nearest to ``time_s``."""
+        time_s = min(max(time_s, self.clock.first_s), self.clock.first_s + self.clock.span_s)
         rows = (lambda tensor: tensor) if ids is None else (lambda tensor: tensor.index_select(0, ids))
         means, feature = rows(splats.means).detach(), rows(splats["feature"])
         code = octaves(self.box.places(means), self.position_frequencies)

@@ -16,6 +16,8 @@ class HeatPart(Heat):
     One part is one file with one subclass and one entry in conf/effects/shared/parts.yaml.
     """
 
+    beyond_record = ""
+
     @abstractmethod
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         """What is left of ``values`` [n, 1] in image units, of the Gaussians in ``query.ids``; the same shape."""

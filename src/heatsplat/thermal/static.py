@@ -35,6 +35,8 @@ class Static(ThermalModel):
         ValueError: the degree is not 0 to 3, or the image is a companion of itself.
     """
 
+    beyond_record = "every Gaussian emits what it emits at all times"
+
     def __init__(
         self,
         sh_degree: int = 0,

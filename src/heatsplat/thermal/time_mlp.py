@@ -40,6 +40,8 @@ class TimeMlp(Wrapper):
         ValueError: a size is not positive.
     """
 
+    own_beyond_record = "what the network adds stays as at the nearest moment of the record"
+
     def __init__(
         self,
         emission: ThermalModel,
@@ -109,12 +111,12 @@ class TimeMlp(Wrapper):
         return super().cost + products
 
     def change(self, features: Tensor, time_s: float | None) -> Tensor:
-        """ΔT in image units of Gaussians with ``features`` [n, F] at a time, [n].
+        """ΔT in image units of Gaussians with ``features`` [n, F] at a time, [n]; that of the record's end beyond it.
 
         Raises:
             ValueError: there is no time.
         """
-        when = torch.tensor([[self.clock.spans(time_s)]], dtype=torch.float64, device=features.device)
+        when = torch.tensor([[self.clock.within(time_s)]], dtype=torch.float64, device=features.device)
         moment = torch.cat((when, octaves(when, self.time_frequencies)), 1)[0].to(features)
         code = self.code(self.moment(moment).relu())
         hidden = (self.of_feature(features) + self.of_code(code)).relu()

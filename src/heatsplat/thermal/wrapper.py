@@ -25,7 +25,12 @@ class Wrapper(ThermalModel):
         members: name of the attribute -> model or part, or a ModuleDict of them; None leaves it away.
         needs: metadata that the wrapper needs beside what its members do.
         own_channels: channels of a thermal image of the wrapper's own, before those of its members.
+
+    Class attributes:
+        own_beyond_record: what the wrapper itself assumes beyond the record, after what is wrapped and the parts.
     """
+
+    own_beyond_record: str = ""
 
     def __init__(
         self, members: Mapping[str, nn.Module | None], needs: Iterable[str] = (), own_channels: int = 0
@@ -111,6 +116,13 @@ class Wrapper(ThermalModel):
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """That of what is wrapped: what a camera would see without anything in between."""
         return self._models[0].temperature(splats, time_s)
+
+    @property
+    def beyond_record(self) -> str:
+        """What is assumed by the model that is wrapped, by the parts and by the wrapper; companions are left out."""
+        parts = (member for member in self.members.values() if not isinstance(member, ThermalModel))
+        clauses = [self._models[0].beyond_record, *(part.beyond_record for part in parts), self.own_beyond_record]
+        return "; ".join(clause for clause in clauses if clause)
 
     def on_step(self, step: int) -> None:
         for member in self.members.values():

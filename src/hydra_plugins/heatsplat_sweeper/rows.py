@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
 
 if TYPE_CHECKING:
-    from heatsplat.studies.published import Plan
+    from heatsplat.studies.published import Reproduction
 
 log = logging.getLogger("heatsplat")
 
@@ -98,7 +98,7 @@ class RowSweeper(BasicSweeper):
         self.batch = max_batch_size
         self.paper = paper
         self.rows = rows
-        self.plan: Plan | None = None
+        self.reproduction: Reproduction | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
@@ -108,18 +108,18 @@ class RowSweeper(BasicSweeper):
     def split_arguments(self, overrides: list[Override], max_batch_size: int | None) -> list[list[list[str]]]:
         """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins."""
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
-        if self.plan is not None:
-            jobs = self._of_table(self.plan, jobs)
+        if self.reproduction is not None:
+            jobs = self._of_table(self.reproduction, jobs)
         elif self.rows:
             jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
         return [jobs]
 
-    def _of_table(self, plan: Plan, grid: Sequence[Sequence[str]]) -> list[list[str]]:
+    def _of_table(self, reproduction: Reproduction, grid: Sequence[Sequence[str]]) -> list[list[str]]:
         """The jobs of a table: those that others come after stand at the beginning, once each, and end before these start."""
         first: dict[tuple[str, ...], Path] = {}
         jobs = []
         for given in grid:
-            for run in plan.runs:
+            for run in reproduction.runs:
                 after = []
                 if run.after is not None:
                     before = tuple(run.after.job(given))
@@ -138,7 +138,7 @@ class RowSweeper(BasicSweeper):
         if self.config.get("table") is not None and not self._plan(list(arguments)):
             return None
         try:
-            return super().sweep(list(arguments)) if self.plan is None or self.plan.runs else None
+            return super().sweep(list(arguments)) if self.reproduction is None or self.reproduction.runs else None
         except ConfigCompositionException as error:
             of, chosen = (self.paper or {}).get("of"), self.config.hydra.runtime.choices.method
             if of in (None, chosen):
@@ -154,10 +154,10 @@ class RowSweeper(BasicSweeper):
             raise
         finally:
             written = write_sweep(folder, list(self.rows or ()), self._printed())
-            if self.plan is not None:
+            if self.reproduction is not None:
                 from heatsplat.studies.published import write_comparison
 
-                written += write_comparison(folder, self.plan)
+                written += write_comparison(folder, self.reproduction)
                 log.info("%s", written[-2].read_text(encoding="utf-8"))
             for path in written:
                 log.info("%s", path)
@@ -183,12 +183,12 @@ class RowSweeper(BasicSweeper):
         Exit code 1 where the table asks for what there is not, or none of its scenes is on disk.
         """
         from heatsplat.contracts import SceneError
-        from heatsplat.studies.published import make_plan
+        from heatsplat.studies.published import reproduction_of
 
         table = OmegaConf.to_container(self.config.table)
         metrics = self.config.callbacks.get("metrics") or {}
         try:
-            self.plan = make_plan(
+            self.reproduction = reproduction_of(
                 table,
                 self.config.data.root,
                 self.hydra_context.config_loader.get_group_options("method"),
@@ -198,8 +198,8 @@ class RowSweeper(BasicSweeper):
         except SceneError as error:
             log.error("%s", error)
             sys.exit(1)
-        nothing = bool(self.plan.missing) and not self.plan.runs
-        told = self.plan.told(metrics.get("lpips_net"), metrics.get("lpips_weights"))
+        nothing = bool(self.reproduction.missing) and not self.reproduction.runs
+        told = self.reproduction.summary(metrics.get("lpips_net"), metrics.get("lpips_weights"))
         log.log(logging.ERROR if nothing else logging.INFO, "%s", told)
         if nothing:
             sys.exit(1)

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from heatsplat.effects.base import Evidence
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.selection import candidates, earns, worthwhile
-from heatsplat.effects.look import Look
 
 WELL_OUTDONE = 1.0  # share of others' size below which an effect makes up for what they lack
 
 
-def gained(look: Look, name: str, sentence: str) -> Evidence:
+def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
     """What an effect gains in the presence of those that were selected."""
-    if look.joint is None:
-        return Evidence(None, look.obs.why or "no point can be followed through the images")
-    fit, model = look.joint
+    if inspected.joint is None:
+        return Evidence(None, inspected.obs.why or "no point can be followed through the images")
+    fit, model = inspected.joint
     if name in model.names:
         less = fit.without(model, name)
         gain, size = fit.gain(model, less), fit.effect_size(model, less)
@@ -33,16 +33,16 @@ def gained(look: Look, name: str, sentence: str) -> Evidence:
     return Evidence(gain, f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost")
 
 
-def selected_kind(look: Look, name: str) -> object | None:
+def selected_kind(inspected: Inspection, name: str) -> object | None:
     """In which kind the joint fit selected an effect; None where it did not, or there is none."""
-    return None if look.joint is None else look.joint[1].kind(name)
+    return None if inspected.joint is None else inspected.joint[1].kind(name)
 
 
-def outdone(look: Look, name: str, others: Collection[str]) -> bool:
+def outdone(inspected: Inspection, name: str, others: Collection[str]) -> bool:
     """Whether an effect was only taken in beside others that explain the same kind of change, and more of it."""
-    if look.joint is None or not {name, *others} <= look.joint[1].names:
+    if inspected.joint is None or not {name, *others} <= inspected.joint[1].names:
         return False
-    fit, model = look.joint
+    fit, model = inspected.joint
     less = fit.without(model, name)
     size = fit.effect_size(model, less)
     return all(size < WELL_OUTDONE * fit.effect_size(less, fit.without(less, other)) for other in others)

@@ -8,18 +8,18 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
-from heatsplat.effects.look import Look
 from heatsplat.effects.physical.frame_offset import in_common
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent."""
-    if outdone(look, "agc", {"frame_offset", "tone"}):
+    if outdone(inspected, "agc", {"frame_offset", "tone"}):
         return Evidence(0.0, "what looks like gains of single images is a bent curve along which they shift")
-    return gained(look, "agc", "gains of single images change values by")
+    return gained(inspected, "agc", "gains of single images change values by")
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

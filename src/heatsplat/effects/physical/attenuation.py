@@ -9,24 +9,24 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
-from heatsplat.effects.look import Look
 
 MAX_DEPTH = 3.0  # optical depth at the typical distance
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether points lose contrast to the surroundings with distance."""
-    if look.obs.ambient is None:
+    if inspected.obs.ambient is None:
         return Evidence(None, "without the temperature of the surroundings nobody knows what haze fades to")
-    found = gained(look, "attenuation", "the path changes values by")
-    kind = selected_kind(look, "attenuation")
+    found = gained(inspected, "attenuation", "the path changes values by")
+    kind = selected_kind(inspected, "attenuation")
     if kind is None:
         return found
-    fit, model = look.joint
+    fit, model = inspected.joint
     seen = passing(fit, kind, fit.own_basis(model), fit.weights)[fit.weights > 0]
     count = numbers(fit.data, kind)
     return replace(

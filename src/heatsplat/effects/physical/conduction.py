@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
-from heatsplat.effects.look import Look
 
 NEIGHBOURS = 6
 MIN_POINTS, MIN_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
@@ -18,15 +18,15 @@ FASTER = 1.35
 LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether contrasts between neighbours fade faster than the levels that they share.
 
     Where every point relaxes by itself, an excess and a difference of two excesses fade alike.
     """
-    obs = look.obs
-    if look.joint is None or obs.times_s is None:
+    obs = inspected.obs
+    if inspected.joint is None or obs.times_s is None:
         return Evidence(None, obs.why or "no point can be followed over time")
-    fit, model = look.joint
+    fit, model = inspected.joint
     if fit.data.drivers is not None:
         return Evidence(0.0, "levels follow the weather, so that nobody knows how fast they would fade by themselves")
     if "relaxation" not in model.names or "harmonic_source" in model.names:

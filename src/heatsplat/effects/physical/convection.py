@@ -6,23 +6,23 @@ import torch
 
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
-from heatsplat.effects.look import Look
+from heatsplat.effects.inspection import Inspection
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether the wind of the record can change temperatures by more than the noise hides.
 
     The record and the size of temperatures say so, not their course: wind is there, and what it does is a matter of scale.
     With h = 5 + 3 v (McAdams' order of magnitude), a surface that is D above the air in equilibrium is off by D · Δh / h
     when the wind is taken to be its mean.
     """
-    weather, obs = look.scene.weather, look.obs
+    weather, obs = inspected.scene.weather, inspected.obs
     if weather.wind_m_s is None or weather.air_c is None:
         return Evidence(None, "the record has no wind, or no air temperature")
     if obs.tracks is None or obs.times_s is None:
         return Evidence(None, obs.why)
     wind = weather_record.at(weather, weather.wind_m_s, obs.times_s)
-    air = look.scene.thermal_range.to_unit(weather_record.at(weather, weather.air_c, obs.times_s))
+    air = inspected.scene.thermal_range.to_unit(weather_record.at(weather, weather.air_c, obs.times_s))
     exchange = 5.0 + 3.0 * wind
     change = (exchange - exchange.mean()) / exchange.mean()
     above = torch.where(obs.tracks.weights > 0, obs.tracks.values - air, torch.nan)

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside
 from heatsplat.effects.joint.image_grid import STILL, grid_columns
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import worthwhile
 from heatsplat.effects.joint.terms import OWN_HURDLE, Shared, centred, where_moving
-from heatsplat.effects.look import Look
 from heatsplat.effects.physical import relaxation, vignetting
 
 NODES, NODES_FEW = 7, 5  # along the sides of the grids on which a pattern is looked for
@@ -22,12 +22,12 @@ MANY = 10_000  # observations from which the finer grid pays
 WELL_SEEN = 2.5  # observations of a point for each of its own numbers before a driven scene is taken for granted
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether places in the image have an offset or gain of their own. Where the image fades towards its corners, the radial
     part is left to vignetting."""
-    if look.joint is None:
-        return Evidence(None, look.obs.why)
-    fit, model = look.joint
+    if inspected.joint is None:
+        return Evidence(None, inspected.obs.why)
+    fit, model = inspected.joint
     if not fit.data.moves:
         return Evidence(None, STILL)
     none = model.minus({"fixed_pattern", "vignetting"})

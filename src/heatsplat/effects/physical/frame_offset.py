@@ -8,23 +8,23 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
-from heatsplat.effects.look import Look
 
 IN_COMMON = 0.15  # share of what half of the points leave that the other half has to explain
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether each image has an offset that all its points share. Where gains change, their shift takes it."""
-    both = look.joint is not None and {"agc", "frame_offset"} <= look.joint[1].names
-    if both and not outdone(look, "agc", {"frame_offset", "tone"}):
+    both = inspected.joint is not None and {"agc", "frame_offset"} <= inspected.joint[1].names
+    if both and not outdone(inspected, "agc", {"frame_offset", "tone"}):
         return Evidence(0.0, "gains change from image to image, and their shift takes what offsets there are")
-    return gained(look, "frame_offset", "images differ from each other by an offset of")
+    return gained(inspected, "frame_offset", "images differ from each other by an offset of")
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

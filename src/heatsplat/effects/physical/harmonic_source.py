@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import RIDGE, own_part, own_weights
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own
-from heatsplat.effects.look import Look
 from heatsplat.effects.physical import relaxation
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
@@ -26,12 +26,12 @@ SWEEPS = 4  # of alternating least squares for them
 HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether something drives the scene, and how many harmonics say how."""
-    beside = "any relaxation" if look.scene.weather is None else "what the weather does"
-    found = gained(look, "harmonic_source", f"points depart from {beside} by")
-    count = selected_kind(look, "harmonic_source")
-    return found if count is None else replace(found, settings={"frequencies": harmonics(look, count)})
+    beside = "any relaxation" if inspected.scene.weather is None else "what the weather does"
+    found = gained(inspected, "harmonic_source", f"points depart from {beside} by")
+    count = selected_kind(inspected, "harmonic_source")
+    return found if count is None else replace(found, settings={"frequencies": harmonics(inspected, count)})
 
 
 def kinds(fit: Fit) -> Sequence[int]:
@@ -72,17 +72,17 @@ def courses(fit: Fit, count: int) -> Tensor:
     return found
 
 
-def harmonics(look: Look, count: int) -> int:
+def harmonics(inspected: Inspection, count: int) -> int:
     """K for which the criterion is least when the courses that points share are written as K harmonics and a decay.
 
     The grid of frequencies is that of the thermal model, whose response to a harmonic after its start is that harmonic
     and a decay.
     """
-    fit, _ = look.joint
-    recorded = torch.tensor([t for t in look.scene.train.times_s if t is not None], dtype=torch.float64)
+    fit, _ = inspected.joint
+    recorded = torch.tensor([t for t in inspected.scene.train.times_s if t is not None], dtype=torch.float64)
     shared = fit.basis("harmonic_source", count)
     frames = len(shared)
-    passed = look.obs.times_s - look.obs.times_s.min()
+    passed = inspected.obs.times_s - inspected.obs.times_s.min()
     decays = torch.exp(
         -passed[:, None] / float(passed.max()) * torch.tensor(relaxation.DECAYS_FEW, dtype=torch.float64)
     )

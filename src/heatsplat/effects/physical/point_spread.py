@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
-from heatsplat.effects.look import Look
+from heatsplat.effects.inspection import Inspection
 
 REACH = 4  # pixels on either side of an edge within which it has to be over
 SHARPEST = 0.1  # of the strong edges, the share that is judged: others are gradients of the scene and not its edges
@@ -18,9 +18,9 @@ MIN_EDGES = 30
 PIXEL_PX, WIDE_PX = 0.45, 0.75
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether edges are wider than pixels. A step's steepest pixel takes a share of it that tells its width."""
-    obs = look.obs
+    obs = inspected.obs
     if obs.images.numel() == 0 or min(obs.images.shape[1:]) < 2 * REACH + 2:
         return Evidence(None, obs.why or "the images are too small to have edges")
     widths = []

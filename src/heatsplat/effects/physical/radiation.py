@@ -7,18 +7,18 @@ from torch import Tensor
 
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
-from heatsplat.effects.look import Look
+from heatsplat.effects.inspection import Inspection
 
 BENT = 1.0  # statistic above which T⁴ shows as what it is: the bend is three times the noise
 MEAN_K = 290.0
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether T⁴ departs from a straight line over the span of temperatures by more than the noise.
 
     For a surface at T about a mean M: the excess over the line is (T - M)² · 3 / (2 M) to second order, in kelvin.
     """
-    obs = look.obs
+    obs = inspected.obs
     if obs.tracks is None:
         return Evidence(None, obs.why)
     kept = torch.where(obs.tracks.weights > 0, obs.tracks.values, torch.nan)

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
-from heatsplat.effects.look import Look
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether one map of the surroundings, mirrored in the surfaces, explains a part of the images."""
-    return gained(look, "reflection", "mirrored surroundings add")
+    return gained(inspected, "reflection", "mirrored surroundings add")
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own
-from heatsplat.effects.look import Look
 
 # Mixtures of these decays, as rates times the record's length, stand for any course that relaxes: the surface of a deep
 # body does not follow one exponential. Within 0.5 % of the excess for slabs of Biot number 0 to 3.
@@ -23,9 +23,9 @@ DECAYS_FEW = (0.7, 3.0, 12.0)
 BESIDE_DRIFT = 0.25  # share of a common offset that other changes must exceed before a still camera
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether points tend to another temperature as time goes by."""
-    return gained(look, "relaxation", "points change over time by")
+    return gained(inspected, "relaxation", "points change over time by")
 
 
 def rates(data: Data) -> tuple[float, ...]:

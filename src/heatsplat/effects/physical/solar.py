@@ -7,19 +7,21 @@ from torch import Tensor
 
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.fit import FLOOR, Fit
 from heatsplat.effects.joint.least_squares import own_part
-from heatsplat.effects.look import Look
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether what points do follows the sunlight of the record, over and above the air."""
-    weather = look.scene.weather
+    weather = inspected.scene.weather
     if weather.irradiance_w_m2 is None or float(weather.irradiance_w_m2.max()) <= 0:
         return Evidence(None, "the record has no irradiance, or the sun does not shine in it")
-    if look.joint is None:
-        return Evidence(None, look.obs.why)
-    gain = explained(look.joint[0], weather_record.drivers(look.obs), weather_record.of_the_air(look.obs))
+    if inspected.joint is None:
+        return Evidence(None, inspected.obs.why)
+    gain = explained(
+        inspected.joint[0], weather_record.drivers(inspected.obs), weather_record.of_the_air(inspected.obs)
+    )
     return Evidence(gain, f"sunlight explains {gain:.1f} times what its numbers for each point cost, beside the air")
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.evidence import selected_kind
-from heatsplat.effects.look import Look
 from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between
 from heatsplat.geometry.projection import to_camera, to_pixels
 
@@ -21,20 +21,20 @@ STRAY = 0.05  # share of votes that differ at the edges of opaque things
 MIN_VOTES = 12
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether visible images show points that thermal images do not, or the other way round.
 
     Where a farther point lies behind a nearer one, one of the two keeps its value from view to view and the other shows
     whatever comes before it. Behind matter that is opaque to both, both modalities keep the nearer one.
     """
-    obs = look.obs
+    obs = inspected.obs
     if obs.tracks is None or obs.still:
         return Evidence(None, obs.why or "a camera that stands still sees no parallax")
-    votes = _votes(look.scene)
+    votes = _votes(inspected.scene)
     if votes is None:
         return Evidence(None, "not every training view has a visible image of the thermal image's size")
     thermal, visible = votes
-    if selected_kind(look, "relaxation"):
+    if selected_kind(inspected, "relaxation"):
         # What is lit or cools changes by itself, so that a thermal image that varies says nothing of what it shows.
         thermal = thermal.clamp_min(0)
     sure = (thermal != 0) & (visible != 0)

@@ -8,20 +8,20 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
-from heatsplat.effects.look import Look
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether what moves a whole image moves its dark and bright parts by amounts that a bent curve explains.
 
     A curve that never changes over a scene that never changes only renames its levels: nothing shows it, and nothing is
     lost without it. It shows where an offset moves all levels along it.
     """
-    return gained(look, "tone", "offsets act on dark and bright parts differently by")
+    return gained(inspected, "tone", "offsets act on dark and bright parts differently by")
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

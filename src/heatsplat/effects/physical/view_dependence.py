@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, where_moving
-from heatsplat.effects.look import Look
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether points look different from different sides.
 
     Beside mirrors it only makes up for their normals, which are known roughly.
     """
-    if outdone(look, "view_dependence", {"reflection"}):
+    if outdone(inspected, "view_dependence", {"reflection"}):
         return Evidence(0.0, "what depends on direction is mirrors, as far as their normals are known")
-    return gained(look, "view_dependence", "points change with the direction of view by")
+    return gained(inspected, "view_dependence", "points change with the direction of view by")
 
 
 EFFECT = Effect(

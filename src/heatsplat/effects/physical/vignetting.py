@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside
 from heatsplat.effects.joint.fit import Fit
@@ -17,18 +18,17 @@ from heatsplat.effects.joint.least_squares import scaled
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import worthwhile
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, where_moving
-from heatsplat.effects.look import Look
 
 MIN_FALLOFF = -0.04  # in the corners; blur at the border of an image passes for half of that
 FINE_NODES = 9  # where the pattern is a random field, which more nodes than it needs do no harm
 STRENGTHS = 12  # iterations for the strength of that field
 
 
-def evidence(look: Look) -> Evidence:
+def evidence(inspected: Inspection) -> Evidence:
     """Whether the image fades towards its corners."""
-    if look.joint is None:
-        return Evidence(None, look.obs.why)
-    fit, model = look.joint
+    if inspected.joint is None:
+        return Evidence(None, inspected.obs.why)
+    fit, model = inspected.joint
     if not fit.data.moves:
         return Evidence(None, STILL)
     none = model.minus({"fixed_pattern", "vignetting"})

@@ -7,8 +7,8 @@ from heatsplat.studies.published.figures import Figure as Figure
 from heatsplat.studies.published.figures import figures as figures
 from heatsplat.studies.published.figures import quoted as quoted
 from heatsplat.studies.published.figures import tables as tables
-from heatsplat.studies.published.plans import Plan as Plan
-from heatsplat.studies.published.plans import Run as Run
-from heatsplat.studies.published.plans import make_plan as make_plan
+from heatsplat.studies.published.reproduction import Reproduction as Reproduction
+from heatsplat.studies.published.reproduction import Run as Run
+from heatsplat.studies.published.reproduction import reproduction_of as reproduction_of
 from heatsplat.studies.published.sources import Source as Source
 from heatsplat.studies.published.sources import source as source

@@ -12,7 +12,7 @@ from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.studies.finished import Runs
 from heatsplat.studies.published.figures import METRICS, Figure
-from heatsplat.studies.published.plans import Plan, row_name
+from heatsplat.studies.published.reproduction import Reproduction, row_name
 from heatsplat.studies.sweeps import COSTS, collect
 
 COMPARISON_FILE, COMPARISON_CSV = "comparison.md", "comparison.csv"
@@ -63,25 +63,25 @@ class Line:
         return f"{name} ({len(self.have)} of {len(self.members)})" if partial else name
 
 
-def write_comparison(folder: Path, plan: Plan) -> list[Path]:
+def write_comparison(folder: Path, reproduction: Reproduction) -> list[Path]:
     """Writes comparison.md and comparison.csv into the folder of a sweep, and returns their paths."""
     found = collect(folder)
-    lines = compare_all(plan, found)
+    lines = compare_all(reproduction, found)
     failed = [f"{row.label} on {row.scene}: {reason}" for row in found for reason in row.failed]
     results = [one for row in found for one in row.table["results"].dropna()]
-    write_atomically(folder / COMPARISON_FILE, markdown(plan, lines, _reasons(results, plan), failed))
+    write_atomically(folder / COMPARISON_FILE, markdown(reproduction, lines, _reasons(results, reproduction), failed))
     write_csv(folder / COMPARISON_CSV, _records(lines))
     return [folder / COMPARISON_FILE, folder / COMPARISON_CSV]
 
 
-def compare_all(plan: Plan, found: Sequence[Runs]) -> list[Line]:
+def compare_all(reproduction: Reproduction, found: Sequence[Runs]) -> list[Line]:
     """The lines of the comparison; a row that ran with several settings (``Runs.other``) has a line for each of them."""
-    key_of = {run.folder: run.scene for run in plan.runs}
+    key_of = {run.folder: run.scene for run in reproduction.runs}
     known = [row for row in found if row.scene in key_of]
     lines = [
         replace(line, other=other)
         for other in dict.fromkeys(row.other for row in known) or [""]
-        for line in compare(plan, {(row.name, key_of[row.scene]): row for row in known if row.other == other})
+        for line in compare(reproduction, {(row.name, key_of[row.scene]): row for row in known if row.other == other})
     ]
     alike: dict[tuple[str, str, str, tuple[str, ...]], list[Line]] = {}
     for line in lines:
@@ -90,22 +90,22 @@ def compare_all(plan: Plan, found: Sequence[Runs]) -> list[Line]:
     return [line for same in shown for line in same]
 
 
-def compare(plan: Plan, results: Mapping[tuple[str, str], Runs]) -> list[Line]:
+def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs]) -> list[Line]:
     """The lines of the comparison, scene by scene in the order of the table.
 
     Args:
-        plan: the table.
+        reproduction: the table.
         results: (name of the row, scene) -> its runs.
     """
     printed: dict[tuple[str, str, str], dict[str, Figure]] = {}
-    for figure in plan.figures:
+    for figure in reproduction.figures:
         printed.setdefault((figure.scene, figure.method, figure.setting), {})[figure.metric] = figure
-    scenes = list(dict.fromkeys(figure.scene for figure in plan.figures))
-    rows = plan.rows or tuple(dict.fromkeys((figure.method, figure.setting) for figure in plan.figures))
+    scenes = list(dict.fromkeys(figure.scene for figure in reproduction.figures))
+    rows = reproduction.rows or tuple(dict.fromkeys((figure.method, figure.setting) for figure in reproduction.figures))
     of_paper = {(method, setting) for _, method, setting in printed}
     lines, incomplete = [], []
     for scene in scenes:
-        members = plan.members(scene)
+        members = reproduction.members(scene)
         single = [member for member in members if member in scenes]
         for method, setting in rows:
             figures = printed.get((scene, method, setting), {})
@@ -117,13 +117,13 @@ def compare(plan: Plan, results: Mapping[tuple[str, str], Runs]) -> list[Line]:
             if len(members) > 1 and len(have) < len(members) and single:
                 incomplete.append((line, have))  # the printed mean is of other scenes; see below
             else:
-                _fill(plan, line, have, results)
+                _fill(reproduction, line, have, results)
             lines.append(line)
     for line, have in incomplete:
         if not have:
             continue
         part = Line(THAT_RAN, line.method, line.setting, line.members)
-        _fill(plan, part, have, results)
+        _fill(reproduction, part, have, results)
         per_scene = [printed.get((scene, line.method, line.setting), {}) for scene in have]
         for metric in line.printed:
             values = [figures[metric].value for figures in per_scene if metric in figures]
@@ -138,12 +138,14 @@ def _of(results: Mapping[tuple[str, str], Runs], method: str, setting: str, scen
     return row if row and row.count else None
 
 
-def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[str, str], Runs]) -> None:
+def _fill(
+    reproduction: Reproduction, line: Line, have: tuple[str, ...], results: Mapping[tuple[str, str], Runs]
+) -> None:
     """Puts ours into a line: the mean over scenes of the means over seeds."""
     runs = [row for scene in have if (row := _of(results, line.method, line.setting, scene))]
     line.have, line.seeds = have, min((row.count for row in runs), default=0)
-    for metric in dict.fromkeys(figure.metric for figure in plan.figures):
-        ours = plan.ours(metric)
+    for metric in dict.fromkeys(figure.metric for figure in reproduction.figures):
+        ours = reproduction.ours(metric)
         values = [row.mean(ours) for row in runs] if ours else []
         if values and None not in values:
             line.ours[metric] = statistics.fmean(METRICS[metric].convert(value) for value in values)
@@ -155,11 +157,11 @@ def _fill(plan: Plan, line: Line, have: tuple[str, ...], results: Mapping[tuple[
             line.cost[name] = statistics.fmean(values)
 
 
-def _reasons(runs: Sequence[RunResults], plan: Plan) -> list[str]:
+def _reasons(runs: Sequence[RunResults], reproduction: Reproduction) -> list[str]:
     """Why printed metrics have no value of ours, a line each."""
     lines = []
-    for metric in dict.fromkeys(figure.metric for figure in plan.figures):
-        ours, known = plan.ours(metric), METRICS[metric]
+    for metric in dict.fromkeys(figure.metric for figure in reproduction.figures):
+        ours, known = reproduction.ours(metric), METRICS[metric]
         if ours is None:
             lines.append(f"{known.title}: {known.why_not}")
         elif runs and not any((run.test | run.cost).get(ours) is not None for run in runs):
@@ -169,12 +171,14 @@ def _reasons(runs: Sequence[RunResults], plan: Plan) -> list[str]:
     return lines
 
 
-def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), failed: Sequence[str] = ()) -> str:
+def markdown(
+    reproduction: Reproduction, lines: Sequence[Line], reasons: Sequence[str] = (), failed: Sequence[str] = ()
+) -> str:
     """The comparison for people. A cell reads ours / paper's (ours less paper's)."""
-    metrics = list(dict.fromkeys(figure.metric for figure in plan.figures))
-    costs = [name for name in BESIDE if name not in {plan.ours(metric) for metric in metrics}]
+    metrics = list(dict.fromkeys(figure.metric for figure in reproduction.figures))
+    costs = [name for name in BESIDE if name not in {reproduction.ours(metric) for metric in metrics}]
     costs = [name for name in costs if any(name in line.cost for line in lines)]
-    several = any(setting for _, setting in plan.rows)
+    several = any(setting for _, setting in reproduction.rows)
     head = ["scene", "method", *(["setting"] if several else []), *(METRICS[metric].title for metric in metrics)]
     head += [f"ours: {COSTS[name][0]}" for name in costs]
     rows = []
@@ -184,23 +188,23 @@ def markdown(plan: Plan, lines: Sequence[Line], reasons: Sequence[str] = (), fai
         cells += [_cell(line, metric) for metric in metrics]
         rows.append(cells + [number(line.cost.get(name), COSTS[name][1]) for name in costs])
     text = [
-        f"# {plan.title}: ours beside the paper's",
+        f"# {reproduction.title}: ours beside the paper's",
         "",
         "A cell reads: ours / printed (ours less printed). – is none. Ours is a mean over seeds (± standard deviation where "
         "there are several), then over scenes. Seconds, memory and frames/s are of other machines than the paper's.",
         "",
         *markdown_table(head, rows),
     ]
-    wanted = {metric: plan.metrics[metric] for metric in metrics if metric in plan.metrics}
+    wanted = {metric: reproduction.metrics[metric] for metric in metrics if metric in reproduction.metrics}
     notes = [f"{METRICS[metric].title} of ours is `{name}` (docs/conventions.md)." for metric, name in wanted.items()]
-    if plan.source and plan.source.unsure:
-        notes.append(plan.source.unsure)
-    shown = dict.fromkeys(figure.note for figure in plan.figures if figure.note)
+    if reproduction.source and reproduction.source.unsure:
+        notes.append(reproduction.source.unsure)
+    shown = dict.fromkeys(figure.note for figure in reproduction.figures if figure.note)
     for title, items in (
-        ("Without ours", [*plan.left_out(), *reasons]),
-        ("Not on disk", [", ".join(plan.missing)] if plan.missing else []),
+        ("Without ours", [*reproduction.left_out(), *reasons]),
+        ("Not on disk", [", ".join(reproduction.missing)] if reproduction.missing else []),
         ("Jobs without a result", failed),
-        ("Notes", [*notes, *plan.notes]),
+        ("Notes", [*notes, *reproduction.notes]),
         ("How cells were read", list(shown)),
     ):
         if items:

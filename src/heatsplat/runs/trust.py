@@ -24,8 +24,8 @@ def vocabulary() -> set[str]:
     return own | {entry.value.replace(":", ".") for entry in entry_points(group=ENTRY_POINTS)}
 
 
-def known(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[str, Any]:
-    """The configuration in a checkpoint without what nothing is built of, once nothing in it can run code but known parts.
+def trusted(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[str, Any]:
+    """The configuration of a checkpoint without what nothing is built of, once nothing in it can run code but known parts.
 
     A part is known if heatsplat's configurations name it, an installed package registers it under the entry points
     "heatsplat.parts", or it is in ``trust``. Functions are only taken as they are (``_partial_``), never called.

@@ -1,4 +1,4 @@
-"""A look at a scene: what its training views show, and what all effects together make of it, each worked out once."""
+"""An inspection of a scene: what its training views show, and what all effects together make of it, each worked out once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from heatsplat.effects.observations import Observations, observe
 from heatsplat.effects.surface import normals
 
 
-class Look:
+class Inspection:
     """A scene, for the evidence of effects.
 
     Args:

@@ -9,7 +9,7 @@ from running import TINY
 
 from heatsplat import composition
 from heatsplat.contracts import SceneError
-from heatsplat.runs import run, vocabulary
+from heatsplat.runs import run, trust
 from heatsplat.runs.resume import resumed
 from heatsplat.training.checkpoints import load_checkpoint
 
@@ -75,23 +75,23 @@ def test_what_an_earlier_run_measured_brings_no_code(tmp_path, here):
 @pytest.mark.parametrize("method", ALL_METHODS)
 def test_every_method_may_be_built_from_its_checkpoint(method):
     config = composition.compose(["data.size=tiny", f"method={method}"])
-    known = vocabulary.known(config, "own.ckpt")
+    known = trust.trusted(config, "own.ckpt")
     assert known["module"] == config["module"] and "callbacks" not in known
 
 
 def test_classes_of_registered_packages_and_those_that_the_user_names_may_be_built(composed, tmp_path, monkeypatch):
     own = composed | {"thermal": {"_target_": "my_package.heat.Mine"}}
     with pytest.raises(SceneError, match=r"trust=\[my_package\.heat\.Mine\]"):
-        vocabulary.known(own, "own.ckpt")
-    assert vocabulary.known(own, "own.ckpt", ["my_package.heat.Mine"])
+        trust.trusted(own, "own.ckpt")
+    assert trust.trusted(own, "own.ckpt", ["my_package.heat.Mine"])
 
     class Entry:
         value = "my_package.heat:Mine"
 
-    monkeypatch.setattr(vocabulary, "entry_points", lambda group: [Entry] if group == "heatsplat.parts" else [])
-    assert vocabulary.known(own, "own.ckpt")
+    monkeypatch.setattr(trust, "entry_points", lambda group: [Entry] if group == "heatsplat.parts" else [])
+    assert trust.trusted(own, "own.ckpt")
     with pytest.raises(SceneError, match=r"my_package\.heat\.os\.system"):
-        vocabulary.known(own | {"data": {"_target_": "my_package.heat.os.system"}}, "own.ckpt")
+        trust.trusted(own | {"data": {"_target_": "my_package.heat.os.system"}}, "own.ckpt")
 
 
 def test_a_refusal_to_load_gives_no_dangerous_advice(tmp_path):

@@ -64,7 +64,7 @@ class OnOthers(Run):
 
 
 @dataclass(frozen=True)
-class Plan:
+class Reproduction:
     """A table and the runs that fill it.
 
     Args:
@@ -109,7 +109,7 @@ class Plan:
         """The scenes of which a printed figure is."""
         return self.source.members(scene or self.unnamed) if self.source else ()
 
-    def told(self, lpips_net: str | None = "alex", lpips_weights: str | None = None) -> str:
+    def summary(self, lpips_net: str | None = "alex", lpips_weights: str | None = None) -> str:
         """What runs, what has the paper's figures only and why, what is missing and where it is got: one message.
 
         Args:
@@ -170,14 +170,14 @@ class Plan:
         return "\n".join([*lines, *([source.unsure] if source.unsure else [])])
 
 
-def make_plan(
+def reproduction_of(
     config: Mapping[str, Any],
     root: str | None,
     methods: Collection[str],
     ablation: Mapping[str, Mapping[str, Any]] | None = None,
     given: Collection[str] = (),
-) -> Plan:
-    """The plan of a table.
+) -> Reproduction:
+    """A published table and the runs that fill it.
 
     Args:
         config: the section ``table`` of an experiment (conf/experiment/shared/table.yaml has its keys).
@@ -254,7 +254,7 @@ def make_plan(
                 joined = (*recipe, *others, f"data.scenes=[{scenes}]")
                 after = OnOthers(method, setting, scene, "+".join(folders), joined)
             runs.append(Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"), after))
-    return Plan(
+    return Reproduction(
         paper,
         table,
         data,
