@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, View
@@ -50,6 +51,22 @@ class LossInputs:
                 f"a loss term asks for {modality} images, which the model does not explain (it has: {there})"
             )
         return self.companions[modality]
+
+    def unmasked(self) -> tuple[Tensor, Tensor]:
+        """Prediction and target with 0 where the mask is False, through which no gradient goes.
+
+        Raises:
+            ValueError: they differ in shape.
+        """
+        if self.prediction.shape != self.target.shape:
+            raise ValueError(
+                f"prediction and target must have one shape, got {list(self.prediction.shape)} and "
+                f"{list(self.target.shape)}"
+            )
+        if self.mask is None:
+            return self.prediction, self.target
+        inside = self.mask[..., None]
+        return torch.where(inside, self.prediction, 0.0), torch.where(inside, self.target, 0.0)
 
 
 class LossTerm(Protocol):

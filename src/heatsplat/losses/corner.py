@@ -69,13 +69,7 @@ class Corner:
         self.published, self.floor = weight == "published", floor
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        prediction, target, mask = inputs.prediction, inputs.target, inputs.mask
-        if prediction.shape != target.shape:
-            raise ValueError(
-                f"prediction and target must have one shape, got {list(prediction.shape)} and {list(target.shape)}"
-            )
-        if mask is not None:
-            prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))
+        (prediction, target), mask = inputs.unmasked(), inputs.mask
         with torch.no_grad():
             weight = self._published(prediction, mask) if self.published else self._corners(target, mask)
         error = weight * (target - prediction).abs()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -40,26 +42,29 @@ def whole_windows(mask: Tensor) -> Tensor:
     return masked < 0.5
 
 
-class Edge:
-    """The mean over pixels of (|∇target| - |∇prediction|)², with Sobel magnitudes (TI-3DGS, Eq. 15).
+def mean_of_differences(inputs: LossInputs, size: Callable[[Tensor], Tensor]) -> Tensor:
+    """The mean over pixels of ``size`` of |∇target| - |∇prediction|, Sobel magnitudes; ``size`` of 0 is 0.
 
     Pixels whose Sobel window touches a masked one are left out, and masked pixels receive no gradient. Without a pixel
-    that counts the loss is 0.
+    that counts it is 0.
+
+    Raises:
+        ValueError: prediction and target differ in shape.
     """
+    prediction, target = inputs.unmasked()
+    difference = sobel_magnitude(target) - sobel_magnitude(prediction)
+    if inputs.mask is None:
+        return size(difference).mean()
+    counted = whole_windows(inputs.mask)[..., None]
+    error = size(torch.where(counted, difference, 0.0))
+    return error.sum() / (counted.sum() * error.shape[2]).clamp(min=1)
+
+
+class Edge:
+    """The mean over pixels of (|∇target| - |∇prediction|)² (TI-3DGS, Eq. 15); see ``mean_of_differences``."""
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        prediction, target = inputs.prediction, inputs.target
-        if prediction.shape != target.shape:
-            raise ValueError(
-                f"prediction and target must have one shape, got {list(prediction.shape)} and {list(target.shape)}"
-            )
-        if inputs.mask is None:
-            return (sobel_magnitude(target) - sobel_magnitude(prediction)).square().mean()
-        inside = inputs.mask[..., None]
-        prediction, target = (torch.where(inside, image, 0.0) for image in (prediction, target))
-        counted = whole_windows(inputs.mask)[..., None]
-        error = torch.where(counted, sobel_magnitude(target) - sobel_magnitude(prediction), 0.0).square()
-        return error.sum() / (counted.sum() * error.shape[2]).clamp(min=1)
+        return mean_of_differences(inputs, torch.square)
 
 
 class EdgeEnhanced:
