@@ -26,7 +26,6 @@ ELSEWHERE = {
     "datamodules/test_synthetic_round_trip": "datamodules/synthetic_scene/writers",
     "datamodules/test_synthetic_shapes": "datamodules/synthetic_scene/shapes",
     "datamodules/test_thermo": "datamodules/surroundings",
-    "datamodules/test_thermoscenes": "datamodules/formats/nerfstudio",
     "datamodules/test_weather": "datamodules/sun",
     "density/test_adaptive": "density/base density/fixed",
     "effects/test_catalogue": (
@@ -63,13 +62,13 @@ ELSEWHERE = {
     "runs/test_budget": "callbacks/budget runs/curves runs/stepping",
     "runs/test_pipeline": "runs/checks runs/folder runs/resume runs/run",
     "sensors/test_supirgs_sensor": "sensors/agc sensors/base sensors/calibration sensors/tone",
-    "studies/test_frontier": "io/tables",
+    "studies/test_frontier": "io/tables studies/frontier_report studies/frontier_runs",
     "studies/test_reproduction": "studies/published/comparison studies/published/sources",
     "studies/test_sweeps": "studies/finished studies/recorded",
     "thermal/test_composed": (
         "thermal/attenuation thermal/conduction thermal/part thermal/reflection thermal/view_dependence"
     ),
-    "thermal/test_energy_network": "thermal/land_cover thermal/residual_network thermal/weather_drive",
+    "thermal/test_energy_network": "thermal/ellipsoid_balance thermal/land_cover thermal/residual_network thermal/weather_drive",
     "thermal/test_imaging_field": "thermal/coordinates",
     "thermal/test_radiative": "physics/grey_body",
     "thermal/test_static": "thermal/base thermal/clipping thermal/harmonics",
@@ -79,7 +78,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 128  # modules; lower it when some go
+LONGEST = 130  # modules; lower it when some go
 
 
 def modules() -> list[str]:
