@@ -57,8 +57,9 @@ bench: $(READY)  ## time the renderer against its peers and its floor
 stability: $(READY)  ## measure the hard cases of arithmetic and write docs/stability.md
 	@$(RUN) src/study.py study=stability $(ARGS)
 
-fuzz: $(READY)  ## read damaged scenes for an hour (ARGS=60 for a minute) and count what became of them
+fuzz: $(READY)  ## read damaged scenes and files for two hours (ARGS=60 for two minutes) and count what became of them
 	@OMP_NUM_THREADS=1 $(RUN) tests/fuzz/readers.py $(or $(ARGS),3600)
+	@OMP_NUM_THREADS=1 $(RUN) tests/fuzz/files.py $(or $(ARGS),3600)
 
 tensorboard: $(READY)  ## look at all runs in TensorBoard
 	@$(VENV)/bin/tensorboard --logdir outputs

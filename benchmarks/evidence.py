@@ -105,15 +105,15 @@ def run(
     Args:
         output_dir: folder of the results.
         data: makes the data module of a scene from ``scene``, ``size`` and ``scene_seed``; its notes name the "effects".
-        scenes, sizes: every pair of them is judged.
+        scenes, sizes: verdicts are asked for every pair of them.
         seeds: of the recordings of each.
         unseen: of further ones, which no threshold was set on; they are counted apart.
         document: file that is written besides; None for none.
-        jobs: recordings that are judged side by side, with one thread each; None: one for each core.
+        jobs: recordings that are worked on side by side, with one thread each; None: one for each core.
     """
     cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
     outcomes = []
-    for outcome in _judged(data, cases, cores() if jobs is None else jobs):
+    for outcome in _outcomes(data, cases, cores() if jobs is None else jobs):
         outcomes.append(outcome)
         log.info("%d of %d: %s %s %d", len(outcomes), len(cases), outcome.scene, outcome.size, outcome.seed)
         for name in sorted(outcome.found ^ outcome.present):
@@ -127,18 +127,18 @@ def run(
     return text
 
 
-def _judged(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], jobs: int) -> Iterator[Outcome]:
+def _outcomes(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], jobs: int) -> Iterator[Outcome]:
     """The outcomes of cases (scene, size, seed), in their order."""
     if jobs == 1:
         torch.set_num_threads(1)  # small tensors
-        yield from (judged(data, *case) for case in cases)
+        yield from (outcome_of(data, *case) for case in cases)
         return
     context = multiprocessing.get_context("spawn")  # a fork would share OpenMP's threads
     with ProcessPoolExecutor(jobs, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        yield from pool.map(partial(judged, data), *zip(*cases, strict=True))
+        yield from pool.map(partial(outcome_of, data), *zip(*cases, strict=True))
 
 
-def judged(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcome:
+def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcome:
     """The verdicts on one recording of a scene.
 
     Raises:

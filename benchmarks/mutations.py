@@ -200,7 +200,7 @@ MUTATIONS = (
     Mutation(
         "NaN in a checkpoint", "callbacks.finite",
         "        demand_finite(_parameters(module), trainer.global_step)\n        for optimizer", "        for optimizer",
-        "tests/callbacks/test_finite_guard.py -k checkpoint",
+        "tests/callbacks/test_finite.py -k checkpoint",
     ),
     *(Mutation(**fault) for fault in yaml.safe_load(FAULTS.read_text(encoding="utf-8"))),
 )  # fmt: skip

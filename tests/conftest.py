@@ -1,5 +1,6 @@
 """Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
+import logging
 import os
 
 import pytest
@@ -21,6 +22,21 @@ RUNS = {
     "training",
 }  # folders with tests that train
 FILMED = {}  # settings of a recording -> the scene, which nobody changes
+
+
+@pytest.fixture(autouse=True)
+def logging_as_it_was():
+    """A command that runs in the test process sets logging up for itself; the next test starts from what was there."""
+    root, found = logging.getLogger(), logging.root.manager.loggerDict
+    level, muted, names = root.level, root.manager.disable, set(found)
+    before = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
+    yield
+    root.setLevel(level)
+    logging.disable(muted)
+    for name, one in found.items():
+        if hasattr(one, "level") and (name in before or name not in names):
+            one.level, one.disabled, one.propagate = before.get(name, (logging.NOTSET, False, True))
+    root.manager._clear_cache()
 
 
 @pytest.fixture(scope="module", autouse=True)

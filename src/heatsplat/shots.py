@@ -136,7 +136,7 @@ def warn_beyond_record(scene: SceneData, frames: Sequence[Frame], assumption: st
     if beyond:
         times = scene.train.times_s
         log.warning(
-            "%d of %d frames (%s s) lie beyond the training record (%.6g to %.6g s): they are predictions, not measurements. "
+            "%d of %d frames, at %s s, beyond the training record (%.6g to %.6g s): predictions, not measurements. "
             "The model's assumption there: %s", len(beyond), len(frames),
             " to ".join(f"{moment:.6g}" for moment in sorted({beyond[0], beyond[-1]})), min(times), max(times), assumption,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 
-from benchmarks.evidence import judged, run, written
+from benchmarks.evidence import outcome_of, run, written
 from heatsplat.contracts import SceneError
 from heatsplat.effects.catalogue import CATALOGUE
 
@@ -16,7 +16,7 @@ SCENES = ("static", "cooling", "drifting")
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return [judged(Synthetic, scene, "tiny", seed) for scene in SCENES for seed in range(2)]
+    return [outcome_of(Synthetic, scene, "tiny", seed) for scene in SCENES for seed in range(2)]
 
 
 def test_verdicts_are_right_where_truth_is_known(outcomes):
@@ -38,7 +38,7 @@ def test_a_drift_of_the_sensor_is_not_taken_for_heat(outcomes):
             assert not {"relaxation", "harmonic_source"} & outcome.found
 
 
-def test_the_page_counts_what_was_judged(outcomes):
+def test_the_page_counts_what_was_decided(outcomes):
     text = written(outcomes)
     for effect in CATALOGUE:
         assert f"| {effect.name} | {effect.stage} |" in text

@@ -56,6 +56,19 @@ def test_images_without_region_of_interest_are_not_averaged_in(tmp_path):
     assert "mean of the 3 of 4 test images" in results.definitions["mae_roi_c"]
 
 
+def test_black_images_are_counted_and_said(tmp_path, caplog):
+    scene = wall()
+
+    def decode(i):
+        view = scene.test[i]
+        return replace(view, thermal=torch.zeros_like(view.thermal)) if i else view
+
+    results = scored(replace(scene, test=ViewSet(scene.test.frames, decode)), tmp_path)
+    assert results.data["test_images_of_one_value"] == 3
+    assert "3 of 4 test images have one value everywhere" in caplog.text
+    assert "test_images_of_one_value" not in scored(scene, tmp_path).data
+
+
 def test_identical_images_give_infinite_psnr_and_null_in_the_file(tmp_path):
     scene = wall()
     module = FakeModule(scene, tmp_path)

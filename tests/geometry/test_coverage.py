@@ -50,6 +50,17 @@ def test_pixels_without_a_surface_are_directions():
     assert not covered(camera(5.0), open_sky, [Sighting(camera(0.0), wall())]).any()
 
 
+def test_a_hole_in_a_surface_is_no_sky():
+    hole = wall()
+    hole[12, 16] = torch.inf
+    open_sky = torch.full((24, 32), torch.inf, dtype=torch.float64)
+    assert not covered(camera(0.0), open_sky, [Sighting(camera(0.0), hole)]).any()
+    half = wall()
+    half[:12] = torch.inf  # above the horizon
+    seen = covered(camera(0.0), open_sky, [Sighting(camera(0.0), half)])
+    assert seen[:11].all() and not seen[11:].any()
+
+
 def test_masked_pixels_of_training_images_cover_nothing():
     mask = torch.ones(24, 32, dtype=torch.bool)
     mask[:, :16] = False

@@ -1,6 +1,7 @@
 """Who may import whom (docs/architecture.md), read from the source with ast."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,12 @@ def test_third_party_packages_come_in_by_their_door(path):
 def test_kernels_know_numpy_and_numba_only():
     for path in (PACKAGE / "kernels").rglob("*.py"):
         assert "torch" not in {name.split(".")[0] for name in imports_of(path)}, path
+
+
+def test_the_table_of_the_page_says_what_is_allowed():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)(?:/|\.py)` \|.*\| ([^|]*) \|$", page, re.M)
+    assert {name: set(re.findall(r"`(\w+)`", imports)) for name, imports in rows} == ALLOWED
 
 
 def test_the_check_itself_sees_a_forbidden_import(tmp_path):

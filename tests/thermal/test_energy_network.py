@@ -109,6 +109,15 @@ def test_temperature_follows_the_time_of_the_question(time):
     assert ((again - morning).abs().max() < 1e-4) == (time != "record")
 
 
+def test_beyond_the_record_the_clock_stays_and_the_weather_goes_on():
+    model, _ = make()
+    last, later = 9 * HOUR_S, 15 * HOUR_S
+    weather, clock = (model.eval()._moment(later) - model._moment(last)).split([5, 2 * model.time_frequencies])
+    assert weather.abs().max() > 0.1 and torch.equal(clock, torch.zeros_like(clock))
+    # Intervals of penalties end minutes after the last image, where the balance holds as well.
+    assert not torch.equal(model.train()._moment(last + 600)[5:], model._moment(last)[5:])
+
+
 # Stages and density control ---------------------------------------------------------------------------
 
 

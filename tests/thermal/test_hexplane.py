@@ -75,6 +75,16 @@ def test_the_field_is_six_grid_samples_in_double_precision():
     assert torch.equal(early, first)  # the border goes on
 
 
+def test_a_gaussian_at_no_place_reads_no_memory():
+    model, splats = make(disturb=0.5)
+    means = splats.means.detach().clone()
+    expected = model.hidden(means, 13.7)
+    means[3, 1] = float("nan")
+    means[4, 0] = float("inf")
+    found = model.hidden(means, 13.7)
+    assert torch.equal(found[:3], expected[:3]) and torch.equal(found[5:], expected[5:])
+
+
 def test_gradients_agree_with_differences():
     model, splats = make(4, disturb=0.5, heads=ALL)
     model, means = model.double(), splats.means.detach().double()

@@ -95,6 +95,16 @@ def test_only_the_asked_gaussians_are_evaluated():
     assert torch.allclose(model.features(splats, at(HOUR_S, ids)), every[ids], atol=1e-6)
 
 
+def test_the_ends_of_the_record_are_held_beyond_it():
+    model, splats, scene = make()
+    with torch.no_grad():
+        model.temperature_head.weight.normal_(generator=torch.Generator().manual_seed(2))
+    first, last = scene.record[0], sum(scene.record)
+    assert torch.equal(model.features(splats, at(last + 3600.0)), model.features(splats, at(last)))
+    assert torch.equal(model.features(splats, at(first - 3600.0)), model.features(splats, at(first)))
+    assert not torch.equal(model.features(splats, at(first)), model.features(splats, at(last)))
+
+
 def test_penalties_are_there_with_gradients_and_absent_at_weight_zero():
     model, splats, _ = make()
     loss = model.features(splats, at(2 * HOUR_S)).sum()

@@ -41,8 +41,8 @@ def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Ten
     """Pixels [H, W] whose surface point lies in the image of some training camera and is not hidden from it; bool.
 
     **Convention:** a pixel without a surface is a direction: it is covered where a training camera looked in that direction
-    and saw no surface either. What lies within ``DEPTH_TOLERANCE`` behind a surface counts as that surface, so that the
-    grid of the depth maps does not matter.
+    and saw no surface around it either, so that a hole in what was reconstructed is no sky. What lies within
+    ``DEPTH_TOLERANCE`` behind a surface counts as that surface, so that the grid of the depth maps does not matter.
 
     Args:
         camera: of the new view.
@@ -64,7 +64,7 @@ def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Ten
         left = (~found).nonzero().squeeze(1)
         if not len(left):
             break
-        found[left] = _sees(sighting, points[left])
+        found[left] = _sees(sighting, points[left], is_open[left])
     return found.reshape(camera.height, camera.width)
 
 
@@ -74,17 +74,20 @@ def _difference(one: Camera, other: Camera) -> float:
     return turned + float((one.center - other.center).norm()) / (1.0 + float(one.center.norm()))
 
 
-def _sees(sighting: Sighting, points: Tensor) -> Tensor:
-    """Which of the points [P, 3] a training camera sees, [P] bool."""
+def _sees(sighting: Sighting, points: Tensor, is_open: Tensor) -> Tensor:
+    """Which of the points [P, 3] a training camera sees, [P] bool; ``is_open`` [P] tells which stand for directions."""
     camera = sighting.camera
     local = to_camera(points, camera.viewmat)
     column, row = to_pixels(local, camera.K).floor().nan_to_num(-1.0).clamp(-1, 2**31).long().unbind(-1)
     inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     ids = inside.nonzero().squeeze(1)
     row, column = row[ids], column[ids]
-    # The farthest of the pixel and its neighbours: at an edge the coarse grid cannot tell them apart.
-    farthest = max_pool2d(sighting.depth.double()[None, None], 3, stride=1, padding=1)[0, 0]
-    visible = local[ids, 2] <= (1.0 + DEPTH_TOLERANCE) * farthest[row, column]
+    # The farthest of the pixel and its neighbours: at an edge the coarse grid cannot tell them apart. A direction must be
+    # free in all of them: holes between Gaussians, and the ragged end of what is reconstructed, have some open pixels.
+    depth = sighting.depth.double()[None, None]
+    farthest, nearest = (sign * max_pool2d(sign * depth, 3, stride=1, padding=1)[0, 0] for sign in (1.0, -1.0))
+    reach = torch.where(is_open[ids], nearest[row, column], farthest[row, column])
+    visible = local[ids, 2] <= (1.0 + DEPTH_TOLERANCE) * reach
     if sighting.mask is not None:
         visible &= sighting.mask[row, column]
     seen = torch.zeros(len(points), dtype=torch.bool)

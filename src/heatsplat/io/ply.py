@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.pictures import colorize
@@ -100,31 +100,39 @@ def read_splats(path: str | Path) -> dict[str, np.ndarray]:
     ``values`` come as [N, 3]; ``sh_rest`` [N, K, 3] and ``temperature_k`` [N] only where the file has them.
 
     Raises:
-        ValueError: the file is not a PLY of splats, naming what is missing.
+        ValueError: the file is not a PLY of splats or was damaged, naming what is missing or not finite.
     """
     try:
         vertex = PlyData.read(str(path))["vertex"]
-    except (PlyParseError, KeyError) as error:
-        raise ValueError(f"{path} is not a PLY file with vertices: {error}") from error
-    there = [prop.name for prop in vertex.properties]
+        there = [prop.name for prop in vertex.properties]
+        columns = {name: np.asarray(vertex[name], dtype=np.float32) for name in there}
+    except OSError:
+        raise
+    except Exception as error:  # plyfile checks its own grammar; what damage makes of the rest raises anything
+        raise ValueError(f"{path} is not a PLY file with vertices: {error!r}") from error
 
-    def columns(*names: str) -> np.ndarray:
-        missing = [name for name in names if name not in there]
+    def stacked(*names: str) -> np.ndarray:
+        missing = [name for name in names if name not in columns]
         if missing:
             raise ValueError(f"{path} is no file of splats: it has no property {', '.join(missing)}")
-        return np.stack([np.asarray(vertex[name], dtype=np.float32) for name in names], axis=1)
+        values = np.stack([columns[name] for name in names], axis=1)
+        if not np.isfinite(values).all():
+            raise ValueError(f"{path} was damaged: {', '.join(names)} have values that are NaN or infinite")
+        return values
 
     found = {
-        "means": columns("x", "y", "z"),
-        "log_scales": columns("scale_0", "scale_1", "scale_2"),
-        "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        "opacity_logits": columns("opacity"),
-        "values": 0.5 + C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        "means": stacked("x", "y", "z"),
+        "log_scales": stacked("scale_0", "scale_1", "scale_2"),
+        "quats": stacked("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity_logits": stacked("opacity"),
+        "values": 0.5 + C0 * stacked("f_dc_0", "f_dc_1", "f_dc_2"),
     }
-    rest = sum(name.startswith("f_rest_") for name in there)
+    rest = sum(name.startswith("f_rest_") for name in columns)
+    if rest % 3:
+        raise ValueError(f"{path} is no file of splats: {rest} properties f_rest_* are no three channels")
     if rest:
-        by_channel = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3)
+        by_channel = stacked(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3)
         found["sh_rest"] = by_channel.transpose(0, 2, 1)
-    if "temperature" in there:
-        found["temperature_k"] = columns("temperature")[:, 0]
+    if "temperature" in columns:
+        found["temperature_k"] = stacked("temperature")[:, 0]
     return found

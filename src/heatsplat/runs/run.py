@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,7 @@ from heatsplat.training.session import fit, prepare_machine, restore
 log = logging.getLogger("heatsplat")
 
 UNSEEN = ("nan", "keep")
+SMALL = 16  # pixels
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,15 @@ def load(
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _told_of(checkpoint):
         restore(module, scene_data, loaded)
+        if module.renderer.backend != "gsplat":  # which the processor has not
+            _look(module, scene_data.scene.train.frames[0])
     return Trained(config, module, scene_data, loaded)
+
+
+@torch.no_grad()
+def _look(module: SplatTraining, frame: Frame) -> None:
+    """Renders a small image: only there do tensors meet that must fit each other."""
+    module.render(replace(frame, camera=frame.camera.resized(SMALL, SMALL)))
 
 
 @contextmanager

@@ -411,7 +411,9 @@ class EnergyNetwork(ThermalModel):
         weather = torch.where(scale > 0, (columns_at(self.weather, time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
         if self.time != "none":
-            share = self.clock.within(time_s) if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
+            # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
+            clock = self.clock.spans if self.training else self.clock.within
+            share = clock(time_s) if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
             parts.append(octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0])
         return torch.cat(parts).to(self.network.own.weight)
 

@@ -23,14 +23,15 @@ def test_names_the_gradient_before_the_optimiser_uses_it(tmp_path):
     assert all(torch.isfinite(p).all() for p in module.parameters())
 
 
-def test_names_the_parameter(tmp_path):
+@pytest.mark.parametrize("every", [4, 1000])
+def test_names_the_parameter_in_the_step_in_which_it_breaks(tmp_path, every):
     class Breaks(FakeModule):
         def on_before_zero_grad(self, optimizer):
             if self.global_step == 3:
                 self.splats.raw["opacity_logits"].data[7] = float("inf")
 
     with pytest.raises(NotFinite, match=r"step 4: parameter splats\.raw\.opacity_logits has 0 NaN and 1 infinite"):
-        fit(Breaks(wall(), tmp_path), trainer(tmp_path, [FiniteGuard(every=4)], steps=12))
+        fit(Breaks(wall(), tmp_path), trainer(tmp_path, [FiniteGuard(every=every)], steps=12))
 
 
 @pytest.mark.parametrize("poison", ["loss", "gradient"])

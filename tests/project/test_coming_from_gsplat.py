@@ -1,0 +1,43 @@
+"""docs/coming_from_gsplat.md: every key that it names is in the composed configuration, with the published value beside it."""
+
+import re
+from functools import reduce
+from pathlib import Path
+
+import pytest
+
+from heatsplat.composition import compose
+
+TEXT = (Path(__file__).resolve().parents[2] / "docs" / "coming_from_gsplat.md").read_text(encoding="utf-8")
+CONFIG = compose(["method=3dgs", "max_steps=30000"])  # the published number of steps
+NAMED = re.findall(r"`([^`]+)`", TEXT)
+KEYS = sorted({name for name in NAMED if re.fullmatch(r"[a-z]+(\.\w+)+", name) and name.split(".")[0] in CONFIG})
+ROWS = re.findall(r"^\| (`\w+`|opacity|[\d.]+ extents) ?([\d.e-]*) \|.*`([a-z]+(?:\.\w+)+)`[^`|]* \|$", TEXT, re.M)
+PUBLISHED = {key: float(value or 0.1) for name, value, key in ROWS if value or "extents" in name}
+del PUBLISHED["thermal.sh_degree"]  # 0 here, as the page says
+
+
+def value_of(key: str):
+    return reduce(lambda tree, part: tree[part], key.split("."), CONFIG)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_keys_are_in_the_configuration(key):
+    value_of(key)
+
+
+def test_settings_in_commands_are_keys_of_a_command():
+    keys = {*CONFIG, *compose([], "render"), "method", "hydra"}
+    given = {word.partition("=")[0] for name in NAMED for word in name.split() if re.match(r"[a-z_.]+=[^\"]", word)}
+    wrong = {key for key in given if key.split(".")[0] not in keys}
+    assert wrong == {"antialiased", "depth"}  # arguments of rasterization, in Python
+
+
+@pytest.mark.parametrize("key", PUBLISHED)
+def test_published_values_are_those_of_the_configuration(key):
+    assert value_of(key) == pytest.approx(PUBLISHED[key], rel=0.003)
+
+
+def test_the_page_has_the_keys_of_density_control_that_it_is_looked_up_for():
+    assert {"density.start", "density.stop", "density.every", "density.duplicate_scale", "renderer.eps2d"} <= set(KEYS)
+    assert len(PUBLISHED) >= 9
