@@ -49,23 +49,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
     if count == 0:  # gsplat's launchers divide by the number of Gaussians
         return reference.render(inputs)
 
-    # gsplat would divide by the length of a zero quaternion; an opacity of 0 culls the Gaussian before that is used.
-    hidden = inputs.quats.detach().square().sum(dim=1) == 0
-    radii, means2d, depths, conics, compensations = kernels.project(
-        inputs.means,
-        None,
-        inputs.quats,
-        inputs.scales,
-        inputs.viewmat[None],
-        inputs.K[None],
-        width,
-        height,
-        eps2d=inputs.eps2d,
-        near_plane=inputs.near,
-        far_plane=inputs.far,
-        calc_compensations=inputs.antialiased,
-        opacities=inputs.opacities.detach().amax(0).masked_fill(hidden, 0.0),
-    )
+    radii, means2d, depths, conics, compensations = _project(kernels, inputs)
     ids = (radii[0] > 0).all(dim=1).nonzero().squeeze(1)
     means2d = means2d[0]
     if means2d.requires_grad:
@@ -115,6 +99,27 @@ def render(inputs: RenderInputs) -> RenderOutput:
         _gather_absgrad(means2d, parts)
     meta = {"means2d": means2d, "radii": radii[0], "visible_ids": ids}
     return RenderOutput(torch.cat(images, dim=2), torch.stack(alphas), depth, meta)
+
+
+def _project(kernels: Kernels, inputs: RenderInputs) -> tuple[Tensor, ...]:
+    """Radii, means2d, depths, conics and compensations of one camera, each with a leading axis of 1."""
+    # gsplat would divide by the length of a zero quaternion; an opacity of 0 culls the Gaussian before that is used.
+    hidden = inputs.quats.detach().square().sum(dim=1) == 0
+    return kernels.project(
+        inputs.means,
+        None,
+        inputs.quats,
+        inputs.scales,
+        inputs.viewmat[None],
+        inputs.K[None],
+        inputs.width,
+        inputs.height,
+        eps2d=inputs.eps2d,
+        near_plane=inputs.near,
+        far_plane=inputs.far,
+        calc_compensations=inputs.antialiased,
+        opacities=inputs.opacities.detach().amax(0).masked_fill(hidden, 0.0),
+    )
 
 
 def _features_and_channels(inputs: RenderInputs, ids: Tensor) -> tuple[Tensor, tuple[int, ...]]:
