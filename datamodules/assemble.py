@@ -16,13 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from heatsplat.datamodules.bounds import celsius
-from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
-from heatsplat.datamodules.poses import MAX_COORDINATE
-from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
-from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
-from heatsplat.datamodules.side_files import finite
-from heatsplat.datamodules.splits import SplitRule
 from torch import Tensor
 
 from heatsplat.contracts import (
@@ -37,6 +30,13 @@ from heatsplat.contracts import (
     Weather,
     evenly_spread,
 )
+from heatsplat.datamodules.bounds import celsius
+from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
+from heatsplat.datamodules.poses import MAX_COORDINATE
+from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
+from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
+from heatsplat.datamodules.side_files import finite
+from heatsplat.datamodules.splits import SplitRule
 
 log = logging.getLogger(__name__)
 

@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
+from torch.utils.data import DataLoader
+
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
@@ -21,9 +24,6 @@ from heatsplat.datamodules.lowres import degraded
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import with_weather
-from torch.utils.data import DataLoader
-
-from heatsplat.contracts import SceneData, SceneError
 from heatsplat.training.sampler import StepSampler
 
 __all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "RawScene", "SceneDataModule", "SceneOptions", "build_scene"]

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from heatsplat.datamodules.side_files import finite, json_object
-
 from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.datamodules.side_files import finite, json_object
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 BOUNDS_FILE = "temperature_bounds.json"

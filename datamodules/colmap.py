@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
 from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
-
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 
 class Colmap(SceneDataModule):

@@ -9,6 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneData, SceneError, ThermalRange
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
 from heatsplat.datamodules.formats.colmap import find_model, read_model
@@ -24,8 +26,6 @@ from heatsplat.datamodules.points import ply_points, random_points
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
 from heatsplat.datamodules.timestamps import stem_of
-
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
 
 log = logging.getLogger(__name__)
 

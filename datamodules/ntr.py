@@ -8,6 +8,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import range_in
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
@@ -16,8 +18,6 @@ from heatsplat.datamodules.points import obj_vertices, random_points
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.surroundings import OutdoorDataModule
 from heatsplat.datamodules.weather import utc_seconds
-
-from heatsplat.contracts import SceneData, SceneError
 
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS
 from heatsplat.datamodules.formats.images import (
     colour_levels,
@@ -21,8 +23,6 @@ from heatsplat.datamodules.formats.images import (
 )
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
-
-from heatsplat.contracts import SceneError
 
 log = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.poses import checked_pose
-from heatsplat.datamodules.splits import SplitRule
 from torch import Tensor
 
 from heatsplat.contracts import Environment, SceneError, ThermalRange, Weather
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.poses import checked_pose
+from heatsplat.datamodules.splits import SplitRule
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from heatsplat.contracts import SceneData
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
-
-from heatsplat.contracts import SceneData
 
 SUBSETS = {"train": "train", "test": "test", "eval": "test", "val": "test"}
 

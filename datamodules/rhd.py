@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from heatsplat.contracts import SceneData, ThermalRange
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.colmap import image_index, match_model
@@ -15,8 +16,6 @@ from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.side_files import json_object
 from heatsplat.datamodules.timestamps import seconds_of_day, unrolled_midnight
-
-from heatsplat.contracts import SceneData, ThermalRange
 
 log = logging.getLogger(__name__)
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
-from heatsplat.datamodules.base import SceneDataModule
 from torch import Tensor
 
 from heatsplat.contracts import WEATHER_COLUMNS, Camera, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.physics.units import DAY_S
 
 

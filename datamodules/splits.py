@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from heatsplat.datamodules.side_files import json_object, read_text, shortened
-
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.side_files import json_object, read_text, shortened
 
 Positions = tuple[list[int], list[int]]
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import WEATHER_COLUMNS, Environment, SceneError, Weather
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.side_files import finite, mapping
 from heatsplat.datamodules.weather import make_weather, read_weather, site_of
-
-from heatsplat.contracts import WEATHER_COLUMNS, Environment, SceneError, Weather
 
 WEATHER_FILE, LABELS_FILE, FEATURES_FILE = "weather.csv", "labels.npy", "space_features.npy"
 

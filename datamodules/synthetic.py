@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
-
-from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.geometry.resampling import resampled
 
 

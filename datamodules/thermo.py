@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame
 from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.colmap import image_index, match_model
@@ -19,8 +21,6 @@ from heatsplat.datamodules.side_files import finite, json_object, mapping, short
 from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
 from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.datamodules.weather import utc_seconds
-
-from heatsplat.contracts import SceneData, SceneError
 
 META_FILE = "meta.json"
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from heatsplat.contracts import SceneData
 from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.nerfstudio import Nerfstudio, bounds_of, find_transforms
 from heatsplat.datamodules.rgbt_scenes import is_paired, paired_frames
 from heatsplat.datamodules.splits import SplitRule
-
-from heatsplat.contracts import SceneData
 
 
 class ThermoScenes(Nerfstudio):

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
-from heatsplat.datamodules.side_files import read_table
-
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.side_files import read_table
 from heatsplat.physics.units import DAY_S
 
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")

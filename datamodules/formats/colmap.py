@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2  # noqa: F401, I001
 import numpy as np
 import pycolmap
-from heatsplat.datamodules.formats.colmap_records import check_records
-from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.colmap_records import check_records
+from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
 
 # What is wrong with a file is said by the exceptions below; OpenCV would add a line for every unknown TIFF tag.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 from heatsplat.datamodules.poses import checked_pose
 from heatsplat.datamodules.side_files import finite, json_object, shortened
-
-from heatsplat.contracts import SceneError
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
 _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}

@@ -11,11 +11,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.synthetic_scene.scene import Scene
 from torch import Tensor
 
 from heatsplat.contracts import ThermalRange
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.training.rng import generator_for
 
 # A pixel is resampled on 3 x 3 rays where it differs by this much from the mean of its neighbours, in kelvin: one ray

@@ -13,6 +13,9 @@ from functools import cache
 
 import numpy as np
 import torch
+from torch import Tensor
+
+from heatsplat.contracts import SceneError, ThermalRange, Weather
 from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     Forcing,
@@ -25,9 +28,6 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
-from torch import Tensor
-
-from heatsplat.contracts import SceneError, ThermalRange, Weather
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.training.rng import generator_for
 

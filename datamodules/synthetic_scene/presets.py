@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
+from torch import Tensor
+
 from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws, Gloss, Haze
 from heatsplat.datamodules.synthetic_scene.heat import Material, Waveform, periodic
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
-from torch import Tensor
 
 # Directions (cycles per wavelength) and phases of the smooth part of every pattern: three waves that share no axis.
 _WAVES = ((0.83, 0.31, 0.46), (-0.37, 0.78, 0.51), (0.29, -0.55, 0.78))

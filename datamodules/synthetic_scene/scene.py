@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from heatsplat.datamodules.synthetic_scene import heat
-from heatsplat.datamodules.synthetic_scene.presets import Preset, Surface
-from heatsplat.datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
 from torch import Tensor
 
 from heatsplat.contracts import ThermalRange, Weather
+from heatsplat.datamodules.synthetic_scene import heat
+from heatsplat.datamodules.synthetic_scene.presets import Preset, Surface
+from heatsplat.datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
 
 # Where the visible light comes from (unit length), and its share that comes from everywhere.
 _SUN = (-0.398, -0.597, 0.697)

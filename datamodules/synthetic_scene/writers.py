@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import colormaps
+from PIL import Image
+
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.synthetic_scene.film import Recording
 from heatsplat.datamodules.synthetic_scene.outdoor import training_frames
 from heatsplat.datamodules.weather import utc_text, write_weather
-from matplotlib import colormaps
-from PIL import Image
-
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 # What nerfstudio does to COLMAP's world: it swaps x and y and turns z round.

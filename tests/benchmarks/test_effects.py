@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
-from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 
 from benchmarks import effects as study
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 from heatsplat.effects import assembly
 from heatsplat.effects.assembly import dependents
 from heatsplat.io.results import RunResults

@@ -3,12 +3,12 @@
 from functools import partial
 
 import pytest
-from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
-from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 
 from benchmarks.evidence import outcome_of, run, written
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.effects.catalogue import CATALOGUE
 
 SCENES = ("static", "cooling", "drifting")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2  # first, before anything brings pycolmap
 import numpy as np
+
 from heatsplat.datamodules.formats.colmap import write_model
 
 WIDTH, HEIGHT = 40, 32

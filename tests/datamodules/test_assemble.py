@@ -3,12 +3,12 @@ import logging
 import numpy as np
 import pytest
 import torch
-from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneOptions, build_scene
-from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.splits import SplitRule
 from layouts import FOCAL, HEIGHT, WIDTH, grey, points, viewmats
 
 from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneOptions, build_scene
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.splits import SplitRule
 
 LENS = Lens(fx=FOCAL, fy=FOCAL + 2, cx=20.5, cy=15.0, width=WIDTH, height=HEIGHT)
 EVERY_8TH = SplitRule("every_8th")

@@ -4,8 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.formats.colmap import find_model, read_model
 from layouts import (
     BOUNDS,
     FOCAL,
@@ -20,6 +18,8 @@ from layouts import (
 )
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import find_model, read_model
 
 M3T = Path(__file__).parents[3] / "shared" / "data" / "m3t_heath"
 needs_m3t = pytest.mark.skipif(not M3T.is_dir(), reason="real DJI data is not at ../shared/data/m3t_heath")

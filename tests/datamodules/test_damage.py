@@ -5,6 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from layouts import HEIGHT, WIDTH, grey, names, viewmats, write_colmap, write_image, write_json, write_thermoscenes
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.colmap_records import check_records
@@ -16,9 +19,6 @@ from heatsplat.datamodules.splits import by_list
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.timestamps import dji_time, times_from_csv
 from heatsplat.datamodules.weather import read_weather
-from layouts import HEIGHT, WIDTH, grey, names, viewmats, write_colmap, write_image, write_json, write_thermoscenes
-
-from heatsplat.contracts import SceneError
 
 STEMS = [f"frame_train_{i:05d}" for i in range(1, 7)] + [f"frame_eval_{i:05d}" for i in range(1, 3)]
 

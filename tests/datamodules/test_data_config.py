@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import pytorch_lightning as pl
 import torch
-from heatsplat.datamodules.base import SceneDataModule
-from heatsplat.datamodules.colmap import Colmap
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, instantiate
 from layouts import names, write_colmap
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.colmap import Colmap
 
 CONF = Path(__file__).parents[2] / "conf"
 LOADERS = ("rhd", "thermoscenes", "nerfstudio", "ti_nsd", "colmap", "rgbt_scenes", "ntr", "thermo")

@@ -8,14 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from running import TINY, run
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, pixel_rays
 from heatsplat.datamodules.synthetic_scene.presets import PANE, PRESETS, TABLE_TOP, Pattern, Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box
-from running import TINY, run
-
-from heatsplat.contracts import SceneError
 from heatsplat.metrics import psnr
 
 SMALL = replace(SIZES["tiny"], frames=4, points=800)

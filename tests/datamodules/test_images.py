@@ -1,6 +1,10 @@
 import cv2
 import numpy as np
 import pytest
+from layouts import write_image
+from PIL import Image
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
@@ -10,10 +14,6 @@ from heatsplat.datamodules.formats.images import (
     split_alpha,
     to_grey,
 )
-from layouts import write_image
-from PIL import Image
-
-from heatsplat.contracts import SceneError
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from heatsplat.datamodules.formats.images import undistorted, undistorted_mask
-from heatsplat.datamodules.formats.lens import Lens, lens_of, undistortion_maps
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.images import undistorted, undistorted_mask
+from heatsplat.datamodules.formats.lens import Lens, lens_of, undistortion_maps
 
 WIDTH, HEIGHT = 64, 48
 

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from heatsplat.datamodules.lowres import Reduction, degraded
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
+from heatsplat.datamodules.lowres import Reduction, degraded
 from heatsplat.geometry.resampling import resampled
 
 HEIGHT, WIDTH = 48, 64

@@ -6,11 +6,11 @@ import shutil
 
 import numpy as np
 import pytest
-from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.nerfstudio import Nerfstudio
 from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_colmap, write_image, write_json
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.nerfstudio import Nerfstudio
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
 

@@ -3,12 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from heatsplat.datamodules.ntr import NTR
-from heatsplat.datamodules.rgbt_scenes import RGBTScenes
-from heatsplat.datamodules.ti_nsd import TINSD, frame_number
 from layouts import HEIGHT, WIDTH, grey, names, points, viewmats, write_colmap, write_image, write_json
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.ntr import NTR
+from heatsplat.datamodules.rgbt_scenes import RGBTScenes
+from heatsplat.datamodules.ti_nsd import TINSD, frame_number
 
 
 def loaded(loader, root, **options):

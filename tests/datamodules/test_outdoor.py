@@ -8,6 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene import heat
 from heatsplat.datamodules.synthetic_scene.film import pixel_rays
@@ -32,9 +35,6 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     integrate,
     solve,
 )
-from scipy.integrate import solve_ivp
-
-from heatsplat.contracts import SceneError
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 SOUTH_WALL, ROOF = (0.0, -1.0, 0.0), (0.0, -(0.5**0.5), 0.5**0.5)

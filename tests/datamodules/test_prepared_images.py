@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.prepared_images import prepare
 from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
-
-from heatsplat.contracts import SceneError
 
 LENS = Lens(fx=30.0, fy=30.0, cx=4.0, cy=3.0, width=8, height=6)
 

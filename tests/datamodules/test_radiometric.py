@@ -5,13 +5,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.formats.radiometric import Planck, has_temperatures, read_celsius, read_fff
-from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
-
-from heatsplat.contracts import SceneError
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 FLIR, M3T = DATA / "flir", DATA / "m3t_heath"

@@ -1,8 +1,8 @@
 import pytest
-from heatsplat.datamodules.raw_scene import Counts, SceneOptions
-from heatsplat.datamodules.splits import SplitRule
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.raw_scene import Counts, SceneOptions
+from heatsplat.datamodules.splits import SplitRule
 
 
 @pytest.mark.parametrize(

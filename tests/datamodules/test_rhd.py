@@ -2,10 +2,10 @@ import logging
 
 import numpy as np
 import pytest
-from heatsplat.datamodules.rhd import RHD
 from layouts import grey, names, rhd_names, write_colmap, write_image, write_rhd
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.rhd import RHD
 
 INFO = {"T_env": 32.9, "min_value": 31, "max_value": 56}
 SECONDS = [56304.825 + 10.25 * i for i in range(16)]

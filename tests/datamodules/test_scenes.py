@@ -5,11 +5,11 @@ from functools import partial
 
 import pytest
 import torch
-from heatsplat.datamodules.base import SceneDataModule
-from heatsplat.datamodules.scenes import DAY_S, Scenes, joined
 from weathered import HOUR_S, make_scene, make_weather
 
 from heatsplat.contracts import Camera, SceneError, ThermalRange, View, ViewSet
+from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.scenes import DAY_S, Scenes, joined
 from heatsplat.renderers.settings import Renderer
 
 

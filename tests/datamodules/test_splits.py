@@ -1,9 +1,9 @@
 import json
 
 import pytest
-from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
 
 def test_every_8th_follows_plain_string_order():

@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import (
     SIZES,
@@ -23,10 +27,6 @@ from heatsplat.datamodules.synthetic_scene.film import (
 )
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS, TABLE_TOP, Pattern, Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
-
-from heatsplat.contracts import SceneError
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 from heatsplat.physics.relaxation import harmonic_response
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import erfcx
+
 from heatsplat.datamodules.synthetic_scene import presets
 from heatsplat.datamodules.synthetic_scene.heat import CONSTANT, Material, Waveform, integrate, periodic, solve
-from scipy.special import erfcx
 
 DURATION_S = 1800.0
 EXCESS_K, FLUX_W_M2 = 40.0, 1000.0

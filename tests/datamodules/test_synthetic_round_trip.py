@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib import colormaps
+
+from heatsplat.contracts import SceneData, View
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.rgbt_scenes import RGBTScenes
@@ -20,9 +23,6 @@ from heatsplat.datamodules.synthetic_scene.writers import APPLIED_TRANSFORM, LAY
 from heatsplat.datamodules.thermo import Thermo
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.ti_nsd import TINSD
-from matplotlib import colormaps
-
-from heatsplat.contracts import SceneData, View
 
 SIZE = replace(SIZES["tiny"], frames=17, points=200)
 DISTORTION = (-0.28, 0.07, 0.0008, -0.0005)

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+
 from heatsplat.datamodules.synthetic_scene.presets import TABLE_TOP
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Sphere, nearest_surface, trace
 

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from layouts import names, write_colmap
+
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, START_UTC_S, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.writers import write_thermo
 from heatsplat.datamodules.thermo import Thermo
-from layouts import names, write_colmap
-
-from heatsplat.contracts import SceneData, SceneError
 
 FRAMES = 9
 

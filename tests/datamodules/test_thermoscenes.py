@@ -1,8 +1,5 @@
 import numpy as np
 import pytest
-from heatsplat.datamodules.formats.lens import lens_of
-from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
-from heatsplat.datamodules.thermoscenes import ThermoScenes
 from layouts import (
     BOUNDS,
     FOCAL,
@@ -20,6 +17,9 @@ from layouts import (
 from plyfile import PlyData, PlyElement
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.lens import lens_of
+from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.thermoscenes import ThermoScenes
 
 STEMS = [f"frame_train_{i:05d}" for i in range(1, 7)] + [f"frame_eval_{i:05d}" for i in range(1, 3)]
 # nerfstudio's turn of COLMAP's world: x and y change places, z changes sign (a rotation).

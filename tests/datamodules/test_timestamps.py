@@ -1,4 +1,6 @@
 import pytest
+
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.timestamps import (
     dji_time,
     seconds_of_day,
@@ -7,8 +9,6 @@ from heatsplat.datamodules.timestamps import (
     times_from_csv,
     unrolled_midnight,
 )
-
-from heatsplat.contracts import SceneError
 
 
 def test_nine_digits_are_hours_minutes_seconds_and_thousandths():

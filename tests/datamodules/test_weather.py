@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
-from heatsplat.datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
 
 from heatsplat.contracts import SceneData, SceneError, Weather
+from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
 
 SITE = Site(47.0, 9.0, 500.0)
 # 11 July 2024, midnight UTC.

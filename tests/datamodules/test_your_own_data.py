@@ -4,12 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+from layouts import grey, names, rhd_names, write_colmap, write_image, write_rhd
+
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.nerfstudio import THERMAL_KEYS, VISIBLE_KEYS
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 from heatsplat.datamodules.rhd import RHD
 from heatsplat.datamodules.thermo import Thermo
-from layouts import grey, names, rhd_names, write_colmap, write_image, write_rhd
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "your_own_data.md").read_text()

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.formats.images import read_image
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.images import read_image
 from heatsplat.effects.catalogue import decide
 from heatsplat.effects.observations import observe
 from heatsplat.physics.noise import noise_of

@@ -23,12 +23,12 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from heatsplat.datamodules.synthetic import Synthetic
 from mutate import VALUES, Outcome, damaged, damaged_copy, guarded, other_bytes
 from running import TINY
 
 from heatsplat import composition
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.io.results import RunResults
 from heatsplat.runs import run

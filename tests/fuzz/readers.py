@@ -25,6 +25,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "datamodules"))
 
+from layouts import names, points, viewmats, write_colmap
+from mutate import Outcome, damaged_copy, guarded
+from test_radiometric import flir_jpeg, raw_for, temperatures
+
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.nerfstudio import Nerfstudio
@@ -38,11 +43,6 @@ from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
 from heatsplat.datamodules.thermo import Thermo
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.ti_nsd import TINSD
-from layouts import names, points, viewmats, write_colmap
-from mutate import Outcome, damaged_copy, guarded
-from test_radiometric import flir_jpeg, raw_for, temperatures
-
-from heatsplat.contracts import SceneData, SceneError
 
 FRAMES = 9
 READERS: dict[str, Callable] = {

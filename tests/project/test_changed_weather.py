@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from heatsplat.datamodules.base import SceneDataModule
 from weathered import HOUR_S, make_scene
 
 from heatsplat import cli
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneData, SceneError
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.runs import run
 from heatsplat.shots import shot_frames
 from heatsplat.training.module import CHECKPOINT_KEY
@@ -43,7 +43,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
 
     data = Yard()
     heat = SimpleNamespace(needs=frozenset(needs), beyond_record="nothing changes")
-    module = SimpleNamespace(thermal=heat, predict=predict)
+    module = SimpleNamespace(thermal=heat, predict=predict, renderer=SimpleNamespace(backend="gsplat"))
     stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)

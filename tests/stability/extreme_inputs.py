@@ -9,11 +9,11 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from heatsplat.datamodules.base import SceneDataModule
 from torch import Tensor
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet, Weather
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.geometry.projection import look_at
 from heatsplat.runs.run import build_callbacks
 from heatsplat.training.checkpoints import load_checkpoint

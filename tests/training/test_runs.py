@@ -93,9 +93,8 @@ def test_a_missing_checkpoint_is_named_with_those_that_exist(tmp_path):
 def test_a_method_that_needs_time_refuses_a_scene_without(tmp_path, monkeypatch):
     from dataclasses import replace
 
-    from heatsplat.datamodules.synthetic import Synthetic
-
     from heatsplat.contracts import ViewSet
+    from heatsplat.datamodules.synthetic import Synthetic
 
     def timeless(views: ViewSet) -> ViewSet:
         return ViewSet([replace(frame, time_s=None) for frame in views.frames], lambda i: views[i])

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from running import run
+
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 
 BRIGHTNESS = 0.35  # of the middle of the scene; gain and bias are told apart by other brightnesses only
 

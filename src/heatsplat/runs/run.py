@@ -217,7 +217,7 @@ def load(
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
     if "weather" in changed and "weather" not in config["data"]:
         raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
-    with _told_of(checkpoint):
+    with _naming(checkpoint):
         module = build_module(config, Path(output_dir))
     if weather is not None and "weather" not in module.thermal.needs:
         raise SceneError(
@@ -227,21 +227,21 @@ def load(
     scene_data = build(config["data"] | changed)
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
-    with _told_of(checkpoint):
+    with _naming(checkpoint):
         restore(module, scene_data, loaded)
         if module.renderer.backend != "gsplat":  # which the processor has not
-            _look(module, scene_data.scene.train.frames[0])
+            _try_render(module, scene_data.scene.train.frames[0])
     return Trained(config, module, scene_data, loaded)
 
 
 @torch.no_grad()
-def _look(module: SplatTraining, frame: Frame) -> None:
+def _try_render(module: SplatTraining, frame: Frame) -> None:
     """Renders a small image: only there do tensors meet that must fit each other."""
     module.render(replace(frame, camera=frame.camera.resized(SMALL, SMALL)))
 
 
 @contextmanager
-def _told_of(checkpoint: Path | str) -> Iterator[None]:
+def _naming(checkpoint: Path | str) -> Iterator[None]:
     """Errors of building from a checkpoint, in which anything may stand, name it."""
     try:
         yield
