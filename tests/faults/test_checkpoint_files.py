@@ -49,6 +49,7 @@ def test_a_full_disk_ends_in_a_sentence_and_leaves_the_last_good_checkpoint(tmp_
 def test_a_temporary_folder_that_is_full_is_nobodys_business(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.mkstemp", lambda *_, **__: pytest.fail("another folder was written to"))
     FILES.save_checkpoint(content(1), tmp_path / "last.ckpt")
+    assert load_checkpoint(tmp_path / "last.ckpt")["global_step"] == 1
 
 
 def test_what_has_a_checkpoints_name_is_whole_whenever_its_writer_is_killed(tmp_path):
