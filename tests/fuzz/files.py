@@ -9,21 +9,19 @@ import logging
 import os
 import random
 import sys
-import tempfile
-import time
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mutate import VALUES, Outcome, damaged, damaged_copy, guarded, other_bytes
+from mutate import VALUES, Outcome, campaign, damaged, damaged_copy, guarded, other_bytes
 from running import TINY
 
 from heatsplat import composition
@@ -170,33 +168,10 @@ def outcome_of(kind: str, root: Path, place: Path, number: int) -> Outcome:
 
 def fuzzed(kind: str, root: Path, place: Path, numbers: range) -> list[Outcome]:
     """Outcomes of the inputs of one kind with these numbers."""
-    whole = Synthetic(scene="cooling", size="tiny", downscale=4).scene  # filmed once
-    Synthetic.load = lambda self: whole
-    return list(guarded(numbers, partial(outcome_of, kind, root, place)))
-
-
-def main(seconds: float, only: str | None = None, number: int | None = None) -> int:
-    """Prints failures as they are found and, at the end, how many inputs of each kind had which outcome."""
-    counts: dict[str, Counter] = {}
-    begin = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        write_templates(root / "whole")
-        first, some = (0, 50) if number is None else (number, 1)
-        while True:
-            for kind in [only] if only else KINDS:
-                for outcome in fuzzed(kind, root / "whole", root / "copy", range(first, first + some)):
-                    counts.setdefault(kind, Counter())[outcome.kind] += 1
-                    if outcome.failed or number is not None:
-                        print(f"{kind} {outcome.number}: {outcome.kind}: {outcome.text}", flush=True)
-            first += some
-            if number is not None or time.monotonic() - begin > seconds:
-                break
-    for kind, counted in counts.items():
-        print(f"{kind:24} {sum(counted.values()):6}  " + ", ".join(f"{k} {n}" for k, n in sorted(counted.items())))
-    return int(any(set(counted) - {"loads", "refused"} for counted in counts.values()))
+    whole = Synthetic(scene="cooling", size="tiny", downscale=4).scene
+    with mock.patch.object(Synthetic, "load", lambda self: whole):  # filmed once
+        return list(guarded(numbers, partial(outcome_of, kind, root, place)))
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    sys.exit(main(float(arguments[0]), *arguments[1:2], *map(int, arguments[2:3])))
+    sys.exit(campaign(KINDS, write_templates, fuzzed, sys.argv[1:]))

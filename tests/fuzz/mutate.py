@@ -14,7 +14,10 @@ import resource
 import select
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -189,3 +192,41 @@ def damaged_copy(template: Path, place: Path, number: int) -> list[str]:
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(template, place)
     return damage(place, random.Random(number))
+
+
+def campaign(
+    kinds: Iterable[str],
+    write_templates: Callable[[Path], None],
+    fuzzed: Callable[[str, Path, Path, range], list[Outcome]],
+    arguments: Sequence[str],
+) -> int:
+    """Exit code of a command that damages inputs until its time is over: 0 where all were loaded or refused by name.
+
+    Failures are printed as they are found; at the end stands how many inputs of each kind had which outcome.
+
+    Args:
+        kinds: of input.
+        write_templates: writes whole inputs of all kinds into a folder.
+        fuzzed: outcomes of a kind's inputs, of (kind, folder of the templates, folder for a copy, their numbers).
+        arguments: of the command: seconds, and for one input its kind and number.
+    """
+    seconds = float(arguments[0])
+    kinds, number = arguments[1:2] or list(kinds), int(arguments[2]) if arguments[2:] else None
+    counts: dict[str, Counter] = {kind: Counter() for kind in kinds}
+    begin, first, some = time.monotonic(), number or 0, 50 if number is None else 1
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        write_templates(root / "whole")
+        while True:
+            for kind in kinds:
+                for outcome in fuzzed(kind, root / "whole", root / "copy", range(first, first + some)):
+                    counts[kind][outcome.kind] += 1
+                    if outcome.failed or number is not None:
+                        print(f"{kind} {outcome.number}: {outcome.kind}: {outcome.text}", flush=True)
+            first += some
+            if number is not None or time.monotonic() - begin > seconds:
+                break
+    counts["all"] = sum(counts.values(), Counter())
+    for kind, counted in counts.items():
+        print(f"{kind:24} {sum(counted.values()):6}  " + ", ".join(f"{k} {n}" for k, n in sorted(counted.items())))
+    return int(bool(set(counts["all"]) - {"loads", "refused"}))

@@ -10,11 +10,8 @@ import logging
 import shutil
 import struct
 import sys
-import tempfile
-import time
 import traceback
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -25,8 +22,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "datamodules"))
 
-from layouts import names, points, viewmats, write_colmap
-from mutate import Outcome, damaged_copy, guarded
+from layouts import names, points, write_colmap
+from mutate import Outcome, campaign, damaged_copy, guarded
 from test_radiometric import flir_jpeg, raw_for, temperatures
 
 from heatsplat.contracts import SceneData, SceneError
@@ -151,7 +148,9 @@ def nonsense(scene: SceneData) -> str:
 
 
 def outcome_of(layout: str, template: Path, place: Path, number: int) -> Outcome:
-    """Damages a copy of the template by the number and reads it."""
+    """Damages a copy of the template by the number and reads it, in a process of its own."""
+    logging.disable(logging.CRITICAL)
+    warnings.simplefilter("ignore")
     known = (
         {p.name for p in template.rglob("*")} | {p.stem for p in template.rglob("*")} | {"data.", "frame ", "scene "}
     )
@@ -171,38 +170,10 @@ def outcome_of(layout: str, template: Path, place: Path, number: int) -> Outcome
         return Outcome(number, "traceback", f"{traceback.format_exc(limit=-4)} ({done})")
 
 
-def fuzzed(layout: str, template: Path, place: Path, numbers: range) -> list[Outcome]:
+def fuzzed(layout: str, root: Path, place: Path, numbers: range) -> list[Outcome]:
     """Outcomes of the inputs of one layout with these numbers."""
-    logging.disable(logging.CRITICAL)
-    warnings.simplefilter("ignore")
-    return list(guarded(numbers, partial(outcome_of, layout, template, place)))
-
-
-def main(seconds: float, only: str | None = None, number: int | None = None) -> int:
-    """Prints failures as they are found and, at the end, how many inputs of each layout had which outcome."""
-    assert viewmats(1)  # the layouts are importable
-    counts: dict[str, Counter] = {}
-    begin = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        write_templates(root / "whole")
-        first, some = (0, 50) if number is None else (number, 1)
-        while True:
-            for layout in [only] if only else READERS:
-                for outcome in fuzzed(layout, root / "whole" / layout, root / "copy", range(first, first + some)):
-                    counts.setdefault(layout, Counter())[outcome.kind] += 1
-                    if outcome.failed or number is not None:
-                        print(f"{layout} {outcome.number}: {outcome.kind}: {outcome.text}", flush=True)
-            first += some
-            if number is not None or time.monotonic() - begin > seconds:
-                break
-    total = sum(counts.values(), Counter())
-    for layout, counted in counts.items():
-        print(f"{layout:20} {sum(counted.values()):6}  " + ", ".join(f"{k} {n}" for k, n in sorted(counted.items())))
-    print(f"{'all':20} {sum(total.values()):6}  " + ", ".join(f"{k} {n}" for k, n in sorted(total.items())))
-    return int(bool(set(total) - {"loads", "refused"}))
+    return list(guarded(numbers, partial(outcome_of, layout, root / layout, place)))
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    sys.exit(main(float(arguments[0]), *arguments[1:2], *map(int, arguments[2:3])))
+    sys.exit(campaign(READERS, write_templates, fuzzed, sys.argv[1:]))

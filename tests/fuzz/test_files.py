@@ -12,8 +12,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", files.KINDS)
-def test_damaged_files_load_sanely_or_are_refused_by_name(whole, kind, tmp_path, monkeypatch):
-    monkeypatch.setattr(files.Synthetic, "load", files.Synthetic.load)  # put back what ``fuzzed`` replaces
+def test_damaged_files_load_sanely_or_are_refused_by_name(whole, kind, tmp_path):
     outcomes = files.fuzzed(kind, whole, tmp_path / "copy", range(25 if kind == "content_of_checkpoint" else 100))
     assert [outcome for outcome in outcomes if outcome.failed] == []
     if kind != "folder_of_run":
