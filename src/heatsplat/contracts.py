@@ -366,6 +366,27 @@ class SceneData:
 
 
 @dataclass(frozen=True)
+class WeightedSums:
+    """Sums over the pixels of maps, weighted by the blending weights of each Gaussian, as gradients of zeros.
+
+    Add ``(image * maps).sum()`` to the loss, maps [H, W, S] being constant: it adds nothing to the value and to no other
+    gradient, and the backward pass leaves in ``sums`` what each visible Gaussian has of each map.
+
+    Args:
+        image: [H, W, S] zeros with a gradient.
+        rows: [n, S] zeros, a row for each of ``meta["visible_ids"]``.
+    """
+
+    image: Tensor
+    rows: Tensor
+
+    @property
+    def sums(self) -> Tensor | None:
+        """Σ_p maps[p] w[p, i], [n, S], with w = T α of the first modality; None before the backward pass."""
+        return self.rows.grad
+
+
+@dataclass(frozen=True)
 class RenderOutput:
     """What a renderer returns, for M modalities (opacity sets) and C channels.
 
@@ -383,6 +404,7 @@ class RenderOutput:
     alpha: Tensor
     depth: Tensor | None
     meta: dict[str, Tensor]
+    weighted: WeightedSums | None = None
 
 
 def evenly_spread(count: int, limit: int) -> list[int]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.contracts import Camera, RenderOutput, SceneData
 from heatsplat.density.ops import Cloud
 
 
@@ -36,6 +36,24 @@ class DensityControl:
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """Per-Gaussian statistics before the first step, each [count, ...]."""
         return {}
+
+    def prepare(self, scene: SceneData, modality: str) -> None:
+        """Takes what it needs of the scene, before anything is trained: how noisy its images are, how many there are."""
+        return
+
+    def maps_at(self, step: int) -> int:
+        """How many maps over pixels it wants summed by blending weights in this step (``pixel_maps``); 0 costs nothing."""
+        return 0
+
+    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+        """The maps [H, W, S], S = ``maps_at(step)``; ``observe`` finds their sums in ``output.weighted.sums``.
+
+        Args:
+            error: [H, W] absolute error of each pixel in image units, mean over channels, 0 where a pixel does not count; on
+                the grid on which training renders.
+            step: training step.
+        """
+        raise NotImplementedError(f"{type(self).__name__} asks for maps and makes none")
 
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         """Takes what it needs from a rendered view after the backward pass. Changes ``state`` in place."""

@@ -9,7 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, View
+from heatsplat.contracts import Camera, SceneData, View
+from heatsplat.geometry.resampling import resampled
 from heatsplat.splats import Splats
 
 
@@ -67,6 +68,25 @@ class LossInputs:
             return self.prediction, self.target
         inside = self.mask[..., None]
         return torch.where(inside, self.prediction, 0.0), torch.where(inside, self.target, 0.0)
+
+
+@torch.no_grad()
+def pixel_errors(inputs: LossInputs, camera: Camera) -> Tensor:
+    """Absolute error of each pixel in image units, mean over the channels of all images; 0 where the mask is False.
+
+    **Convention:** errors are those of the target's pixels, area averages of the prediction where that is finer; they are
+    given on the grid of ``camera``, [H, W].
+    """
+    pairs = [(inputs.prediction, inputs.target), *inputs.companions.values()]
+    total, channels = 0.0, 0
+    for prediction, target in pairs:
+        seen = resampled(prediction, *target.shape[:2], "area")
+        total = total + (seen - target).abs().sum(-1)
+        channels += target.shape[-1]
+    error = total / channels
+    if inputs.mask is not None:
+        error = torch.where(inputs.mask, error, 0.0)
+    return resampled(error[..., None], camera.height, camera.width, "area")[..., 0]
 
 
 class LossTerm(Protocol):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import RenderOutput
+from heatsplat.contracts import RenderOutput, WeightedSums
 
 # Constants that all backends share, so that they can be compared pixel by pixel (values of gsplat 1.5).
 EPS2D = 0.3  # pixels² added to the diagonal of the projected covariance, unless the caller gives others
@@ -63,6 +63,7 @@ def rasterization(
     absgrad: bool = False,
     depth: bool = True,
     eps2d: float = EPS2D,
+    maps: int = 0,
 ) -> RenderOutput:
     """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
 
@@ -87,6 +88,7 @@ def rasterization(
         absgrad: also gather the sum of absolute values of the screen gradients in ``meta["means2d"].absgrad``.
         depth: composite the depth of the first modality as well.
         eps2d: pixels² added to both variances of the projected covariance (3DGS: 0.3; Mip-Splatting: 0.1, antialiased).
+        maps: how many maps over pixels the backward pass sums by blending weights (``RenderOutput.weighted``).
 
     Returns:
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
@@ -119,8 +121,32 @@ def rasterization(
         backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
     if backend not in BACKENDS:
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
+    probe = _Probe(features, means, maps) if maps else None
+    if probe is not None:
+        features = probe
+        background = None if background is None else torch.cat([background.new_zeros(maps), background])
+        first, *rest = modality_channels or (None,)
+        modality_channels = first and (first + maps, *rest)
     inputs = RenderInputs(
         means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
         background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
     )  # fmt: skip
-    return import_module(f"heatsplat.renderers.{backend}").render(inputs)
+    output = import_module(f"heatsplat.renderers.{backend}").render(inputs)
+    return output if probe is None else probe.read(output)
+
+
+class _Probe:
+    """Channels of zeros before those of the features, whose gradients are sums over the pixels of what weighs them."""
+
+    def __init__(self, features: Tensor | Callable[[Tensor], Tensor], means: Tensor, maps: int) -> None:
+        self.features, self.maps, self.like = features, maps, means
+        self.rows: Tensor | None = None
+
+    def __call__(self, ids: Tensor) -> Tensor:
+        self.rows = self.like.new_zeros(len(ids), self.maps, requires_grad=True)
+        seen = self.features(ids) if callable(self.features) else self.features.index_select(0, ids)
+        return torch.cat([self.rows, seen], dim=1)
+
+    def read(self, output: RenderOutput) -> RenderOutput:
+        image, features = output.features[..., : self.maps], output.features[..., self.maps :]
+        return replace(output, features=features, weighted=WeightedSums(image, self.rows))

@@ -65,6 +65,7 @@ class Renderer:
         modality_channels: tuple[int, ...],
         absgrad: bool = False,
         depth: bool = False,
+        maps: int = 0,
     ) -> RenderOutput:
         """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``."""
         given = means.dtype
@@ -92,6 +93,7 @@ class Renderer:
             absgrad=absgrad,
             depth=depth,
             eps2d=self.eps2d,
+            maps=maps,
         )
         if given == dtype:
             return seen

@@ -15,7 +15,7 @@ from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneErr
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
-from heatsplat.losses.compose import Loss, LossInputs
+from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
@@ -120,6 +120,7 @@ class SplatTraining(pl.LightningModule):
         self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
+        self.density.prepare(scene, self.modality)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
@@ -182,7 +183,7 @@ class SplatTraining(pl.LightningModule):
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
 
-    def render(self, frame: Frame, depth: bool = False, absgrad: bool = False) -> RenderOutput:
+    def render(self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
 
         channels = self.thermal.modality_channels[0]
@@ -200,6 +201,7 @@ class SplatTraining(pl.LightningModule):
             self.thermal.opacity_channels,
             absgrad=absgrad,
             depth=depth,
+            maps=maps,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
 
@@ -211,9 +213,10 @@ class SplatTraining(pl.LightningModule):
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
         view = view.to(self.device, self.dtype)
-        self.thermal.on_step(self.schedule.round_step(step))
+        here = self.schedule.round_step(step)
+        self.thermal.on_step(here)
         frame = self._fine(view.frame)
-        output = self.render(frame, absgrad=self.density.absgrad)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here))
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -228,7 +231,11 @@ class SplatTraining(pl.LightningModule):
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         self._rendered = (output, frame.camera)
-        return {"loss": sum(terms.values()), "terms": {name: term.detach() for name, term in terms.items()}}
+        loss = sum(terms.values())
+        if output.weighted is not None:  # adds 0 to the loss
+            maps = self.density.pixel_maps(pixel_errors(inputs, frame.camera), here)
+            loss = loss + (output.weighted.image * maps).sum()
+        return {"loss": loss, "terms": {name: term.detach() for name, term in terms.items()}}
 
     def _fine(self, frame: Frame) -> Frame:
         """The frame on the grid on which training renders."""
