@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from heatsplat.renderers.base import rasterization
 
 WIDTH, HEIGHT, COUNT = 40, 32, 60
