@@ -21,7 +21,7 @@ ALLOWED = {
     "metrics": {"contracts", "geometry", "physics"},
     "renderers": {"contracts", "geometry", "splats", "kernels"},
     "thermal": {"contracts", "geometry", "physics", "splats", "kernels"},
-    "density": {"contracts", "geometry", "splats"},
+    "density": {"contracts", "geometry", "physics", "splats"},
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.contracts import SceneData
+
 # A Laplacian of Laplacians: blind to anything that varies linearly along rows or columns (Immerkaer, CVIU 64, 1996).
 _MASK = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _MASK_GAIN = 6.0  # root of the sum of its squares
@@ -15,6 +17,7 @@ _MAD_TO_SIGMA = 1.4826
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
 MIN_NOISE = 1e-6  # image units; what an image without any shows
+NOISY_VIEWS = 5  # of a scene, from which its noise is estimated
 _UNIFORM = 1.0 / math.sqrt(12.0)
 
 
@@ -47,6 +50,16 @@ def noise_of_repeats(images: Tensor, masks: Tensor | None = None) -> float:
     steps = steps - steps.nanmedian(dim=1, keepdim=True).values
     spread = float(_MAD_TO_SIGMA * steps.abs().nanmedian() / math.sqrt(2.0))
     return spread if math.isfinite(spread) else 0.0
+
+
+def noise_of_scene(scene: SceneData, modality: str) -> float:
+    """Standard deviation of the noise of a pixel of a scene's training images, from a few views spread over the record."""
+    positions = torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long()
+    views = [scene.train[i] for i in positions]
+    images = torch.stack([view.image(modality)[..., 0] for view in views]).double()
+    every = torch.ones(images.shape[1:], dtype=torch.bool)
+    masks = torch.stack([every if view.mask is None else view.mask for view in views])
+    return noise_of(images, quantum_of(images[0]), masks)
 
 
 def quantum_of(image: Tensor) -> float:
