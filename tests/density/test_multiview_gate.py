@@ -119,7 +119,9 @@ def test_nothing_is_asked_that_is_not_used():
     off = control(gate_pixels=None, late_blame=None, late_stop=200)
     assert not any(off.maps_at(step) for step in range(300))
     growing = control(late_blame=None, late_stop=200)
-    assert any(growing.maps_at(step) for step in range(100)) and not any(growing.maps_at(step) for step in range(100, 300))
+    assert any(growing.maps_at(step) for step in range(100)) and not any(
+        growing.maps_at(step) for step in range(100, 300)
+    )
     late = control(gate_pixels=None, late_stop=200)
     assert not any(late.maps_at(step) for step in range(100)) and sum(late.maps_at(s) for s in range(100, 300)) == 50
 
