@@ -1,9 +1,13 @@
 """Whole runs under rules of density control: every method lives through them, and a stopped run goes on bit for bit."""
 
+import itertools
+
 import pytest
 import torch
 from helpers import ALL_METHODS
 from running import TINY, run
+
+from heatsplat.training.module import SplatTraining
 
 RULES = {
     "multiview_gate": (
@@ -43,6 +47,26 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(rule, tmp_path):
     resumed = state_of(*run(tmp_path / "resumed", *given, f"ckpt={half}"))
     assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
     assert len(module.splats) > 600  # density control was at work
+
+
+def test_a_run_that_sums_gradients_of_views_moves_at_every_second_step_and_resumes_between_them(tmp_path, monkeypatch):
+    given = (
+        *TINY, "method=etgs", "density=fixed", "optim=adamw", "optim.decoupled.opacity=0.1", "optim.accumulate=2",
+        "max_steps=12", "test=false", "trainer.val_check_interval=12", "callbacks.checkpoint.every_n_train_steps=9",
+    )  # fmt: skip
+    opacities = []
+    end = SplatTraining.on_train_batch_end
+    monkeypatch.setattr(
+        SplatTraining,
+        "on_train_batch_end",
+        lambda self, *rest: (opacities.append(self.splats["opacity_logits"].detach().clone()), end(self, *rest)),
+    )
+    whole = state_of(*run(tmp_path / "whole", *given))
+    moved = [not torch.equal(one, two) for one, two in itertools.pairwise(opacities)]
+    assert moved == [True] * 5 + [False, True] * 3  # from step 6 on, after 7, 9 and 11
+    half = tmp_path / "whole" / "checkpoints" / "step_000009.ckpt"  # one view waits
+    resumed = state_of(*run(tmp_path / "resumed", *given, f"ckpt={half}"))
+    assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
 
 
 PAIRS = [  # every method under one of the rules; under the others where there is time
