@@ -66,6 +66,7 @@ class Renderer:
         absgrad: bool = False,
         depth: bool = False,
         maps: int = 0,
+        signs: Tensor | None = None,
     ) -> RenderOutput:
         """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``."""
         given = means.dtype
@@ -94,6 +95,7 @@ class Renderer:
             depth=depth,
             eps2d=self.eps2d,
             maps=maps,
+            signs=signs,
         )
         if given == dtype:
             return seen

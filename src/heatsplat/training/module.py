@@ -23,6 +23,7 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.overlap import Overlap
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
@@ -50,6 +51,7 @@ class SplatTraining(pl.LightningModule):
         stages: which parameters are frozen at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
+        overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -73,6 +75,7 @@ class SplatTraining(pl.LightningModule):
         stages: Stages | None = None,
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
+        overlap: Overlap | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -86,6 +89,7 @@ class SplatTraining(pl.LightningModule):
         self.schedule = Schedule(max_steps, self.stages.restarts)
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
+        self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -171,7 +175,10 @@ class SplatTraining(pl.LightningModule):
         """Steps between validations, none of which measures opacities that were just reset."""
         if not isinstance(interval, int):
             return interval
-        return self.schedule.interval(interval, lambda step: self.density.settled(self.schedule.round_step(step - 1)))
+        parts = (self.density, self.overlap)
+        return self.schedule.interval(
+            interval, lambda step: all(part.settled(self.schedule.round_step(step - 1)) for part in parts)
+        )
 
     # One step ----------------------------------------------------------------------------------------
 
@@ -188,7 +195,9 @@ class SplatTraining(pl.LightningModule):
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
 
-    def render(self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0) -> RenderOutput:
+    def render(
+        self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0, signs: Tensor | None = None
+    ) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time."""
 
         channels = self.thermal.modality_channels[0]
@@ -207,6 +216,7 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
             maps=maps,
+            signs=signs,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
 
@@ -221,7 +231,8 @@ class SplatTraining(pl.LightningModule):
         here = self.schedule.round_step(step)
         self.thermal.on_step(here)
         frame = self._fine(view.frame)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here))
+        signs = self.overlap.signs_at(here, len(self.splats), self.seed)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here), signs=signs)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -235,6 +246,8 @@ class SplatTraining(pl.LightningModule):
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
+        if signs is not None:
+            terms["entropy"] = self.overlap.entropy(output, here)
         self._rendered = (output, frame.camera)
         loss = sum(terms.values())
         if output.weighted is not None:  # adds 0 to the loss
@@ -278,6 +291,7 @@ class SplatTraining(pl.LightningModule):
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
             self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
+        self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
