@@ -1,12 +1,9 @@
 """Budget: who grows and when, exactly to B and never above; noise is not detail; what shows nothing goes; resume."""
 
-from pathlib import Path
-
 import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, View, ViewSet, WeightedSums
-from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.budget import CURVES, Budget, _drawn
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.base import rasterization
