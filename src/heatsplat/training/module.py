@@ -104,6 +104,8 @@ class SplatTraining(pl.LightningModule):
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
+        self._pixels = 0  # of the last image
+        self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -180,6 +182,9 @@ class SplatTraining(pl.LightningModule):
     # One step ----------------------------------------------------------------------------------------
 
     def on_train_start(self) -> None:
+        for name, gradient in self._waiting.items():
+            self.get_parameter(name).grad = gradient.to(self.device)
+        self._waiting = {}
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -254,8 +259,17 @@ class SplatTraining(pl.LightningModule):
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
+        self._pixels = camera.width * camera.height
         self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
+
+    def _updates(self, step: int) -> bool:
+        """Whether parameters change after ``step``: always, but where gradients of several views are summed."""
+        return self.optim.updates(step, self.schedule.progress(step)) or step + 1 >= self.schedule.end
+
+    def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
+        if self.global_step == 0 or self._updates(self.global_step - 1):
+            optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
@@ -265,10 +279,13 @@ class SplatTraining(pl.LightningModule):
             inner.state.clear()
             for statistic in self._density_state.values():
                 statistic.zero_()
+        update = self._updates(step)
         with self.stages.on_step(step, inner):
-            optimizer.step(closure=optimizer_closure)
+            optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
         cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
         here = self.schedule.round_step(step)
+        if self.optim.decoupled is not None and update:
+            self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
@@ -346,6 +363,9 @@ class SplatTraining(pl.LightningModule):
             "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
+        if self.global_step > 0 and not self._updates(self.global_step - 1):
+            gradients = ((name, parameter.grad) for name, parameter in self.named_parameters())
+            checkpoint[CHECKPOINT_KEY]["gradients"] = {name: grad.cpu() for name, grad in gradients if grad is not None}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -358,6 +378,7 @@ class SplatTraining(pl.LightningModule):
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
+        self._waiting = checkpoint[CHECKPOINT_KEY].get("gradients", {})
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from heatsplat.splats import Splats
+from heatsplat.training.decoupled import DecoupledDecay
 
 
 class Optimisation:
@@ -19,9 +20,12 @@ class Optimisation:
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to
             its "lr_end" to this power. 1 is what the methods' papers do in 30 000 steps; 0 leaves rates as they are.
         betas, eps: of Adam.
+        accumulate: views whose gradients are summed for one update; 1: every view has an update of its own.
+        accumulate_from: share of the run after which that begins.
+        decoupled: decay of opacities and sizes beside Adam, or None.
 
     Raises:
-        ValueError: ``decay`` is negative.
+        ValueError: ``decay`` is negative, or fewer than one view is accumulated.
     """
 
     def __init__(
@@ -34,12 +38,18 @@ class Optimisation:
         decay: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
+        accumulate: int = 1,
+        accumulate_from: float = 0.5,
+        decoupled: DecoupledDecay | None = None,
     ) -> None:
+        if accumulate < 1:
+            raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
         if decay < 0:
             raise ValueError(f"optim.decay must not be negative, got {decay}")
         self.means, self.means_end, self.decay = means, means_end, decay
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps
+        self.accumulate, self.accumulate_from, self.decoupled = accumulate, accumulate_from, decoupled
 
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
         """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""
@@ -54,6 +64,10 @@ class Optimisation:
             {"params": [splats[name]], "name": name, "lr": lr, "lr_end": ends.get(name, 1.0)}
             for name, lr in rates.items()
         ]
+
+    def updates(self, step: int, progress: float) -> bool:
+        """Whether parameters change after ``step``, at which ``progress`` of the run is done; else its gradients wait."""
+        return self.accumulate == 1 or progress < self.accumulate_from or (step + 1) % self.accumulate == 0
 
     def build(self, groups: list[dict[str, Any]], progress: Callable[[float], float]):
         """The optimiser over all groups, and the scheduler to call after every step.
