@@ -155,7 +155,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": item.lr,
+                "lr": self.optim.pace * item.lr,
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
