@@ -14,7 +14,7 @@ CAMERA = Camera(torch.eye(4), torch.eye(3), width=20, height=10)
 
 
 def budget(**options) -> Budget:
-    return Budget(**{"growth": None} | options)
+    return Budget(**{"multiple": None} | options)
 
 
 def make_cloud(policy, count: int, opacities: list[float] | None = None) -> Cloud:
@@ -90,8 +90,8 @@ def test_what_was_pruned_comes_back_and_a_cap_that_is_lowered_holds():
     assert len(cloud) == 400
 
 
-def test_growth_counts_in_gaussians_of_the_start():
-    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=(), growth=2.5)
+def test_b_may_count_in_gaussians_of_the_start():
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=(), multiple=2.5)
     cloud = make_cloud(policy, 100)
     for step in range(100):
         refine(policy, cloud, step)

@@ -29,7 +29,7 @@ DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and 
 class Budget(DensityControl):
     """Splits where the image is wrong until there are exactly B Gaussians, and removes those that show nothing.
 
-    B is ``cap_max`` or, where that is less, ``growth`` times the Gaussians of the start.
+    B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start.
 
     The score of a Gaussian is the error that its pixels have beyond the noise of the camera, weighted by how much of each
     pixel it is, Σ_v Σ_p w max(e - floor noise, 0), over the last ``views`` steps before an event (the sampler shows each
@@ -52,7 +52,7 @@ class Budget(DensityControl):
         start, stop: first and last step at which Gaussians are added, or removed as transparent.
         every: steps between events.
         cap_max: never more Gaussians than this.
-        growth: B in Gaussians of the start; None: B is ``cap_max``.
+        multiple: B in Gaussians of the start; None: B is ``cap_max``.
         score: "error", "absgrad" (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
         curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
         views: steps before an event over which the score is summed.
@@ -74,7 +74,7 @@ class Budget(DensityControl):
         stop: int = 14_400,
         every: int = 500,
         cap_max: int = 100_000,
-        growth: float | None = 3.0,
+        multiple: float | None = 3.0,
         score: str = "error",
         curve: str = "linear",
         views: int = 10,
@@ -90,15 +90,15 @@ class Budget(DensityControl):
         check_option("density.curve", curve, CURVES)
         if min(every, cap_max, views) < 1:
             raise ValueError(f"density.every, cap_max and views must be at least 1, got {every}, {cap_max} and {views}")
-        if growth is not None and not growth > 0:
-            raise ValueError(f"density.growth must be above 0, or null, got {growth}")
+        if multiple is not None and not multiple > 0:
+            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
         if not 0 < keep <= 1 or min(floor, least_pixels, noise or 0.0) < 0:
             raise ValueError(
                 "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
                 f"got {keep}, {floor}, {noise} and {least_pixels}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
-        self.growth, self.wanted = growth, math.inf
+        self.multiple, self.wanted = multiple, math.inf
         self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
         self.absgrad = score == "absgrad"
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
@@ -121,8 +121,8 @@ class Budget(DensityControl):
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
         "shown" (pixels) and "seen" (views) for removal."""
-        if self.growth is not None:
-            self.wanted = round(self.growth * count)
+        if self.multiple is not None:
+            self.wanted = round(self.multiple * count)
         return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
 
     # When ------------------------------------------------------------------------------------------------------------
