@@ -5,6 +5,7 @@ import torch
 from running import TINY, run
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, View, ViewSet, WeightedSums
+from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.budget import CURVES, Budget, _drawn
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.base import rasterization
