@@ -23,6 +23,7 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
@@ -52,6 +53,7 @@ class SplatTraining(pl.LightningModule):
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
+        overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -76,6 +78,7 @@ class SplatTraining(pl.LightningModule):
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
         resolution: Resolution | None = None,
+        overlap: Overlap | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -90,6 +93,7 @@ class SplatTraining(pl.LightningModule):
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
         self.resolution = resolution or Resolution()
+        self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -177,7 +181,10 @@ class SplatTraining(pl.LightningModule):
         """Steps between validations, none of which measures opacities that were just reset."""
         if not isinstance(interval, int):
             return interval
-        return self.schedule.interval(interval, lambda step: self.density.settled(self.schedule.round_step(step - 1)))
+        parts = (self.density, self.overlap)
+        return self.schedule.interval(
+            interval, lambda step: all(part.settled(self.schedule.round_step(step - 1)) for part in parts)
+        )
 
     # One step ----------------------------------------------------------------------------------------
 
@@ -195,7 +202,13 @@ class SplatTraining(pl.LightningModule):
             self.trainer.should_stop = True
 
     def render(
-        self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0, ratio: float = 1.0
+        self,
+        frame: Frame,
+        depth: bool = False,
+        absgrad: bool = False,
+        maps: int = 0,
+        ratio: float = 1.0,
+        signs: Tensor | None = None,
     ) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time.
 
@@ -219,6 +232,7 @@ class SplatTraining(pl.LightningModule):
             depth=depth,
             maps=maps,
             ratio=ratio,
+            signs=signs,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
 
@@ -235,7 +249,9 @@ class SplatTraining(pl.LightningModule):
         view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
         frame = replace(view.frame, camera=camera)
         self.thermal.on_step(here)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here), ratio=ratio)
+        signs = self.overlap.signs_at(here, len(self.splats), self.seed)
+        maps = self.density.maps_at(here)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -250,6 +266,8 @@ class SplatTraining(pl.LightningModule):
             ratio,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
+        if signs is not None:
+            terms["entropy"] = self.overlap.entropy(output, here)
         self._rendered = (output, camera)
         loss = sum(terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
@@ -286,6 +304,7 @@ class SplatTraining(pl.LightningModule):
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
             self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
+        self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
