@@ -11,7 +11,7 @@ from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.base import DensityChange
 from heatsplat.density.ops import Cloud
-from heatsplat.physics.noise import noise_of_scene
+from heatsplat.physics.noise import noise_of_views
 
 LEAST_VIEWS = 8  # of a scene; FastGS fails where views are few (28 of them: 17 dB)
 WRONG = 0.1  # an error above this share of the largest of its image is wrong (FastGS)
@@ -98,7 +98,7 @@ class MultiviewGate(Adaptive):
                 f"training; it needs {LEAST_VIEWS}. Use density=adaptive."
             )
         self.views = min(self.views, self._count)
-        self.noise = noise_of_scene(scene, modality)
+        self.noise = noise_of_views(scene.train, modality)
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """ "gradient", "absolute" and "seen" [N], over all views; "wrong", "blame" and "blaming" [N], over the V views."""

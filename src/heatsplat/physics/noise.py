@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import ViewSet, evenly_spread
 
 # A Laplacian of Laplacians: blind to anything that varies linearly along rows or columns (Immerkaer, CVIU 64, 1996).
 _MASK = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
@@ -17,8 +17,21 @@ _MAD_TO_SIGMA = 1.4826
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
 MIN_NOISE = 1e-6  # image units; what an image without any shows
-NOISY_VIEWS = 5  # of a scene, from which its noise is estimated
+_NOISY_VIEWS = 5  # from which the noise of a scene's images is estimated
 _UNIFORM = 1.0 / math.sqrt(12.0)
+
+
+def noise_of_views(views: ViewSet, modality: str) -> float:
+    """Standard deviation of the noise of a pixel in the images of a modality, in image units, from a few of the views.
+
+    The median over these views of ``noise_of`` their first channel; quantisation counts as in the first of them.
+    """
+    few = [views[i] for i in evenly_spread(len(views), _NOISY_VIEWS)]
+    images = [view.image(modality)[None, ..., 0].double() for view in few]
+    masks = [None if view.mask is None else view.mask[None] for view in few]
+    step = quantum_of(images[0] if masks[0] is None else images[0][masks[0]])
+    single = [noise_of(image, step, mask) for image, mask in zip(images, masks, strict=True)]
+    return float(torch.tensor(single, dtype=torch.float64).median())
 
 
 def noise_of(images: Tensor, step: float = 0.0, masks: Tensor | None = None) -> float:
@@ -50,16 +63,6 @@ def noise_of_repeats(images: Tensor, masks: Tensor | None = None) -> float:
     steps = steps - steps.nanmedian(dim=1, keepdim=True).values
     spread = float(_MAD_TO_SIGMA * steps.abs().nanmedian() / math.sqrt(2.0))
     return spread if math.isfinite(spread) else 0.0
-
-
-def noise_of_scene(scene: SceneData, modality: str) -> float:
-    """Standard deviation of the noise of a pixel of a scene's training images, from a few views spread over the record."""
-    positions = torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long()
-    views = [scene.train[i] for i in positions]
-    images = torch.stack([view.image(modality)[..., 0] for view in views]).double()
-    every = torch.ones(images.shape[1:], dtype=torch.bool)
-    masks = torch.stack([every if view.mask is None else view.mask for view in views])
-    return noise_of(images, quantum_of(images[0]), masks)
 
 
 def quantum_of(image: Tensor) -> float:

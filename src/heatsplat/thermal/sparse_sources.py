@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, evenly_spread
-from heatsplat.physics.noise import MIN_NOISE, noise_of_scene
+from heatsplat.physics.noise import MIN_NOISE, noise_of_views
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class SparseSources:
         times = sorted(set(scene.train.times_s))
         self.times_s = [times[i] for i in evenly_spread(len(times), MOMENTS)]
         if self.noise is None:
-            self.noise = noise_of_scene(scene, modality)
+            self.noise = noise_of_views(scene.train, modality)
             if self.noise <= MIN_NOISE:
                 log.warning(
                     "neighbouring pixels of scene '%s' are equal, so its noise is unknown and no source is dropped; "

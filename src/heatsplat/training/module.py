@@ -24,6 +24,7 @@ from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.overlap import Overlap
+from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
@@ -51,6 +52,7 @@ class SplatTraining(pl.LightningModule):
         stages: which parameters are frozen at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
+        resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
         seed: seed of every random draw.
@@ -75,6 +77,7 @@ class SplatTraining(pl.LightningModule):
         stages: Stages | None = None,
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
+        resolution: Resolution | None = None,
         overlap: Overlap | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
@@ -89,6 +92,7 @@ class SplatTraining(pl.LightningModule):
         self.schedule = Schedule(max_steps, self.stages.restarts)
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
+        self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
@@ -127,8 +131,10 @@ class SplatTraining(pl.LightningModule):
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.density.prepare(scene, self.modality)
+        learned = (self.modality, *self.thermal.companions)
+        self.resolution.prepare(scene, learned, self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
-        modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
+        modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
@@ -153,7 +159,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": item.lr,
+                "lr": self.optim.pace * item.lr,
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
@@ -196,9 +202,18 @@ class SplatTraining(pl.LightningModule):
             self.trainer.should_stop = True
 
     def render(
-        self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0, signs: Tensor | None = None
+        self,
+        frame: Frame,
+        depth: bool = False,
+        absgrad: bool = False,
+        maps: int = 0,
+        ratio: float = 1.0,
+        signs: Tensor | None = None,
     ) -> RenderOutput:
-        """The clean image that the splats send to the camera of ``frame`` at its time."""
+        """The clean image that the splats send to the camera of ``frame`` at its time.
+
+        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there.
+        """
 
         channels = self.thermal.modality_channels[0]
         moved = self.thermal.geometry(self.splats, _query(frame))
@@ -216,6 +231,7 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
             maps=maps,
+            ratio=ratio,
             signs=signs,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
@@ -227,12 +243,15 @@ class SplatTraining(pl.LightningModule):
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
-        view = view.to(self.device, self.dtype)
-        here = self.schedule.round_step(step)
+        here, progress = self.schedule.round_step(step), self.schedule.progress(step)
+        ratio = self.resolution.ratio(progress)
+        camera = rendered(view.camera, self.supersample / ratio)
+        view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
+        frame = replace(view.frame, camera=camera)
         self.thermal.on_step(here)
-        frame = self._fine(view.frame)
         signs = self.overlap.signs_at(here, len(self.splats), self.seed)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here), signs=signs)
+        maps = self.density.maps_at(here)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -242,25 +261,19 @@ class SplatTraining(pl.LightningModule):
             view,
             self.splats,
             step,
-            self.schedule.progress(step),
+            progress,
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
+            ratio,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         if signs is not None:
             terms["entropy"] = self.overlap.entropy(output, here)
-        self._rendered = (output, frame.camera)
+        self._rendered = (output, camera)
         loss = sum(terms.values())
-        if output.weighted is not None:  # adds 0 to the loss
-            maps = self.density.pixel_maps(pixel_errors(inputs, frame.camera), here)
-            loss = loss + (output.weighted.image * maps).sum()
+        if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            loss = loss + (output.weighted.image * maps).sum() * ratio**2
         return {"loss": loss, "terms": {name: term.detach() for name, term in terms.items()}}
-
-    def _fine(self, frame: Frame) -> Frame:
-        """The frame on the grid on which training renders."""
-        if self.supersample == 1:
-            return frame
-        camera, factor = frame.camera, self.supersample
-        return replace(frame, camera=camera.resized(factor * camera.width, factor * camera.height))
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered

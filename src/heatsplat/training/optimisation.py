@@ -10,12 +10,17 @@ import torch
 from heatsplat.splats import Splats
 from heatsplat.training.decoupled import DecoupledDecay
 
+PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
+
 
 class Optimisation:
     """The optimiser's settings (defaults of 3D Gaussian Splatting).
 
     Args:
         means, log_scales, quats, opacity_logits: learning rates; that of the means is multiplied by the scene's extent.
+        length_power: how much faster parameters of Gaussians learn in a run shorter than 30 000 steps, for which the papers chose
+            their rates: (30 000 / steps) ** length_power times, in longer ones as fast. Opacities are left out, they saturate.
+        steps: planned length of the run.
         means_end: factor on the means' learning rate at the last step; log-linear in between.
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to
             its "lr_end" to this power. 1 is what the methods' papers do in 30 000 steps; 0 leaves rates as they are.
@@ -35,6 +40,8 @@ class Optimisation:
         log_scales: float = 5e-3,
         quats: float = 1e-3,
         opacity_logits: float = 5e-2,
+        length_power: float = 0.0,
+        steps: int = PUBLISHED_STEPS,
         decay: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
@@ -46,6 +53,7 @@ class Optimisation:
             raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
         if decay < 0:
             raise ValueError(f"optim.decay must not be negative, got {decay}")
+        self.pace = max(PUBLISHED_STEPS / steps, 1.0) ** length_power
         self.means, self.means_end, self.decay = means, means_end, decay
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps
@@ -54,9 +62,9 @@ class Optimisation:
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
         """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""
         rates = {
-            "means": self.means * extent,
-            "log_scales": self.log_scales,
-            "quats": self.quats,
+            "means": self.pace * self.means * extent,
+            "log_scales": self.pace * self.log_scales,
+            "quats": self.pace * self.quats,
             "opacity_logits": self.opacity_logits,
         }
         ends = {"means": self.means_end}
