@@ -109,6 +109,8 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 raise
             sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
         except Exception as error:  # of a job of a sweep, when all others have run
+            if "group override must be a string" in str(error) and (nulled := _nulled()) and not all_of_it:
+                sys.exit(f"{nulled}=null: a group takes the name of one of its options: {', '.join(_options(nulled))}")
             cause = _expected(error)
             if all_of_it or cause is None:
                 raise
@@ -136,6 +138,16 @@ def _meant(error: Exception, name: str) -> str:
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _nulled() -> str | None:
+    """The configuration group that the command line sets to null, if there is one."""
+    given = (text.removesuffix("=null") for text in sys.argv[1:] if text.endswith("=null"))
+    return next((group for group in given if _options(group)), None)
+
+
+def _options(group: str) -> list[str]:
+    return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
 def _keys(settings: dict[str, Any], path: str = "") -> Iterator[str]:

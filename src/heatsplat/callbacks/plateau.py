@@ -12,12 +12,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.callbacks.budget import BudgetClock
-from heatsplat.contracts import SceneError, evenly_spread
-from heatsplat.physics.noise import noise_of
+from heatsplat.contracts import SceneError
+from heatsplat.physics.noise import noise_of_views
 
 log = logging.getLogger("heatsplat")
-
-NOISE_VIEWS = 16  # training views from which the noise of the camera is judged
 
 
 class Plateau(pl.Callback):
@@ -56,13 +54,7 @@ class Plateau(pl.Callback):
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if any(isinstance(callback, BudgetClock) for callback in trainer.callbacks):
             raise SceneError("callbacks=plateau and budget= both move the end of the run: leave one out")
-        views = module.scene.train
-        chosen = [views[i] for i in evenly_spread(len(views), NOISE_VIEWS)]
-        images = [view.image(module.modality).mean(-1) for view in chosen]
-        masks = [torch.ones_like(image, dtype=torch.bool) if view.mask is None else view.mask for image, view in
-                 zip(images, chosen, strict=True)]  # fmt: skip
-        single = [noise_of(image[None], masks=mask[None]) for image, mask in zip(images, masks, strict=True)]
-        self._variance = float(torch.tensor(single, dtype=torch.float64).median()) ** 2
+        self._variance = noise_of_views(module.scene.train, module.modality) ** 2
 
     @torch.no_grad()
     def on_train_batch_end(
@@ -71,9 +63,11 @@ class Plateau(pl.Callback):
         if self._found is not None:
             return
         view, schedule, step = batch, module.schedule, trainer.global_step
-        total, visits = self._now.get(view.frame.frame_id, (0.0, 0))
-        error = squared_error(outputs["prediction"], view.image(module.modality), view.mask)
-        self._now[view.frame.frame_id] = (total + error, visits + 1)
+        prediction, image = outputs["prediction"], view.image(module.modality)
+        if len(prediction) >= len(image):  # a coarse start tells nothing of full size
+            total, visits = self._now.get(view.frame.frame_id, (0.0, 0))
+            error = squared_error(prediction, image, view.mask)
+            self._now[view.frame.frame_id] = (total + error, visits + 1)
         tenth = max(1, round(schedule.steps / 10))
         if step % tenth:
             return

@@ -26,6 +26,7 @@ CURVES_FILE = "renders/curves.png"
 
 COST_UNITS = {
     "train_seconds": "s",
+    "cpu_seconds": "s",
     "steps_per_second": "1/s",
     "render_fps": "1/s",
     "peak_memory_mb": "MB",

@@ -25,6 +25,8 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.overlap import Overlap
+from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
@@ -53,6 +55,8 @@ class SplatTraining(pl.LightningModule):
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
         merging: what is done to Gaussians after training, before the test; None: nothing.
+        resolution: how large images are over the run; None: full size throughout.
+        overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -77,6 +81,8 @@ class SplatTraining(pl.LightningModule):
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
         merging: Merging | None = None,
+        resolution: Resolution | None = None,
+        overlap: Overlap | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -91,6 +97,8 @@ class SplatTraining(pl.LightningModule):
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
         self.merging = merging or Merging()
+        self.resolution = resolution or Resolution()
+        self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -105,6 +113,8 @@ class SplatTraining(pl.LightningModule):
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
+        self._pixels = 0  # of the last image
+        self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -126,8 +136,10 @@ class SplatTraining(pl.LightningModule):
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.density.prepare(scene, self.modality)
+        learned = (self.modality, *self.thermal.companions)
+        self.resolution.prepare(scene, learned, self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
-        modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
+        modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
@@ -153,7 +165,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": item.lr,
+                "lr": self.optim.pace * item.lr,
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
@@ -175,11 +187,17 @@ class SplatTraining(pl.LightningModule):
         """Steps between validations, none of which measures opacities that were just reset."""
         if not isinstance(interval, int):
             return interval
-        return self.schedule.interval(interval, lambda step: self.density.settled(self.schedule.round_step(step - 1)))
+        parts = (self.density, self.overlap)
+        return self.schedule.interval(
+            interval, lambda step: all(part.settled(self.schedule.round_step(step - 1)) for part in parts)
+        )
 
     # One step ----------------------------------------------------------------------------------------
 
     def on_train_start(self) -> None:
+        for name, gradient in self._waiting.items():
+            self.get_parameter(name).grad = gradient.to(self.device)
+        self._waiting = {}
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -205,10 +223,15 @@ class SplatTraining(pl.LightningModule):
         depth: bool = False,
         absgrad: bool = False,
         maps: int = 0,
+        ratio: float = 1.0,
+        signs: Tensor | None = None,
         values: Tensor | None = None,
     ) -> RenderOutput:
-        """The clean image that the splats send to the camera of ``frame`` at its time; ``values`` [N, C] are what they emit
-        in place of what the thermal model makes of them."""
+        """The clean image that the splats send to the camera of ``frame`` at its time.
+
+        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
+        [N, C] are what they emit in place of what the thermal model makes of them.
+        """
 
         channels = self.thermal.modality_channels[0]
         moved = self.thermal.geometry(self.splats, _query(frame))
@@ -227,6 +250,8 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
             maps=maps,
+            ratio=ratio,
+            signs=signs,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
 
@@ -237,11 +262,15 @@ class SplatTraining(pl.LightningModule):
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
-        view = view.to(self.device, self.dtype)
-        here = self.schedule.round_step(step)
+        here, progress = self.schedule.round_step(step), self.schedule.progress(step)
+        ratio = self.resolution.ratio(progress)
+        camera = rendered(view.camera, self.supersample / ratio)
+        view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
+        frame = replace(view.frame, camera=camera)
         self.thermal.on_step(here)
-        frame = self._fine(view.frame)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here))
+        signs = self.overlap.signs_at(here, len(self.splats), self.seed)
+        maps = self.density.maps_at(here)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -251,29 +280,34 @@ class SplatTraining(pl.LightningModule):
             view,
             self.splats,
             step,
-            self.schedule.progress(step),
+            progress,
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
+            ratio,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
-        self._rendered = (output, frame.camera)
+        if signs is not None:
+            terms["entropy"] = self.overlap.entropy(output, here)
+        self._rendered = (output, camera)
         loss = sum(terms.values())
-        if output.weighted is not None:  # adds 0 to the loss
-            maps = self.density.pixel_maps(pixel_errors(inputs, frame.camera), here)
-            loss = loss + (output.weighted.image * maps).sum()
+        if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
 
-    def _fine(self, frame: Frame) -> Frame:
-        """The frame on the grid on which training renders."""
-        if self.supersample == 1:
-            return frame
-        camera, factor = frame.camera, self.supersample
-        return replace(frame, camera=camera.resized(factor * camera.width, factor * camera.height))
-
     def on_after_backward(self) -> None:
         output, camera = self._rendered
+        self._pixels = camera.width * camera.height
         self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
+
+    def _updates(self, step: int) -> bool:
+        """Whether parameters change after ``step``: always, but where gradients of several views are summed."""
+        return self.optim.updates(step, self.schedule.progress(step)) or step + 1 >= self.schedule.end
+
+    def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
+        if self.global_step == 0 or self._updates(self.global_step - 1):
+            optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
@@ -283,10 +317,14 @@ class SplatTraining(pl.LightningModule):
             inner.state.clear()
             for statistic in self._density_state.values():
                 statistic.zero_()
+        update = self._updates(step)
         with self.stages.on_step(step, inner):
-            optimizer.step(closure=optimizer_closure)
+            optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
         cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
+        if self.optim.decoupled is not None and update:
+            self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
+        self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
@@ -396,6 +434,9 @@ class SplatTraining(pl.LightningModule):
             "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
+        if self.global_step > 0 and not self._updates(self.global_step - 1):
+            gradients = ((name, parameter.grad) for name, parameter in self.named_parameters())
+            checkpoint[CHECKPOINT_KEY]["gradients"] = {name: grad.cpu() for name, grad in gradients if grad is not None}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -408,6 +449,7 @@ class SplatTraining(pl.LightningModule):
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
+        self._waiting = checkpoint[CHECKPOINT_KEY].get("gradients", {})
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 
