@@ -284,10 +284,13 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 @_job
 def simplify(config: dict[str, Any], output_dir: Path) -> None:
     """Merges the Gaussians of a checkpoint into fewer: a checkpoint and a PLY for each level of detail."""
+    from heatsplat.contracts import SceneError
     from heatsplat.runs.levels import write_levels
     from heatsplat.runs.run import load
     from heatsplat.training.session import prepare_machine
 
+    if HydraConfig.get().runtime.choices.merge == "none":
+        raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
     prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
     merging = build(config["merge"])

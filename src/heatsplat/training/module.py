@@ -213,8 +213,8 @@ class SplatTraining(pl.LightningModule):
             return
         optimizer = self.trainer.optimizers[0]
         found = self.merging(self, self.cloud(getattr(optimizer, "optimizer", optimizer)))
-        self.smoothing.follow(self.splats.means.detach(), self.global_step, self.schedule.end, found is not None)
         if found is not None:
+            self._show(self.splats)
             self.results.run["merging"] = found
 
     def render(
