@@ -165,7 +165,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": self.optim.pace * item.lr,
+                "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
