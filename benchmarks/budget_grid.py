@@ -110,7 +110,8 @@ def run(
         place = folder / "runs" / "_".join(names).replace("/", "-") / str(seed)
         wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
         chosen = [*_of(method, scene, seed), *settings]
-        wanted += ["density.reset_every=null"] if "reset_every" in compose(chosen)["density"] else []
+        density = compose(chosen)["density"]
+        wanted += [f"density.{name}=null" for name in ("reset_every", "multiple") if name in density]  # as budget= trains
         wanted += [f"density.cap_max={cap}"] if cap else []
         results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])

@@ -100,6 +100,7 @@ def test_further_settings_are_measured_beside_the_same_without(tmp_path, monkeyp
     assert len(names) == len(set(names))
     for name, overrides in asked:
         assert ("density.reset_every=null" in overrides) == ("density=budget" not in overrides), name
+        assert ("density.multiple=null" in overrides) == ("density=budget" in overrides), name  # the cap counts
     points = read_points(tmp_path / "curves.csv")
     assert {point.settings for point in points} == {
         (), ("density=budget", "schedule=coarse_to_fine"), ("dtype=float64",),

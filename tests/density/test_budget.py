@@ -1,9 +1,8 @@
 """Budget: who grows and when, exactly to B and never above; noise is not detail; what shows nothing goes; resume."""
 
-from pathlib import Path
-
 import pytest
 import torch
+from running import TINY, run
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, View, ViewSet, WeightedSums
 from heatsplat.density.adaptive import Adaptive
@@ -15,7 +14,11 @@ from heatsplat.splats import Splats
 CAMERA = Camera(torch.eye(4), torch.eye(3), width=20, height=10)
 
 
-def make_cloud(policy, count: int, opacities: list[float] | None = None, optimizer: bool = False) -> Cloud:
+def budget(**options) -> Budget:
+    return Budget(**{"multiple": None} | options)
+
+
+def make_cloud(policy, count: int, opacities: list[float] | None = None) -> Cloud:
     splats = Splats(
         {
             "means": torch.arange(count * 3, dtype=torch.float32).reshape(count, 3),
@@ -54,7 +57,7 @@ def observed(policy: Budget, cloud: Cloud, sums: torch.Tensor, step: int) -> Non
 
 @pytest.mark.parametrize("curve", sorted(CURVES))
 def test_numbers_follow_the_curve_to_exactly_b(curve: str):
-    policy = Budget(start=20, stop=115, every=10, cap_max=777, curve=curve, score="uniform", remove_at=())
+    policy = budget(start=20, stop=115, every=10, cap_max=777, curve=curve, score="uniform", remove_at=())
     cloud = make_cloud(policy, 200)
     numbers = []
     for step in range(200):
@@ -71,7 +74,7 @@ def test_numbers_follow_the_curve_to_exactly_b(curve: str):
 
 
 def test_what_was_pruned_comes_back_and_a_cap_that_is_lowered_holds():
-    policy = Budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=())
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=())
     cloud = make_cloud(policy, 100)
     for step in range(100):
         if step == 39:
@@ -88,14 +91,22 @@ def test_what_was_pruned_comes_back_and_a_cap_that_is_lowered_holds():
     assert len(cloud) == 400
 
 
+def test_b_may_count_in_gaussians_of_the_start():
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=(), multiple=2.5)
+    cloud = make_cloud(policy, 100)
+    for step in range(100):
+        refine(policy, cloud, step)
+    assert len(cloud) == 250
+
+
 def test_more_than_b_at_the_start_stay_and_none_is_added():
-    policy = Budget(start=0, stop=100, every=10, cap_max=50, score="uniform", remove_at=())
+    policy = budget(start=0, stop=100, every=10, cap_max=50, score="uniform", remove_at=())
     cloud = make_cloud(policy, 60)
     assert [refine(policy, cloud, step).added for step in range(9, 100, 10)] == [0] * 10
 
 
 def test_one_event_splits_each_gaussian_once_at_most():
-    policy = Budget(start=0, stop=10, every=10, cap_max=1000, score="uniform", remove_at=())
+    policy = budget(start=0, stop=10, every=10, cap_max=1000, score="uniform", remove_at=())
     cloud = make_cloud(policy, 10)
     assert refine(policy, cloud, 9).added == 10
 
@@ -113,7 +124,7 @@ def test_only_gaussians_with_a_score_grow_the_worst_most_often():
 
 
 def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_event():
-    policy = Budget(start=0, stop=100, every=10, views=3, noise=0.1, remove_at=())
+    policy = budget(start=0, stop=100, every=10, views=3, noise=0.1, remove_at=())
     policy.prepare(noisy_scene(0.0, 1), "thermal")
     assert [policy.maps_at(step) for step in range(11)] == [0] * 7 + [3] * 3 + [0]
     assert policy.maps_at(100) == 0
@@ -128,7 +139,7 @@ def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_ev
 
 
 def test_gaussians_wrong_on_few_pixels_are_not_split():
-    policy = Budget(start=0, stop=100, every=10, cap_max=100, remove_at=())
+    policy = budget(start=0, stop=100, every=10, cap_max=100, remove_at=())
     cloud = make_cloud(policy, 3)
     blame(cloud, [1.0, 1.0, 1.0])
     cloud.state["wrong"] = torch.tensor([2.9, 4.9, 5.1])  # of 200 pixels each: 3 + 1 %
@@ -136,7 +147,7 @@ def test_gaussians_wrong_on_few_pixels_are_not_split():
 
 
 def test_absgrad_scores_by_the_pull_on_screen_positions():
-    policy = Budget(start=0, stop=100, every=10, views=2, score="absgrad", remove_at=())
+    policy = budget(start=0, stop=100, every=10, views=2, score="absgrad", remove_at=())
     assert policy.absgrad and policy.maps_at(9) == 0
     cloud = make_cloud(policy, 2)
     means2d = torch.zeros(2, 2)
@@ -183,7 +194,7 @@ def selected(policy: Budget, noise: float) -> float:
 
 def test_noise_is_not_detail():
     def policy(floor: float) -> Budget:
-        made = Budget(start=0, stop=100, every=50, cap_max=10**6, floor=floor, remove_at=())
+        made = budget(start=0, stop=100, every=50, cap_max=10**6, floor=floor, remove_at=())
         made.prepare(noisy_scene(0.02, 3), "thermal")
         return made
 
@@ -198,7 +209,7 @@ def test_noise_is_not_detail():
 
 
 def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
-    policy = Budget(start=0, stop=10, every=10, cap_max=6, score="uniform", remove_at=(11,), keep=0.99)
+    policy = budget(start=0, stop=10, every=10, cap_max=6, score="uniform", remove_at=(11,), keep=0.99)
     policy.prepare(noisy_scene(0.01, 4), "thermal")
     assert [step for step in range(40) if policy.maps_at(step)] == [12, 13, 14, 15]
     cloud = make_cloud(policy, 6)
@@ -212,7 +223,7 @@ def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
 
 
 def test_what_another_modality_shows_stays():
-    policy = Budget(start=0, stop=10, every=10, remove_at=(0,))
+    policy = budget(start=0, stop=10, every=10, remove_at=(0,))
     cloud = make_cloud(policy, 3)
     cloud.splats.raw["opacity_logits"] = torch.nn.Parameter(torch.tensor([[0.0, 0.0], [-30.0, 0.0], [-30.0, -30.0]]))
     cloud.state["shown"] = torch.tensor([1.0, 0.0, 0.0])
@@ -221,7 +232,7 @@ def test_what_another_modality_shows_stays():
 
 
 def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
-    policy = Budget(start=0, stop=100, every=10, cap_max=3, remove_at=())
+    policy = budget(start=0, stop=100, every=10, cap_max=3, remove_at=())
     cloud = make_cloud(policy, 3, [0.5, 0.001, 0.5])
     assert refine(policy, cloud, 9).removed == 1 and len(cloud) == 2
     with pytest.raises(RuntimeError, match="remove all 2 Gaussians at step 9"):
@@ -234,3 +245,83 @@ def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Budget(**options)
+
+
+# Whole runs ------------------------------------------------------------------------------------------------------------
+
+
+def plane_view(texture, noise: float, step: int) -> tuple[Camera, torch.Tensor]:
+    """A camera before the plane z = 4, a little aside at every step, and what it records."""
+    size, focal = 64, 64.0
+    draw = torch.Generator().manual_seed(step)
+    shift = 0.4 * (torch.rand(2, generator=draw) - 0.5)
+    viewmat = torch.eye(4)
+    viewmat[:2, 3] = -shift
+    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    places = (torch.arange(size) + 0.5 - size / 2) * 4 / focal
+    image = texture(places[None, :] + shift[0], places[:, None] + shift[1])
+    return Camera(viewmat, K, size, size), (image + noise * torch.randn(size, size, generator=draw))[..., None]
+
+
+def share_of_new_on_the_right(policy, steps: int, noise: float) -> float:
+    """Trains Gaussians on a plane whose left half is flat and whose right half is textured."""
+
+    def texture(x, y):
+        return 0.5 + torch.where(x > 0, 0.2 * torch.sin(12 * x) * torch.sin(12 * y), 0.0)
+
+    grid = torch.linspace(-2.0, 2.0, 16)
+    x, y = torch.meshgrid(grid, grid, indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((256,), 4.0)], dim=1)
+    splats = Splats(
+        {
+            "means": means,
+            "log_scales": torch.tensor([0.12, 0.13, 0.02]).log().repeat(256, 1),
+            "quats": torch.tensor([1.0, 0, 0, 0]).repeat(256, 1),
+            "opacity_logits": torch.full((256, 1), 1.0),
+            "heat": torch.full((256, 1), 0.4),
+        }
+    )
+    rates = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "heat": 1e-2}
+    optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name, "lr": lr} for name, lr in rates.items()])
+    cloud = Cloud(splats, optimizer, policy.initial_state(256, torch.device("cpu")))
+    for step in range(steps):
+        camera, target = plane_view(texture, noise, step)
+        output = rasterization(
+            splats.means, splats.quats, splats.scales, splats.opacities, splats["heat"], camera.viewmat.float(),
+            camera.K.float(), camera.width, camera.height, backend="cpu", depth=False, maps=policy.maps_at(step),
+        )  # fmt: skip
+        error = (output.features - target).abs()
+        loss = error.mean()
+        if output.weighted is not None:
+            loss = loss + (output.weighted.image * policy.pixel_maps(error.detach()[..., 0], step)).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        policy.observe(cloud.state, output, camera, step)
+        optimizer.step()
+        policy.refine(cloud, step, 1.0, torch.Generator().manual_seed(step))
+    assert len(splats) > 300
+    right = int((splats.means[:, 0] > 0).sum())
+    return (right - 128) / (len(splats) - 256)
+
+
+def test_new_gaussians_come_where_there_is_texture():
+    steps, noise = 160, 0.01
+    ours = budget(start=40, stop=160, every=20, cap_max=512, noise=noise, remove_at=())
+    theirs = Adaptive(start=40, stop=160, every=20, cap_max=512, duplicate_scale=0.05, reset_every=None)
+    share = share_of_new_on_the_right(ours, steps, noise)
+    assert share >= 0.8
+    assert share_of_new_on_the_right(theirs, steps, noise) < share
+
+
+@pytest.mark.parametrize("method", ["etgs", "ravigs"])
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(method: str, tmp_path):
+    overrides = (
+        *TINY, f"method={method}", "density=budget", "density.start=5", "density.every=10", "density.stop=30", "max_steps=60",
+        "density.remove_at=[31]", "test=false", "callbacks.checkpoint.every_n_train_steps=26", "trainer.limit_val_batches=0",
+    )  # fmt: skip
+    whole, _ = run(tmp_path / "whole", *overrides)
+    checkpoint = tmp_path / "whole" / "checkpoints" / "step_000026.ckpt"  # in the views before an event
+    resumed, _ = run(tmp_path / "resumed", *overrides, f"ckpt={checkpoint}")
+    assert 600 < len(whole.splats) <= 1800
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name

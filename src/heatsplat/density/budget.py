@@ -1,8 +1,9 @@
-"""Density control to a budget: the Gaussians with the largest error are split along their longest axis, exactly B of them."""
+"""Density control to a budget: Gaussians are split along their longest axis where images are wrong, exactly to B of them."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -26,7 +27,9 @@ DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and 
 
 
 class Budget(DensityControl):
-    """Splits where the image is wrong until there are exactly ``cap_max`` Gaussians, and removes those that show nothing.
+    """Splits where the image is wrong until there are exactly B Gaussians, and removes those that show nothing.
+
+    B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start.
 
     The score of a Gaussian is the error that its pixels have beyond the noise of the camera, weighted by how much of each
     pixel it is, Σ_v Σ_p w max(e - floor noise, 0), over the last ``views`` steps before an event (the sampler shows each
@@ -48,7 +51,8 @@ class Budget(DensityControl):
     Args:
         start, stop: first and last step at which Gaussians are added, or removed as transparent.
         every: steps between events.
-        cap_max: B.
+        cap_max: never more Gaussians than this.
+        multiple: B in Gaussians of the start; None: B is ``cap_max``.
         score: "error", "absgrad" (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
         curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
         views: steps before an event over which the score is summed.
@@ -70,8 +74,9 @@ class Budget(DensityControl):
         stop: int = 14_400,
         every: int = 500,
         cap_max: int = 100_000,
+        multiple: float | None = 3.0,
         score: str = "error",
-        curve: str = "sqrt",
+        curve: str = "linear",
         views: int = 10,
         floor: float = 3.0,
         noise: float | None = None,
@@ -85,12 +90,15 @@ class Budget(DensityControl):
         check_option("density.curve", curve, CURVES)
         if min(every, cap_max, views) < 1:
             raise ValueError(f"density.every, cap_max and views must be at least 1, got {every}, {cap_max} and {views}")
+        if multiple is not None and not multiple > 0:
+            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
         if not 0 < keep <= 1 or min(floor, least_pixels, noise or 0.0) < 0:
             raise ValueError(
                 "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
                 f"got {keep}, {floor}, {noise} and {least_pixels}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
+        self.multiple, self.wanted = multiple, math.inf
         self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
         self.absgrad = score == "absgrad"
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
@@ -113,6 +121,8 @@ class Budget(DensityControl):
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
         "shown" (pixels) and "seen" (views) for removal."""
+        if self.multiple is not None:
+            self.wanted = round(self.multiple * count)
         return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
 
     # When ------------------------------------------------------------------------------------------------------------
@@ -214,7 +224,7 @@ class Budget(DensityControl):
         score = torch.ones_like(state["score"]) if self.score == "uniform" else state["score"].clone()
         if self.score == "error":
             score[state["wrong"] <= self.least_pixels + BY_CHANCE * state["weight"]] = 0
-        wanted = round(self._share(step) * max(self.cap_max - len(cloud), 0))
+        wanted = round(self._share(step) * max(min(self.wanted, self.cap_max) - len(cloud), 0))
         chosen = _drawn(score, wanted, generator)
         cloud.split(chosen, self.split)
         return len(chosen)
