@@ -12,7 +12,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.studies import time_to_accuracy
 from heatsplat.studies.time_to_accuracy import run
-from heatsplat.studies.time_to_accuracy_runs import Outcome, Panel
+from heatsplat.studies.time_to_accuracy_runs import Outcome
 
 CONFIG = Path(cli.CONF) / "study" / "time_to_accuracy.yaml"
 REFERENCE, RECIPES = ["max_steps=800"], {"quick": ["preset=fast"]}
@@ -194,8 +194,3 @@ def test_the_configuration_asks_for_what_there_is():
     for recipe in study["recipes"].values():
         config = compose([*overrides, "method=etgs", "data.scene=heated", *recipe])
         assert config["max_steps"] <= 30000 and config["callbacks"]["images"] is None
-
-
-def test_a_level_is_worse_than_the_reference_by_the_margin():
-    panel = Panel("", {"psnr": 0.2, "mae_c": 0.02})
-    assert panel.level("psnr", 40.0) == pytest.approx(39.8) and panel.level("mae_c", 0.1) == pytest.approx(0.12)
