@@ -127,3 +127,12 @@ def test_a_run_goes_through_a_share_of_the_decay(decay, end):
     assert rates["quats"] == 1e-3
     with pytest.raises(ValueError, match="optim.decay must not be negative, got -1"):
         Optimisation(decay=-1)
+
+
+def test_gradients_of_several_views_wait_for_one_update():
+    settings = Optimisation(accumulate=4, accumulate_from=0.5)
+    updates = [step for step in range(20) if settings.updates(step, step / 20)]
+    assert updates == [*range(10), 11, 15, 19]
+    assert all(Optimisation().updates(step, 0.99) for step in range(5))
+    with pytest.raises(ValueError, match="at least 1"):
+        Optimisation(accumulate=0)

@@ -67,6 +67,7 @@ class Renderer:
         depth: bool = False,
         maps: int = 0,
         ratio: float = 1.0,
+        signs: Tensor | None = None,
     ) -> RenderOutput:
         """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``.
 
@@ -105,6 +106,7 @@ class Renderer:
             depth=depth,
             eps2d=blur,
             maps=maps,
+            signs=signs,
         )
         if given == dtype:
             return seen

@@ -94,12 +94,14 @@ class Heat(nn.Module, ABC):
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
         lr: learning rate of its own parameters (those that are not per Gaussian).
         lr_end: factor on it at the last step of the run, log-linear in between.
+        inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
     """
 
     needs: frozenset[str] = frozenset()
     narrowest_range_k: float = 0.0
+    inseparable: str = ""
     beyond_record: str = "it is evaluated as within the record, which nothing has tested"
     lr: float = 1e-3
     lr_end: float = 1.0
