@@ -33,7 +33,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
 
     Args:
         overrides: as the command line has them.
-        name: of the command: train | evaluate | render | study.
+        name: of the command: train | evaluate | render | simplify | study.
     """
     return plain(composed(overrides, name), overrides)
 

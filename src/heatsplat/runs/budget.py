@@ -327,7 +327,7 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     made = Plan.from_dict(asked) if isinstance(asked, Mapping) else _measured(config, scene)
     decay = [] if made.decay is None else [f"optim.decay={made.decay}"]
     overrides, density = config["overrides"], config["density"]
-    growth = {"cap_max": made.cap}
+    growth = {"cap_max": made.cap, "multiple": "null"}  # as many as planned
     if "density.reset_every" not in keys_of(overrides):
         growth["reset_every"] = "null"  # as in the runs behind the curves
     growing = [f"density.{key}={value}" for key, value in growth.items() if density.get(key) is not None]
