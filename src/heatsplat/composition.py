@@ -5,6 +5,7 @@ Only Hydra is imported here, so that --help, --cfg and typing errors answer at o
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,6 +47,14 @@ def composed(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+
+
+def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
+    """Which option of each group a training run with these overrides has, such as {"density": "adaptive"}."""
+    open_already = GlobalHydra.instance().is_initialized()
+    with contextlib.nullcontext() if open_already else hydra.initialize_config_dir(CONF, version_base="1.3"):
+        config = hydra.compose("train", list(overrides), return_hydra_config=True)
+    return dict(config.hydra.runtime.choices)
 
 
 def plain(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
