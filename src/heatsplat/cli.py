@@ -78,6 +78,7 @@ EXAMPLES = {
     ),
     "evaluate": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
+    "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
     "study": ("study=frontier study.runs=outputs",),
 }
 
@@ -108,6 +109,8 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 raise
             sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
         except Exception as error:  # of a job of a sweep, when all others have run
+            if "group override must be a string" in str(error) and (nulled := _nulled()) and not all_of_it:
+                sys.exit(f"{nulled}=null: a group takes the name of one of its options: {', '.join(_options(nulled))}")
             cause = _expected(error)
             if all_of_it or cause is None:
                 raise
@@ -135,6 +138,16 @@ def _meant(error: Exception, name: str) -> str:
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _nulled() -> str | None:
+    """The configuration group that the command line sets to null, if there is one."""
+    given = (text.removesuffix("=null") for text in sys.argv[1:] if text.endswith("=null"))
+    return next((group for group in given if _options(group)), None)
+
+
+def _options(group: str) -> list[str]:
+    return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
 def _keys(settings: dict[str, Any], path: str = "") -> Iterator[str]:
@@ -265,6 +278,24 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c")}
     written = write_shot(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
+
+
+@_command
+@_job
+def simplify(config: dict[str, Any], output_dir: Path) -> None:
+    """Merges the Gaussians of a checkpoint into fewer: a checkpoint and a PLY for each level of detail."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.runs.levels import write_levels
+    from heatsplat.runs.run import load
+    from heatsplat.training.session import prepare_machine
+
+    if HydraConfig.get().runtime.choices.merge == "none":
+        raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
+    prepare_machine(config["threads"])
+    trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
+    merging = build(config["merge"])
+    written = write_levels(trained, merging, config["levels_c"], output_dir, config["ply"], config["time"])
+    log.info("%d files in %s", len(written), output_dir)
 
 
 @_command

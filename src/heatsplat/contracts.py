@@ -398,6 +398,8 @@ class RenderOutput:
         meta: "means2d" [N, 2] in pixels, a tensor whose .grad is filled by the backward pass (and whose .absgrad is,
             with absgrad=True: sums over pixels and modalities); "radii" [N, 2] int32 extents in pixels, 0 where a
             Gaussian is not seen; "visible_ids" [n] int64.
+        weighted: sums of maps over pixels, where they were asked for.
+        signed: [H, W] composited ``signs`` of the first modality, where they were given.
     """
 
     features: Tensor
@@ -405,6 +407,7 @@ class RenderOutput:
     depth: Tensor | None
     meta: dict[str, Tensor]
     weighted: WeightedSums | None = None
+    signed: Tensor | None = None
 
 
 def evenly_spread(count: int, limit: int) -> list[int]:

@@ -11,15 +11,25 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from heatsplat.callbacks.timing import CLEAR, CostMeter
 
 
+def work(seconds: float) -> None:
+    """Keeps the processor busy for so long, by its own clock."""
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+
+
 class Slow(FakeModule):
-    """Steps take 10 ms, the first one 300 (a compiler at work); a validation view takes 100, a test view 20."""
+    """Steps wait for 10 ms and work for 4, the first one 300 and 200 (a compiler at work); a validation view waits for 100
+    and works for 50, a test view waits for 20."""
 
     def training_step(self, view, batch_idx):
         time.sleep(0.3 if self.global_step == 0 else 0.01)
+        work(0.2 if self.global_step == 0 else 0.004)
         return super().training_step(view, batch_idx)
 
     def validation_step(self, view, batch_idx):
         time.sleep(0.1)
+        work(0.05)
         return super().validation_step(view, batch_idx)
 
     def predict(self, frame):
@@ -38,6 +48,8 @@ def test_compiling_and_evaluation_are_not_training(tmp_path):
     assert cost["warmup_seconds"] >= 0.3
     assert cost["evaluation_seconds"] >= 6 * 0.1
     assert 17 * 0.01 <= cost["train_seconds"] <= elapsed - 0.9
+    assert 17 * 0.004 <= cost["cpu_seconds"] <= cost["train_seconds"] - 17 * 0.01  # waiting is not work
+    assert cost["cpu_seconds"] <= 17 * 0.004 + 0.2  # nor are the first step and the validations training
     assert cost["steps_per_second"] == pytest.approx(17 / cost["train_seconds"])
     assert cost["wall_seconds"] <= elapsed
     assert "render_fps" not in cost
@@ -50,12 +62,14 @@ def test_a_resumed_run_goes_on_counting(tmp_path):
     save = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=8, save_top_k=-1)
     module = Slow(wall(), tmp_path)
     fit(module, trainer(tmp_path, [CostMeter(), save], steps=8, every=4))
-    stored = torch.load(tmp_path / "step=8.ckpt", weights_only=True)["callbacks"]["CostMeter"]["seconds"]
+    stored = torch.load(tmp_path / "step=8.ckpt", weights_only=True)["callbacks"]["CostMeter"]
+    stored, stored_cpu = stored["seconds"], stored["cpu_seconds"]
     assert 5 * 0.01 <= stored["train"] <= module.results.cost["train_seconds"]
     again = Slow(wall(), tmp_path)
     fit(again, trainer(tmp_path, [CostMeter()], steps=16, every=4), ckpt=tmp_path / "step=8.ckpt")
     cost = again.results.cost
     assert cost["train_seconds"] >= stored["train"] + 5 * 0.01
+    assert stored_cpu >= 5 * 0.004 and cost["cpu_seconds"] >= stored_cpu + 5 * 0.004
     assert cost["steps_per_second"] == pytest.approx((8 - 3 + 8 - 3) / cost["train_seconds"])
     assert cost["warmup_seconds"] >= stored["warmup"] + 3 * 0.01
     assert (

@@ -412,10 +412,10 @@ def test_image_and_gradients_are_those_of_a_model_without_it_to_the_last_bit(nam
 @pytest.mark.parametrize("name", EFFECTS)
 def test_with_it_on_all_of_that_differs(name):
     off, on = switched_off(name), switched_on(name)
+    assert on.operators - off.operators
+    shown, without = on.shown, off.shown  # which draws a graph of neighbours, where there is one
     assert on.held() != off.held()
     assert on.numbers() > off.numbers()
-    assert on.operators - off.operators
-    shown, without = on.shown, off.shown
     if name == "thermal_opacity":  # the visible image beside the thermal one, each with opacities of its own
         assert shown.shape[2] == without.shape[2] + 3 and assembled(*CASES[name].others)["loss"] == {}
         assert len(on.model.opacities) == 2 and set(assembled(name)["loss"]) == {"rgb"}

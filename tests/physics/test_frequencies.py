@@ -18,7 +18,7 @@ def times(*values):
 
 def test_bounds_of_the_paper():
     timestamps = torch.arange(0, 1001, 2.0, dtype=torch.float64)
-    omega = frequency_grid(timestamps, 24, tau_min=10.0, gain=HALF_POWER)
+    omega = frequency_grid(timestamps, 24, tau_min=10.0, gain=HALF_POWER, separation=0.0)
     assert omega.shape == (24,)
     assert omega.dtype == torch.float64
     assert omega[0].item() == pytest.approx(2 * math.pi / 1000)  # one cycle over the span (Eq. 27)
@@ -38,7 +38,7 @@ def test_a_span_beyond_a_day_is_cut_at_the_lowest_frequency():
 
 @pytest.mark.parametrize("gain", [1.0, 0.999999])
 def test_no_gain_to_lose_leaves_the_narrowest_band(gain):
-    omega = frequency_grid(times(0, 1, 2, 100), 5, tau_min=50.0, gain=gain)
+    omega = frequency_grid(times(0, 1, 2, 100), 5, tau_min=50.0, gain=gain, separation=0.0)
     assert omega[-1].item() == pytest.approx(1.2 * omega[0].item())  # Eq. 34
     assert len(omega) == 5
 
@@ -68,7 +68,7 @@ def test_none_asked_for_none_given(caplog):
 
 
 def test_frequencies_stay_distinct_in_the_narrowest_band():
-    omega = frequency_grid(times(0.0, 1.0), 100_000, tau_min=1.0, gain=1.0)
+    omega = frequency_grid(times(0.0, 1.0), 100_000, tau_min=1.0, gain=1.0, separation=0.0)
     assert len(omega) == 100_000
     assert (omega.diff() > 0).all()
 
@@ -86,6 +86,8 @@ def test_rounding_of_a_clock_is_no_gap():
         ({"gain": 1.5}, r"gain must lie in \(0, 1\]"),
         ({"tau_min": 0.0}, "tau_min must be"),
         ({"tau_min": math.nan}, "tau_min must be"),
+        ({"separation": -0.1}, "separation must be"),
+        ({"separation": math.inf}, "separation must be"),
         ({"count": -1}, "count of frequencies"),
         ({"count": 2.5}, "count of frequencies"),
         ({"timestamps": times(0, math.nan)}, "timestamps must be finite"),
@@ -102,6 +104,36 @@ def test_default_time_constant_follows_the_sampling():
     assert default_tau_min(torch.arange(0, 10001.0)) == 50  # span / 200
 
 
+def test_neighbours_complete_half_a_cycle_more_over_the_record():
+    """24 on one cycle to 15.9: crowded below, where neighbours are 1.13 times each other, and as they were above."""
+    timestamps = torch.arange(0, 1001, 2.0, dtype=torch.float64)
+    every, apart = (frequency_grid(timestamps, 24, 10.0, HALF_POWER, separation) for separation in (0.0, 0.5))
+    kept, asked = (omega * 1000 / (2 * math.pi) for omega in (apart, every))
+    assert kept[0] == asked[0] and torch.isin(kept, asked).all()
+    assert (kept.diff() >= 0.5).all()
+    above = asked[:, None] - kept[None]
+    assert (torch.where(above >= 0, above, math.inf).min(1).values < 0.5).all()  # none that had room was left out
+    assert torch.equal(apart, frequency_grid(timestamps, 24, 10.0, HALF_POWER))
+
+
+def condition(timestamps, omega):
+    phases = timestamps[:, None] * omega
+    return torch.linalg.cond(torch.cat([phases.sin(), phases.cos()], 1)).item()
+
+
+def test_a_record_tells_separate_frequencies_apart_and_close_ones_not():
+    """The record of 72 frames that the synthetic scene has: rounding has the last word on what 24 harmonics mean."""
+    timestamps = torch.linspace(0, 1800, 72, dtype=torch.float64)
+    found = {
+        separation: frequency_grid(timestamps, 24, default_tau_min(timestamps), HALF_POWER, separation)
+        for separation in (0.0, 0.5, 1.0)
+    }
+    assert [len(omega) for omega in found.values()] == [24, 14, 9]
+    assert condition(timestamps, found[0.0]) > 1e14
+    assert condition(timestamps, found[0.5]) < 1e4
+    assert condition(timestamps, found[1.0]) < 3
+
+
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     st.lists(st.floats(-1e6, 1e6, allow_subnormal=False), max_size=20),
@@ -110,8 +142,10 @@ def test_default_time_constant_follows_the_sampling():
     st.floats(1e-3, 1),
 )
 def test_any_timestamps_give_an_ascending_finite_grid(values, count, tau_min, gain):
-    omega = frequency_grid(torch.tensor(values, dtype=torch.float64), count, tau_min, gain)
+    moments = torch.tensor(values, dtype=torch.float64)
+    omega = frequency_grid(moments, count, tau_min, gain)
     assert len(omega) <= count
+    assert set(omega.tolist()) <= set(frequency_grid(moments, count, tau_min, gain, 0.0).tolist())
     assert omega.isfinite().all()
     assert (omega > 0).all()
     assert (omega.diff() > 0).all()

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
+from heatsplat.contracts import Camera, Frame, View, ViewSet
+from heatsplat.physics.noise import noise_of, noise_of_repeats, noise_of_views, quantum_of
 
 
 def scene_images(frames: int, noise: float, seed: int = 0) -> torch.Tensor:
@@ -31,3 +32,17 @@ def test_noise_is_never_below_that_of_rounding():
     step = quantum_of(grey[0])
     assert step == pytest.approx(1 / 255, rel=1e-3)
     assert noise_of(grey.double(), step) >= step / math.sqrt(12)
+
+
+def test_noise_of_views_of_several_sizes_leaves_masked_pixels_out():
+    camera = Camera(torch.eye(4), torch.eye(3), 80, 60)
+    frames = [Frame(str(i), i, camera) for i in range(7)]
+
+    def view(i: int) -> View:
+        image = scene_images(1, 0.01, seed=i)[0, : 60 - 2 * i]
+        mask = torch.ones_like(image, dtype=torch.bool)
+        mask[:, 40:] = False
+        image[:, 40:] += torch.randn(image[:, 40:].shape, generator=torch.Generator().manual_seed(i))
+        return View(frames[i], image[..., None], mask=mask)
+
+    assert noise_of_views(ViewSet(frames, view), "thermal") == pytest.approx(0.01, rel=0.15)

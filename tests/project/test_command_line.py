@@ -122,6 +122,11 @@ def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
     assert f"Did you mean {meant}" in output and "Traceback" not in output
 
 
+def test_a_group_set_to_null_is_told_its_options(tmp_path):
+    output = command("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
+    assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
+
+
 def test_results_stay_those_of_their_settings(finished):
     before = {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     told = command("train", "method=etgs", *TINY, "optim.means=1e-3", f"hydra.run.dir={finished}", cwd=finished, code=1)

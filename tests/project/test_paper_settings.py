@@ -69,6 +69,7 @@ SHARED = {  # what a method has of others
     "direct_3dgs": (GAUSSIANS, ADAPTIVE, COLOUR),
     "energy_balance": (GAUSSIANS, ADAPTIVE, PHOTOMETRIC),
     "etgs": (GAUSSIANS, ADAPTIVE),
+    "etgs_released": (GAUSSIANS, ADAPTIVE, PHOTOMETRIC),
     "hexplane_4dgs": (GAUSSIANS, ADAPTIVE),
     "mftg": (GAUSSIANS, BOTH_IMAGES, BOTH_PHOTOMETRIC),
     "mip_splatting": (GAUSSIANS, ADAPTIVE, PHOTOMETRIC),
@@ -96,11 +97,28 @@ OWN = {
     "etgs": {
         "thermal.frequencies": (24, "App. B: K"),
         "thermal.frequency_gain": (2**-0.5, "App. B: alpha"),
-        "thermal.source_l2": (1e-5, "second-hand: lambda_reg"),
         "thermal.ambient": ("measured", "constant T_env of the scene"),
         "thermal.lr_initial": (2.5e-3, "3DGS: feature_lr"),
         f"{TERM}.dssim_weight": (0.2, "Eq. 36, lambda of 3DGS"),
         f"{TERM}.dssim_half": (True, "Eq. 36: (1 - SSIM) / 2"),
+    },
+    "etgs_released": {
+        "thermal.frequencies": (24, "gaussian_model.py: K_default"),
+        "thermal.frequency_gain": (0.25, "gaussian_model.py: alpha"),
+        "thermal.tau_min_s": (60.0, "gaussian_model.py: tau_min"),
+        "thermal.separation": (0.5, "gaussian_model.py: f_sep"),
+        "thermal.source_penalty": (1e-5, "train.py: lambda_group_ab"),
+        "thermal.penalty_reduction": ("sum", "train.py: group_energy"),
+        "thermal.ambient": ("measured", "gaussian_model.py: T_env of info.json"),
+        "thermal.clip": ("hard", "gaussian_model.py: clamp"),
+        "thermal.time_constant_s": (60.0, "gaussian_model.py: tau_init"),
+        "thermal.source_scale": (1e-3, "gaussian_model.py: gamma_init"),
+        "thermal.lr_initial_c": (0.1, "arguments: T0"),
+        "thermal.lr_time_constant_s": (0.1, "arguments: tau_lr"),
+        "thermal.lr_source_scale": (1e-3, "arguments: gamma_lr"),
+        "thermal.lr_gains": (2e-3, "arguments: ab_lr"),
+        "thermal.lr_end": (1.0, "gaussian_model.py: update_learning_rate"),
+        "optim.opacity_logits": (2.5e-2, "arguments: opacity_lr"),
     },
     "hexplane_4dgs": {
         "first_steps": (3000, "coarse_iterations"),
@@ -219,6 +237,7 @@ OWN = {
     "ti3dgs": {
         "thermal.position_frequencies": (10, "Eq. 9: L"),
         "thermal.time_frequencies": (10, "Eq. 9: L"),
+        "thermal.exponent": ("printed", "Eq. 9-10: no constraint"),
         "thermal.lr": (8e-4, "section IV-A"),
         "thermal.lr_end": (1.6e-6 / 8e-4, "section IV-A"),
         f"{TERM}.dssim_weight": (0.2, "3DGS"),
@@ -232,8 +251,15 @@ DEPARTURES = {  # ours and the published number
         "thermal.lr": (2e-3, 1.6e-4),
         "thermal.lr_planes": (1e-2, 1.6e-3),
     },
-    "etgs": {"thermal.l2_reduction": ("mean_over_gaussians", "sum"), "thermal.clip": ("straight_through", "hard")},
+    "etgs": {
+        "thermal.separation": (0.5, 0.0),
+        "thermal.penalty": ("group", "ridge"),
+        "thermal.source_penalty": (1e-3, 1e-5),
+        "thermal.penalty_reduction": ("mean_over_gaussians", "sum"),
+        "thermal.clip": ("straight_through", "hard"),
+    },
     "ntr_gaussian": {"thermal.width": (32, 64), "thermal.feature_size": (8, 32)},
+    "ravigs": {"loss.terms.physical_prior.term.reduction": ("sum", "mean")},
     "srgs": {"teacher": ("lanczos", "SwinIR")},
     "supirgs": {"teacher": ("lanczos", "SwinIR-S"), f"{TERM}.term.boost_weight": (0.0, "undefined")},
     "thermal3dgs": {
@@ -244,7 +270,7 @@ DEPARTURES = {  # ours and the published number
     },
     "thermogs": {"thermal.projected_area": ("exact", "printed")},
     "ti3dgs": {
-        "thermal.exponent": ("positive", "printed"),
+        "thermal.frames_per_cycle": (4.0, None),
         "thermal.exponent_max": (4.0, None),
         "thermal.applies_to": ("radiance", "harmonics"),
     },
@@ -270,6 +296,14 @@ def at(config, key):
     for name in key.split("."):
         config = config[name]
     return config
+
+
+@pytest.mark.parametrize(
+    ("steps", "rate", "rest"), [(20, 1e-2, 5e-4), (1500, 1e-2, 5e-4), (5000, 3e-3, 1.5e-4), (30000, 2.5e-3, 1.25e-4)]
+)
+def test_short_runs_of_ravigs_reach_as_far_with_its_attributes(steps, rate, rest):
+    thermal = compose(["method=ravigs", f"max_steps={steps}"])["thermal"]
+    assert (thermal["lr_attributes"], thermal["lr_rest"]) == pytest.approx((rate, rest))
 
 
 def test_every_method_here_exists():

@@ -287,7 +287,7 @@ def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
     ]
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
-        "max_steps=2", "seed=0", *many, "thermal.source_l2=0.000000000000000000000000000000000001", "test=false",
+        "max_steps=2", "seed=0", *many, "thermal.source_penalty=0.000000000000000000000000000000000001", "test=false",
         "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
     succeeds(command)

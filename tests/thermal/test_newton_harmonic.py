@@ -3,6 +3,7 @@
 import io
 import logging
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -129,7 +130,7 @@ def test_before_the_record_temperatures_come_from_at_most_one_time_constant_back
 
 
 def test_frequencies_span_one_cycle_to_the_half_power_point():
-    model, _ = ready(tau_min_s=10.0)
+    model, _ = ready(tau_min_s=10.0, separation=0.0)
     assert model.omega.shape == (24,)
     assert (model.omega[0] / SPAN_S).item() == pytest.approx(2 * math.pi / SPAN_S)
     assert (model.omega[-1] / SPAN_S).item() == pytest.approx(0.1)
@@ -180,7 +181,7 @@ def fit(model, splats, declared, observed, times_s, steps):
         shown = step * 37 % len(times_s)
         error = model.features(splats, Query(time_s=times_s[shown]))[:, 0] - observed[shown]
         optimizer.zero_grad()
-        error.square().mean().backward()
+        (error.square().mean() + sum(model.regularisers(splats).values())).backward()
         optimizer.step()
 
 
@@ -203,7 +204,7 @@ def test_it_learns_a_driven_temperature_at_unseen_times():
     error = {}
     for frequencies in (0, 24):
         start = Seeds(torch.zeros(count, 3), observed[0][:, None].clone(), torch.Generator())
-        model, splats = ready(start, frequencies=frequencies, tau_min_s=5.0, source_l2=0.0, lr_gain=2e-2)
+        model, splats = ready(start, frequencies=frequencies, tau_min_s=5.0, source_penalty=0.0, lr_source=0.48)
         fit(model, splats, model.per_gaussian(start), observed[::2], times_s[::2], steps=1500)
         shown = torch.stack([model.features(splats, Query(time_s=time))[:, 0] for time in times_s[1::2]])
         error[frequencies] = (shown - torch.stack(observed[1::2])).abs().mean().item()
@@ -216,8 +217,11 @@ def test_without_frequencies_the_source_is_absent():
     assert "source_gains" not in splats
     assert model.effects() == {"relaxation": {"param": "rate", "ambient": "fixed"}}
     assert model.cost < NewtonHarmonic().cost + 1
-    with_source, _ = ready(frequencies=24)
+    with_source, _ = ready(frequencies=24, separation=0.0)
     assert with_source.effects()["harmonic_source"] == {"frequencies": 24}
+    apart, _ = ready(frequencies=24)
+    assert apart.effects()["harmonic_source"] == {"frequencies": apart.omega.numel()}
+    assert apart.omega.numel() < 24
     assert with_source.cost > 10 * model.cost
 
 
@@ -298,7 +302,7 @@ def test_clipping_straight_through_hard_and_none():
 
 def test_faithful_form_has_a_gauge_that_only_its_prior_sees():
     """C, h, A and B times a factor: the same image, a smaller penalty on A and B; only the prior on C holds it."""
-    model, splats = ready(param="faithful", dtype=torch.float64)
+    model, splats = ready(param="faithful", dtype=torch.float64, penalty="ridge")
     stir(splats)
     query = Query(time_s=91.0)
     before = model.features(splats, query)
@@ -326,11 +330,69 @@ def test_faithful_and_rate_form_agree():
     torch.testing.assert_close(faithful.temperature(splats, 60.0), rate.temperature(same, 60.0), rtol=1e-12, atol=0)
 
 
-def test_the_penalty_is_a_sum_or_a_mean():
-    summed = ready(l2_reduction="sum")[0].per_gaussian(seeds())["source_gains"]
-    meant = ready()[0].per_gaussian(seeds())["source_gains"]
-    assert (summed.l2, summed.l2_mean) == (1e-5, False)
-    assert (meant.l2, meant.l2_mean) == (1e-5, True)
+def test_squares_are_penalised_in_the_optimiser_as_a_sum_or_a_mean():
+    summed, meant = (
+        ready(penalty="ridge", source_penalty=1e-5, penalty_reduction=reduction)
+        for reduction in ("sum", "mean_over_gaussians")
+    )
+    declared = [model.per_gaussian(seeds())["source_gains"] for model, _ in (summed, meant)]
+    assert [(item.l2, item.l2_mean) for item in declared] == [(1e-5, False), (1e-5, True)]
+    assert [model.regularisers(splats) for model, splats in (summed, meant)] == [{}, {}]
+
+
+@pytest.mark.parametrize("reduction", ["sum", "mean_over_gaussians"])
+def test_groups_are_penalised_by_the_norm_of_each_frequency_over_all_gaussians(reduction):
+    model, splats = ready(source_penalty=0.1, penalty_reduction=reduction, dtype=torch.float64)
+    stir(splats)
+    gains = splats["source_gains"].detach()
+    share = 1.0 if reduction == "sum" else 1 / len(splats)
+    expected = sum((share * gains[:, :, k].square().sum()).sqrt() for k in range(model.omega.numel()))
+    term = model.regularisers(splats)["source_groups"]
+    assert term.item() == pytest.approx(0.1 * expected.item())
+    assert model.per_gaussian(seeds())["source_gains"].l2 == 0
+    term.backward()
+    weak = 0.1 * share * gains[:, :, 3] / (share * gains[:, :, 3].square().sum()).sqrt()
+    torch.testing.assert_close(splats["source_gains"].grad[:, :, 3], weak)
+
+
+def test_groups_that_start_at_nothing_have_no_pull():
+    model, splats = ready(source_penalty=0.1)
+    model.regularisers(splats)["source_groups"].backward()
+    assert not splats["source_gains"].grad.any()
+
+
+@pytest.mark.parametrize("off", [{"source_penalty": 0.0}, {"frequencies": 0}])
+def test_a_penalty_that_is_off_is_absent(off):
+    model, splats = ready(**off)
+    assert model.regularisers(splats) == {}
+
+
+def test_groups_leave_the_frequencies_that_a_scene_needs():
+    """A drive at one frequency of the grid and half of it noise: squares shrink all by a share, groups the idle ones."""
+    times_s, count = torch.linspace(0, SPAN_S, 81).tolist(), 8
+    generator = torch.Generator().manual_seed(1)
+    left = {}
+    for penalty, weight in (("ridge", 3e-4), ("group", 3e-3)):
+        start = Seeds(torch.zeros(count, 3), torch.full((count, 1), 0.5), torch.Generator())
+        model, splats = ready(start, tau_min_s=5.0, penalty=penalty, source_penalty=weight)
+        driven = model.omega[4].item() / SPAN_S
+        noise = 0.02 * torch.randn(len(times_s), count, generator=generator.manual_seed(1))
+        observed = [0.5 + 0.2 * math.sin(driven * t) + noise[i] for i, t in enumerate(times_s)]
+        declared = model.per_gaussian(start)
+        declared = {
+            name: replace(item, l2=item.l2 / count) for name, item in declared.items()
+        }  # as the module has means
+        fit(model, splats, declared, observed, times_s, steps=1000)
+        strength = splats["source_gains"].detach().norm(dim=(0, 1))
+        left[penalty] = (strength / strength.max() < 0.05).sum().item()
+    assert left["group"] > left["ridge"]
+
+
+def test_a_step_moves_the_temperature_as_much_whatever_the_number_of_harmonics():
+    rates = [ready(frequencies=k)[0].per_gaussian(seeds())["source_gains"] for k in (1, 4, 8)]
+    sizes = [item.initial.shape[2] for item in rates]
+    assert sizes[0] < sizes[1] < sizes[2]
+    assert [item.lr * size for item, size in zip(rates, sizes, strict=True)] == pytest.approx([0.16] * 3)
 
 
 @pytest.mark.parametrize("log_rate", [math.log(1e-30), -1e4, 1e4])
@@ -372,7 +434,8 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
     [
         ({"param": "tau"}, "param must be one of rate, faithful, got 'tau'"),
         ({"clip": "soft"}, "clip must be one of"),
-        ({"l2_reduction": "mean"}, "l2_reduction must be one of sum, mean_over_gaussians"),
+        ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
+        ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )

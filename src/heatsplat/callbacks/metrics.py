@@ -26,7 +26,7 @@ from heatsplat.metrics import (
 log = logging.getLogger("heatsplat")
 
 TEST_FILE = "test_per_image.csv"
-CURVE_COLUMNS = ("step", "train_seconds", "gaussians", *DEFINITIONS)
+CURVE_COLUMNS = ("step", "train_seconds", "cpu_seconds", "gaussians", *DEFINITIONS)
 
 
 class QualityMetrics(pl.Callback):
@@ -113,12 +113,13 @@ class QualityMetrics(pl.Callback):
         if trainer.sanity_checking or not self._rows:
             return
         means = {name: mean_of_images(self._rows, name) for name in self._names}
-        step, seconds = trainer.global_step, module.results.cost.get("train_seconds")
+        step, cost = trainer.global_step, module.results.cost
+        clocks = {name: cost.get(name) for name in ("train_seconds", "cpu_seconds")}
         self._log(module, "val", means, step)
-        if seconds is not None:
-            self._log(module, "val_by_seconds", means, round(seconds))
+        if clocks["train_seconds"] is not None:
+            self._log(module, "val_by_seconds", means, round(clocks["train_seconds"]))
         self.curve = [row for row in self.curve if row["step"] < step]
-        self.curve.append({"step": step, "train_seconds": seconds, "gaussians": len(module.splats), **means})
+        self.curve.append({"step": step, **clocks, "gaussians": len(module.splats), **means})
         write_csv(module.output_dir / CURVE_FILE, self.curve, tuple(self.curve[-1]))
 
     # Test ------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,11 @@ class CostMeter(pl.Callback):
     * ``train_seconds``: wall time of training steps, everything that happens in them included (data, render, backward,
       optimiser, density control, callbacks, writing checkpoints). Excluded: validation with its pictures and curves,
       the test, set-up, and the first ``warmup_steps`` steps after every start, in which kernels are compiled.
-    * ``steps_per_second``: the steps timed so, by their seconds.
+    * ``cpu_seconds``: processor seconds of this process in the same steps, all of its threads added up. A run on one thread
+      takes as many beside other runs as alone, but for what they take of caches and memory, so they compare runs of a busy
+      machine. On several threads those that wait for work count while they spin (``OMP_WAIT_POLICY=PASSIVE``: they sleep);
+      on a GPU they are those of the host.
+    * ``steps_per_second``: the steps timed so, by their ``train_seconds``.
     * ``warmup_seconds``, ``evaluation_seconds``: the time of the excluded steps, and of validation during training.
     * ``wall_seconds``: all of the training run, from its first step to its end.
     * ``render_fps``: one by the median time of a rendered test view, as ``predict`` gives it.
@@ -43,9 +47,11 @@ class CostMeter(pl.Callback):
         self.every, self.warmup_steps = every, warmup_steps
         self.fps_views, self.fps_repeats = fps_views, fps_repeats
         self.seconds = {"train": 0.0, "warmup": 0.0, "evaluation": 0.0}
+        self.cpu_seconds = 0.0
         self.steps = 0
         self.peak_mb = 0.0
         self._since: float | None = None
+        self._cpu_since = 0.0
         self._phase = "train"
         self._warming = 0
 
@@ -55,10 +61,9 @@ class CostMeter(pl.Callback):
         """Ends the running phase and starts another; None stops the clock."""
         if module.device.type == "cuda":
             torch.cuda.synchronize(module.device)
-        now = time.perf_counter()
-        if self._since is not None:
-            self.seconds[self._phase] += now - self._since
-        self._since = None if phase is None else now
+        self.seconds, self.cpu_seconds = self._reading(), self._cpu_reading()
+        self._since = None if phase is None else time.perf_counter()
+        self._cpu_since = time.process_time()
         self._phase = phase or self._phase
 
     @property
@@ -109,15 +114,21 @@ class CostMeter(pl.Callback):
         running = 0.0 if self._since is None else time.perf_counter() - self._since
         return {phase: value + running * (phase == self._phase) for phase, value in self.seconds.items()}
 
+    def _cpu_reading(self) -> float:
+        """Processor seconds of training up to now, likewise."""
+        running = self._since is not None and self._phase == "train"
+        return self.cpu_seconds + (time.process_time() - self._cpu_since if running else 0.0)
+
     def _publish(self, module: pl.LightningModule) -> None:
         """Puts what is known into the results, on which other callbacks read the training seconds."""
         put = module.results.put
         seconds = self._reading()
         if self.steps:
             put("cost", "train_seconds", seconds["train"])
+            put("cost", "cpu_seconds", self._cpu_reading())
             put("cost", "steps_per_second", self.steps / seconds["train"])
         else:
-            for name in ("train_seconds", "steps_per_second"):
+            for name in ("train_seconds", "cpu_seconds", "steps_per_second"):
                 put("cost", name, None, f"the run was not longer than its {self.warmup_steps} steps of warm-up")
         put("cost", "warmup_seconds", seconds["warmup"])
         put("cost", "evaluation_seconds", seconds["evaluation"])
@@ -128,7 +139,14 @@ class CostMeter(pl.Callback):
 
     def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if sum(self.seconds.values()) == 0:
-            for name in ("train_seconds", "steps_per_second", "warmup_seconds", "evaluation_seconds", "wall_seconds"):
+            for name in (
+                "train_seconds",
+                "cpu_seconds",
+                "steps_per_second",
+                "warmup_seconds",
+                "evaluation_seconds",
+                "wall_seconds",
+            ):
                 module.results.put("cost", name, None, "this run evaluated a checkpoint and trained nothing")
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
@@ -159,10 +177,16 @@ class CostMeter(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"seconds": self._reading(), "steps": self.steps, "peak_mb": self.peak_mb}
+        return {
+            "seconds": self._reading(),
+            "cpu_seconds": self._cpu_reading(),
+            "steps": self.steps,
+            "peak_mb": self.peak_mb,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.seconds, self.steps, self.peak_mb = dict(state["seconds"]), state["steps"], state["peak_mb"]
+        self.seconds, self.cpu_seconds = dict(state["seconds"]), state["cpu_seconds"]
+        self.steps, self.peak_mb = state["steps"], state["peak_mb"]
 
 
 def _reset_peak(device: torch.device) -> None:

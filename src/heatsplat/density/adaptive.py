@@ -99,13 +99,16 @@ class Adaptive(DensityControl):
 
     def _grow(self, cloud: Cloud, extent: float, generator: torch.Generator) -> int:
         pull = cloud.state["gradient"] / cloud.state["seen"].clamp(min=1)
-        grow = pull > self.grad_threshold
+        large = cloud.splats.scales.amax(dim=1) > self.duplicate_scale * extent
+        return self._multiply(cloud, pull, pull > self.grad_threshold, large, generator)
+
+    def _multiply(self, cloud: Cloud, pull: Tensor, grow: Tensor, large: Tensor, generator: torch.Generator) -> int:
+        """Duplicates those of ``grow`` that are not ``large`` and splits the others; under the cap, strongest pull first."""
         room = max(0, self.cap_max - len(cloud))
         if int(grow.sum()) > room:  # one more Gaussian each, whether it is duplicated or split
             strongest = pull.argsort(descending=True, stable=True)[:room]
             grow = torch.zeros_like(grow)
             grow[strongest] = True
-        large = cloud.splats.scales.amax(dim=1) > self.duplicate_scale * extent
         duplicates, splits = (grow & ~large).nonzero().squeeze(1), (grow & large).nonzero().squeeze(1)
         if len(duplicates):
             cloud.append(cloud.rows(duplicates))

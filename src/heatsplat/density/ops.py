@@ -2,13 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 
+from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.splats import Splats
+
+THINNER = 0.99  # largest shortest semi-axis of a child, of that along which its parent was split
+
+
+@dataclass(frozen=True)
+class LongAxisSplit:
+    """Two Gaussians in the place of one, side by side along its longest semi-axis; heat and all else is inherited.
+
+    The defaults keep centre, covariance and mass: offset² + along² = 1 and 2 fade along = 1 but for what overlaps. Of all
+    splits at this offset they change the image least: by 15 % of an isolated Gaussian of opacity 0.5, where a clone
+    changes it by 68 % and two Gaussians drawn from it by 85 %. The split of Improved-GS (2025, rho = 0.45) is offset
+    1.35, along 0.55, across 0.893, fade 0.6; it leaves a gap at the centre and changes the image by 77 %.
+
+    The shortest semi-axis stays the shortest, at the price of children of nearly round Gaussians that are a little flatter:
+    it is the normal of the surface for models that need one.
+
+    Args:
+        offset: of the centres from that of the parent, either way, in units of its longest semi-axis.
+        along: factor on the longest semi-axis.
+        across: factor on the other two.
+        fade: factor on opacities.
+    """
+
+    offset: float = 0.7
+    along: float = 0.72
+    across: float = 1.0
+    fade: float = 0.74
 
 
 @dataclass
@@ -97,6 +126,44 @@ class Cloud:
             )
         for name, tensor in self.state.items():
             self.state[name] = torch.cat([tensor, tensor.new_zeros(count, *tensor.shape[1:])])
+
+    @torch.no_grad()
+    def split(self, ids: Tensor, how: LongAxisSplit) -> None:
+        """Splits Gaussians along their longest semi-axis: one child takes the row of its parent, the other is appended.
+
+        The moments and statistics of both start at zero.
+        """
+        if len(ids) == 0:
+            return
+        rows = self.rows(ids)
+        scales = rows["log_scales"]
+        longest, shortest = scales.argmax(dim=1, keepdim=True), scales.argmin(dim=1, keepdim=True)
+        axes = quats_to_matrices(rows["quats"]).gather(2, longest[:, None].expand(-1, 3, 1)).squeeze(2)
+        aside = how.offset * scales.gather(1, longest).exp() * axes
+        scales += torch.full_like(scales, math.log(how.across)).scatter_(1, longest, math.log(how.along))
+        own, limit = scales.gather(1, shortest), scales.gather(1, longest) + math.log(THINNER)
+        scales.scatter_(1, shortest, torch.where(shortest == longest, own, own.minimum(limit)))
+        rows["opacity_logits"] = torch.logit(how.fade * rows["opacity_logits"].sigmoid())
+        for name in ("log_scales", "opacity_logits"):
+            self.splats[name][ids] = rows[name]
+        self.splats["means"][ids] = rows["means"] + aside
+        self._forget(ids)
+        self.append(rows | {"means": rows["means"] - aside})
+
+    def _forget(self, ids: Tensor) -> None:
+        """Moments and statistics of some Gaussians become zero."""
+        for name, parameter in self.splats.raw.items():
+            places = self.splats.places(name)
+            rows = ids if places is None else places[ids][places[ids] >= 0]
+            for moment in self._moments(parameter).values():
+                moment[rows] = 0
+        for statistic in self.state.values():
+            statistic[ids] = 0
+
+    def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
+        """What the optimiser keeps of a parameter, element by element."""
+        moments = {} if self.optimizer is None else self.optimizer.state.get(parameter, {})
+        return {key: value for key, value in moments.items() if value.shape == parameter.shape}
 
     def overwrite(self, name: str, values: Tensor) -> None:
         """Gives one tensor new values [N, ...] and forgets its moments; a sparse one takes the rows that it has."""

@@ -11,8 +11,9 @@ from torch import Tensor
 CUBIC_A = -0.5  # slope of Keys' cubic at 1; the value that antialiased bicubic filters use
 
 
-def _box(x: Tensor) -> Tensor:
-    return ((x >= -0.5) & (x < 0.5)).to(x)
+def _overlap(distances: Tensor, step: float) -> Tensor:
+    """How much of new pixels, ``step`` wide, lies in old ones of width 1 whose centres are so far away."""
+    return ((1.0 + step) / 2 - distances.abs()).clamp(min=0.0, max=min(step, 1.0))
 
 
 def _triangle(x: Tensor) -> Tensor:
@@ -30,11 +31,17 @@ def _lanczos3(x: Tensor) -> Tensor:
     return torch.where(x.abs() < 3.0, torch.sinc(x) * torch.sinc(x / 3.0), 0.0)
 
 
-KERNELS: dict[str, Callable[[Tensor], Tensor]] = {
-    "area": _box,
-    "bilinear": _triangle,
-    "bicubic": _cubic,
-    "lanczos": _lanczos3,
+def _stretched(kernel: Callable[[Tensor], Tensor]) -> Callable[[Tensor, float], Tensor]:
+    """A kernel that is as wide as a new pixel where that is larger than an old one."""
+    return lambda distances, step: kernel(distances / max(step, 1.0))
+
+
+# Weights of old pixels of width 1 at these distances from the centre of a new one, and its width.
+KERNELS: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "area": _overlap,
+    "bilinear": _stretched(_triangle),
+    "bicubic": _stretched(_cubic),
+    "lanczos": _stretched(_lanczos3),
 }
 
 
@@ -51,7 +58,8 @@ def resampled(image: Tensor, height: int, width: int, kernel: str = "bicubic") -
     Args:
         image: [H, W, C], floating point. Differentiable.
         height, width: size of the result in pixels.
-        kernel: "area", "bilinear", "bicubic" (Keys, a = -1/2) or "lanczos" (three lobes).
+        kernel: "area" (the average of what a new pixel covers, parts of old ones included), "bilinear", "bicubic" (Keys,
+            a = -1/2) or "lanczos" (three lobes).
 
     Raises:
         ValueError: the kernel is unknown or there would be no pixel.
@@ -84,10 +92,9 @@ def weights(count: int, new_count: int, kernel: str) -> Tensor:
     if count < 1 or new_count < 1:
         raise ValueError(f"a line of {count} pixels cannot become one of {new_count}")
     step = count / new_count
-    stretch = max(step, 1.0)
     centres = (torch.arange(new_count, dtype=torch.float64) + 0.5) * step
     pixels = torch.arange(count, dtype=torch.float64) + 0.5
-    found = KERNELS[kernel]((pixels - centres[:, None]) / stretch)
+    found = KERNELS[kernel](pixels - centres[:, None], step)
     found[found.abs() < 1e-14] = 0.0  # a kernel's zeros, which rounding would count as contributions
     return found / found.sum(1, keepdim=True)
 

@@ -25,6 +25,7 @@ FAILED = "FAILED"  # why it has no results
 TEST = tuple(DEFINITIONS)
 COST = (
     "train_seconds",
+    "cpu_seconds",
     "steps_per_second",
     "render_fps",
     "peak_memory_mb",

@@ -27,6 +27,7 @@ class LossInputs:
         step: training step, from 0.
         progress: share of the run that is done, in [0, 1] (``Schedule.progress``).
         companions: prediction and target of the further images that the model explains, by modality.
+        ratio: how many pixels of full size fit beside one of the prediction (``Resolution.ratio``).
     """
 
     prediction: Tensor
@@ -37,6 +38,7 @@ class LossInputs:
     step: int = 0
     progress: float = 0.0
     companions: Mapping[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    ratio: float = 1.0
 
     def pair(self, modality: str | None) -> tuple[Tensor, Tensor]:
         """Prediction and target of a companion, or of the image itself for None.

@@ -21,7 +21,7 @@ class HighFrequency:
 
     H is what lies between two averages and W, the confidence, falls where the teacher departs from the target. Both are
     made once per training image and kept in half precision (4 bytes per pixel and channel). Where a masked pixel of the
-    target is near, nothing counts.
+    target is near, nothing counts. Below full size (``inputs.ratio``) there is no such detail, and the term is absent.
 
     Args:
         teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
@@ -60,8 +60,10 @@ class HighFrequency:
         """Asks the teacher for the images of a scene; see ``TeacherImages.prepare``."""
         return self._teacher_images.prepare(scene, modality)
 
-    def __call__(self, inputs: LossInputs) -> Tensor:
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
         check_fineness(inputs, self.factor)
+        if inputs.ratio > 1:
+            return {}
         detail, confidence = (
             made.to(inputs.prediction) for made in self._teacher_images.of(inputs.view, inputs.target)
         )

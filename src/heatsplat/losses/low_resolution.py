@@ -97,10 +97,14 @@ def fineness(inputs: LossInputs) -> int:
 
 
 def check_fineness(inputs: LossInputs, factor: int) -> None:
-    """Raises ValueError where the prediction is not ``factor`` times as fine as the target."""
-    if fineness(inputs) != factor:
+    """Raises ValueError where the prediction, at full size, is not ``factor`` times as fine as the target.
+
+    Below full size (``inputs.ratio``) it is less fine by the ratio, down to as fine as the target.
+    """
+    expected = max(factor / inputs.ratio, 1.0)
+    if fineness(inputs) != expected:
         raise ValueError(
-            f"the prediction is {fineness(inputs)} times as fine as the training image, the loss expects {factor}; set "
+            f"the prediction is {fineness(inputs)} times as fine as the training image, the loss expects {expected:g}; set "
             "both by super_resolution"
         )
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 from torch import Tensor
 
 from heatsplat.contracts import SceneData
+from heatsplat.geometry.resampling import resampled
 from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.low_resolution import OnTargetGrid, check_fineness, counted_finely
+from heatsplat.losses.low_resolution import OnTargetGrid, check_fineness, counted_finely, fineness
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.teacher import Teacher, TeacherImages
 
@@ -19,6 +20,7 @@ class TeacherAndTarget:
 
     The terms are "teacher/l1", "teacher/dssim", "target/l1" and "target/dssim", weighted; a share of zero leaves its pair
     out. Near masked pixels of the target the teacher's image does not count: there it is a guess from half a picture.
+    Below full size (``inputs.ratio``) it is averaged to the prediction's grid.
 
     Args:
         teacher: gives where fine images come from; called when the first is needed, so that only training loads it.
@@ -60,7 +62,8 @@ class TeacherAndTarget:
         terms: dict[str, Tensor] = {}
         if self.target_weight < 1.0:
             (fine,) = (kept.to(inputs.prediction) for kept in self._teacher_images.of(inputs.view, inputs.target))
-            mask = None if inputs.mask is None else counted_finely(inputs.mask, self.factor)
+            fine = resampled(fine, *inputs.prediction.shape[:2], "area")
+            mask = None if inputs.mask is None else counted_finely(inputs.mask, fineness(inputs))
             taught = self._compare(replace(inputs, target=fine, mask=mask))
             terms |= {f"teacher/{name}": (1.0 - self.target_weight) * value for name, value in taught.items()}
         if self.target_weight > 0.0:

@@ -13,6 +13,7 @@ log = logging.getLogger(__name__)
 LOWEST_HZ = 1e-5  # ETGS Eq. 27
 SAME_MOMENT_S = 1e-6  # timestamps closer than this are one moment: clocks since 1970 in float64 resolve 2e-7 s
 NARROWEST_BAND = 1.2  # the highest frequency is at least this times the lowest (ETGS Eq. 34)
+SEPARATION = 0.5  # cycles over the record by which frequencies differ at least (the authors' code; the text has none)
 
 
 def default_tau_min(timestamps: Tensor) -> float:
@@ -24,12 +25,15 @@ def default_tau_min(timestamps: Tensor) -> float:
     return max(gaps.median().item(), gaps.sum().item() / 200) if gaps.numel() else 0.0
 
 
-def frequency_grid(timestamps: Tensor, count: int, tau_min: float, gain: float) -> Tensor:
-    """Angular frequencies [K'] in rad/s, float64, ascending and log-uniform, K' <= count (ETGS Eq. 7 and 27-34).
+def frequency_grid(
+    timestamps: Tensor, count: int, tau_min: float, gain: float, separation: float = SEPARATION
+) -> Tensor:
+    """Angular frequencies [K'] in rad/s, float64, ascending, K' <= count (ETGS Eq. 7 and 27-34).
 
-    From one cycle over the observed span up to what the sampling resolves (half the inverse of the smallest gap) and
-    what a body with time constant ``tau_min`` still follows with amplitude ``gain``; at least 1.2 times the lowest
-    frequency.
+    Log-uniform from one cycle over the observed span up to what the sampling resolves (half the inverse of the smallest gap)
+    and what a body with time constant ``tau_min`` still follows with amplitude ``gain``; at least 1.2 times the lowest
+    frequency. Of these, from the lowest up, those stay that complete ``separation`` cycles more over the span than the last
+    one that stayed: a record of that length cannot tell closer ones apart.
 
     **Degenerate cases:** repeated timestamps count once; count = 1 gives the lowest frequency alone; fewer than two
     distinct timestamps (or count = 0) give an empty grid, so that a model falls back to pure relaxation, with a
@@ -40,14 +44,17 @@ def frequency_grid(timestamps: Tensor, count: int, tau_min: float, gain: float) 
         count: how many frequencies to ask for, at least 0.
         tau_min: shortest time constant in seconds, above 0 (see ``default_tau_min``).
         gain: steady-state amplitude in (0, 1] below which a frequency is not worth having; α of the paper.
+        separation: cycles over the span by which neighbours differ at least; 0 removes equal ones alone (the text).
 
     Raises:
-        ValueError: a timestamp is not finite, or count, tau_min or gain lies outside its range.
+        ValueError: a timestamp is not finite, or count, tau_min, gain or separation lies outside its range.
     """
     if count != int(count) or count < 0:
         raise ValueError(f"count of frequencies must be a whole number of at least 0, got {count}")
     if not 0 < gain <= 1:
         raise ValueError(f"gain must lie in (0, 1], got {gain}; 0.7071 is the half-power point")
+    if not 0 <= separation < math.inf:
+        raise ValueError(f"separation must be a number of cycles of at least 0, got {separation}")
     gaps = _positive_gaps(timestamps)
     if count == 0:
         return torch.zeros(0, dtype=torch.float64)
@@ -59,13 +66,23 @@ def frequency_grid(timestamps: Tensor, count: int, tau_min: float, gain: float) 
         return torch.zeros(0, dtype=torch.float64)
     if not (math.isfinite(tau_min) and tau_min > 0):
         raise ValueError(f"tau_min must be a number of seconds above 0, got {tau_min}")
-    lowest = max(1 / gaps.sum().item(), LOWEST_HZ)
+    span = gaps.sum().item()
+    lowest = max(1 / span, LOWEST_HZ)
     sampled = 0.5 / gaps.min().item()
     followed = math.sqrt((1 - gain) * (1 + gain)) / gain / (2 * math.pi * tau_min)
     highest = max(min(sampled, followed), NARROWEST_BAND * lowest)
     steps = torch.arange(int(count), dtype=torch.float64) / max(count - 1, 1)
-    omega = 2 * math.pi * lowest * (highest / lowest) ** steps
-    return omega.unique()
+    hertz = lowest * (highest / lowest) ** steps
+    return 2 * math.pi * _apart(hertz.unique(), separation / span)
+
+
+def _apart(values: Tensor, least: float) -> Tensor:
+    """Of ascending values the first, and each that lies at least so far above the last one that stayed."""
+    kept: list[float] = []
+    for value in values.tolist():
+        if not kept or value - kept[-1] >= least:
+            kept.append(value)
+    return torch.tensor(kept, dtype=torch.float64)
 
 
 def _positive_gaps(timestamps: Tensor) -> Tensor:

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.contracts import ViewSet, evenly_spread
+
 # A Laplacian of Laplacians: blind to anything that varies linearly along rows or columns (Immerkaer, CVIU 64, 1996).
 _MASK = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
 _MASK_GAIN = 6.0  # root of the sum of its squares
@@ -15,7 +17,21 @@ _MAD_TO_SIGMA = 1.4826
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
 MIN_NOISE = 1e-6  # image units; what an image without any shows
+_NOISY_VIEWS = 5  # from which the noise of a scene's images is estimated
 _UNIFORM = 1.0 / math.sqrt(12.0)
+
+
+def noise_of_views(views: ViewSet, modality: str) -> float:
+    """Standard deviation of the noise of a pixel in the images of a modality, in image units, from a few of the views.
+
+    The median over these views of ``noise_of`` their first channel; quantisation counts as in the first of them.
+    """
+    few = [views[i] for i in evenly_spread(len(views), _NOISY_VIEWS)]
+    images = [view.image(modality)[None, ..., 0].double() for view in few]
+    masks = [None if view.mask is None else view.mask[None] for view in few]
+    step = quantum_of(images[0] if masks[0] is None else images[0][masks[0]])
+    single = [noise_of(image, step, mask) for image, mask in zip(images, masks, strict=True)]
+    return float(torch.tensor(single, dtype=torch.float64).median())
 
 
 def noise_of(images: Tensor, step: float = 0.0, masks: Tensor | None = None) -> float:

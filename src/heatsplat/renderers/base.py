@@ -64,6 +64,7 @@ def rasterization(
     depth: bool = True,
     eps2d: float = EPS2D,
     maps: int = 0,
+    signs: Tensor | None = None,
 ) -> RenderOutput:
     """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
 
@@ -89,6 +90,7 @@ def rasterization(
         depth: composite the depth of the first modality as well.
         eps2d: pixels² added to both variances of the projected covariance (3DGS: 0.3; Mip-Splatting: 0.1, antialiased).
         maps: how many maps over pixels the backward pass sums by blending weights (``RenderOutput.weighted``).
+        signs: [N] numbers, constant, that are composited like a feature of the first modality (``RenderOutput.signed``).
 
     Returns:
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
@@ -121,12 +123,12 @@ def rasterization(
         backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
     if backend not in BACKENDS:
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
-    probe = _Probe(features, means, maps) if maps else None
+    probe = _Probe(features, means, maps, signs) if maps or signs is not None else None
     if probe is not None:
         features = probe
-        background = None if background is None else torch.cat([background.new_zeros(maps), background])
+        background = None if background is None else torch.cat([background.new_zeros(probe.channels), background])
         first, *rest = modality_channels or (None,)
-        modality_channels = first and (first + maps, *rest)
+        modality_channels = first and (first + probe.channels, *rest)
     inputs = RenderInputs(
         means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
         background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
@@ -136,17 +138,27 @@ def rasterization(
 
 
 class _Probe:
-    """Channels of zeros before those of the features, whose gradients are sums over the pixels of what weighs them."""
+    """Channels before those of the features: zeros whose gradients are sums over pixels of what weighs them, and signs."""
 
-    def __init__(self, features: Tensor | Callable[[Tensor], Tensor], means: Tensor, maps: int) -> None:
+    def __init__(
+        self, features: Tensor | Callable[[Tensor], Tensor], means: Tensor, maps: int, signs: Tensor | None
+    ) -> None:
         self.features, self.maps, self.like = features, maps, means
+        self.signs = None if signs is None else signs.to(means)[:, None]
+        self.channels = maps + (signs is not None)
         self.rows: Tensor | None = None
 
     def __call__(self, ids: Tensor) -> Tensor:
         self.rows = self.like.new_zeros(len(ids), self.maps, requires_grad=True)
         seen = self.features(ids) if callable(self.features) else self.features.index_select(0, ids)
-        return torch.cat([self.rows, seen], dim=1)
+        own = [self.rows] if self.signs is None else [self.rows, self.signs[ids]]
+        return torch.cat([*own, seen], dim=1)
 
     def read(self, output: RenderOutput) -> RenderOutput:
-        image, features = output.features[..., : self.maps], output.features[..., self.maps :]
-        return replace(output, features=features, weighted=WeightedSums(image, self.rows))
+        image, features = output.features[..., : self.maps], output.features[..., self.channels :]
+        return replace(
+            output,
+            features=features,
+            weighted=WeightedSums(image, self.rows) if self.maps else None,
+            signed=None if self.signs is None else output.features[..., self.maps],
+        )

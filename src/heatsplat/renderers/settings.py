@@ -20,7 +20,7 @@ class Renderer:
     Args:
         backend: "auto", "cpu", "gsplat" or "reference".
         antialiased: compensates opacity for the screen blur (Mip-Splatting's 2D filter).
-        eps2d: pixels² added to both variances of a Gaussian on the screen.
+        eps2d: pixels² of full size added to both variances of a Gaussian on the screen.
         near, far: visible range of camera z in world units.
         background: what lies behind the splats: "ambient" (the ambient temperature where the scene has one, black where
             not), or an image value in [0, 1].
@@ -66,8 +66,20 @@ class Renderer:
         absgrad: bool = False,
         depth: bool = False,
         maps: int = 0,
+        ratio: float = 1.0,
+        signs: Tensor | None = None,
     ) -> RenderOutput:
-        """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``."""
+        """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``.
+
+        Args:
+            ratio: how many pixels of full size fit beside one of ``camera``. The screen blur is that of full size, so that
+                Gaussians have the same size in the scene; a blur of coarse pixels would thicken them, and their training
+                would make up for it. Where opacity is compensated, a coarse pixel also averages over the r² of full size
+                in it, whose variance is (1 - 1 / r²) / 12 of its own size.
+        """
+        blur = self.eps2d / ratio**2
+        if self.antialiased:
+            blur += (1 - 1 / ratio**2) / 12
         given = means.dtype
         dtype = given if self.backend == "reference" else torch.float32
 
@@ -92,8 +104,9 @@ class Renderer:
             backend=self.backend,
             absgrad=absgrad,
             depth=depth,
-            eps2d=self.eps2d,
+            eps2d=blur,
             maps=maps,
+            signs=signs,
         )
         if given == dtype:
             return seen

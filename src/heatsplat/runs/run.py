@@ -108,7 +108,7 @@ def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
 
 def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
     """The trainer of a configuration, with the callbacks and the logger of ``watching``, which write into the run's folder."""
-    logger = watching["logger"] and build({**watching["logger"], "save_dir": str(output_dir)})
+    logger = build({**watching["logger"], "save_dir": str(output_dir)}) if watching.get("logger") else False
     callbacks = build_callbacks(watching["callbacks"], output_dir)
     places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
     return build(dict(trainer), callbacks=callbacks, logger=logger, **places)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Frame, check_option
+from heatsplat.contracts import Frame, SceneData, check_option
 from heatsplat.sensors.base import SensorPart
 
 NORMS = ("image", "columns", "none")
@@ -25,7 +25,8 @@ class ConductionResidual(SensorPart):
     Where it departs from the published code: that normalises an image without a batch axis, so that columns of it
     share a size (norm "columns"), and its last layer too has norm and ReLU, so that it starts anywhere and only brightens.
 
-    **Convention:** curvatures are differences to the next pixels, with none across the border. Images with several
+    **Convention:** curvatures are differences to the next pixels, with none across the border, per squared pixel of a
+    training image whatever the size of the image is. Images with several
     channels get one correction, of the mean of their channels.
 
     Args:
@@ -56,6 +57,7 @@ class ConductionResidual(SensorPart):
         self.norm, self.bound, self.lr, self.lr_end = norm, bound, lr, lr_end
         self.layers = nn.ModuleList(nn.Linear(2 if i == 0 else width, width) for i in range(hidden))
         self.last = nn.Linear(width, 1)
+        self.register_buffer("trained_width", torch.zeros((), dtype=torch.float64))  # of the images, in pixels; 0: any
         with torch.no_grad():
             angles = math.pi * ((torch.arange(width) + 0.5) / width - 0.25)
             self.layers[0].weight.copy_(torch.stack((angles.cos(), angles.sin()), 1))
@@ -64,20 +66,24 @@ class ConductionResidual(SensorPart):
             for parameter in (*(layer.bias for layer in self.layers), self.last.weight, self.last.bias):
                 parameter.zero_()
 
+    def prepare(self, scene: SceneData) -> None:
+        self.trained_width.fill_(scene.train.frames[0].camera.width)
+
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         brightness = image.mean(2)
-        values = torch.stack((brightness, curvature(brightness)), 2)
+        zoom = image.shape[1] / (self.trained_width.item() or image.shape[1])
+        values = torch.stack((brightness, zoom**2 * curvature(brightness)), 2)
         for layer in self.layers:
-            values = self._normalised(layer(values)).relu()
+            values = self._normalised(layer(values), zoom).relu()
         return image + self.bound * torch.tanh(self.last(values) / self.bound)
 
-    def _normalised(self, values: Tensor) -> Tensor:
-        """Answers [H, W, width] of a layer over their size."""
+    def _normalised(self, values: Tensor, zoom: float) -> Tensor:
+        """Answers [H, W, width] of a layer over their size, for an image so many times as fine as the training images."""
         if self.norm == "none":
             return values
         if self.norm == "image":
             return values / (values.square().mean((0, 1), keepdim=True) + TINY**2).sqrt()
-        return values / (values.square().sum(0, keepdim=True) + TINY**2).sqrt()
+        return values / (values.square().sum(0, keepdim=True) / zoom + TINY**2).sqrt()
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"conduction": {"network": f"{self.last.in_features} x {len(self.layers)} per pixel", "norm": self.norm}}

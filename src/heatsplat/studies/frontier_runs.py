@@ -52,12 +52,16 @@ class Recipe(Runs):
         return statistics.fmean(found) if found and None not in found else None
 
 
-def find_runs(folders: Iterable[Path]) -> pd.DataFrame:
+def find_runs(folders: Iterable[Path], clock: str = "train_seconds") -> pd.DataFrame:
     """The finished runs in folders at any depth (``read_runs``), in the order of their paths; each once.
 
     Further columns: measured, what tells its validation and test views from others of the scene ("image size" -> "64x52" and
     the like), and course, score -> (seconds, value) of the validations in order. One whose files cannot be read is left out,
     and a warning names it and says why. Evaluations of a run are not runs.
+
+    Args:
+        folders: where to look.
+        clock: column of the curve whose seconds those are: "train_seconds" | "cpu_seconds".
     """
     places = [file.parent for folder in folders for file in sorted(folder.rglob(METRICS_FILE))]
     places = [place for place in places if (place / CURVE_FILE).exists() and (place / OVERRIDES).exists()]
@@ -69,7 +73,7 @@ def find_runs(folders: Iterable[Path]) -> pd.DataFrame:
         try:
             if pd.notna(one.failed):
                 raise ValueError(one.failed)
-            courses.append(_courses(one.folder / CURVE_FILE))
+            courses.append(_courses(one.folder / CURVE_FILE, clock))
         except (ValueError, OSError, csv.Error) as error:
             log.warning("%s is left out: %s", one.folder, error)
             courses.append(None)
@@ -101,12 +105,12 @@ def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, 
     return {name: str(value) for name, value in known.items() if value is not None}
 
 
-def _courses(path: Path) -> dict[str, list[tuple[float, float]]]:
+def _courses(path: Path, clock: str) -> dict[str, list[tuple[float, float]]]:
     courses: dict[str, list[tuple[float, float]]] = {"psnr": [], "mae_c": []}
     for row in read_csv(path):
         for name, course in courses.items():
-            if row.get(name) is not None and row.get("train_seconds") is not None:
-                course.append((float(row["train_seconds"]), float(row[name])))
+            if row.get(name) is not None and row.get(clock) is not None:
+                course.append((float(row[clock]), float(row[name])))
     return courses
 
 
@@ -115,7 +119,7 @@ def group(runs: pd.DataFrame) -> list[Recipe]:
 
     A panel is a scene whose runs measured alike views. Names leave out what all recipes share.
     """
-    titles = _titles(runs)
+    titles = panel_titles(runs)
     panels = runs.assign(title=titles, name=_names(runs, titles)).groupby(["title", "name"], sort=False)
     recipes = [Recipe(name, title, own) for (title, name), own in panels]
     for scene in {recipe.scene for recipe in recipes}:
@@ -129,7 +133,7 @@ def group(runs: pd.DataFrame) -> list[Recipe]:
     return sorted(recipes, key=lambda recipe: (recipe.scene, recipe.mean("train_seconds") or 0.0))
 
 
-def _titles(runs: pd.DataFrame) -> list[str]:
+def panel_titles(runs: pd.DataFrame) -> list[str]:
     """For each run the title of its panel: the scene, and of what was measured as much as tells panels apart."""
     titles = runs["scene"].tolist()
     for part in dict.fromkeys(name for measured in runs["measured"] for name in measured):

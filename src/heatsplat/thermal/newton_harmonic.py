@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData, SceneError, check_option
-from heatsplat.physics.frequencies import default_tau_min, frequency_grid
+from heatsplat.physics.frequencies import SEPARATION, default_tau_min, frequency_grid
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import relax
 from heatsplat.splats import Splats
@@ -23,6 +22,7 @@ from heatsplat.thermal.sparse_sources import SparseSources
 log = logging.getLogger(__name__)
 
 PARAMS = ("rate", "faithful")
+PENALTIES = ("group", "ridge")
 REDUCTIONS = ("sum", "mean_over_gaussians")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
@@ -35,6 +35,10 @@ class NewtonHarmonic(ThermalModel):
     which an optimiser can so evade. ``param="rate"`` learns the three ratios; ``param="faithful"`` learns the paper's
     four and fixes the scale by a weak prior that keeps C near 1.
 
+    The penalty on A and B (on A/C and B/C in rate form) is the paper's sum of squares, "ridge", or that of the authors'
+    code, "group": Σ_k √(Σ_i A_ik² + B_ik²). Its pull on a frequency is the stronger the less all Gaussians together make
+    of it, so that a scene keeps the few frequencies that it needs.
+
     **Convention:** inside, time is counted in observed spans and temperature in image units, 0 at Tmin and 1 at Tmax;
     so are rates and gains, and so is the penalty. A scene without a range is modelled in image values, with no
     temperature in kelvin.
@@ -44,18 +48,23 @@ class NewtonHarmonic(ThermalModel):
     (see Splats) at those steps: what has no row only relaxes, and costs neither its harmonics nor their memory.
 
     Args:
-        frequencies: harmonics asked for; the grid may hold fewer. 0 is pure relaxation, without any tensor of a source.
+        frequencies: harmonics asked for; K, those that the grid holds, may be fewer. 0 is pure relaxation, without any
+            tensor of a source.
         param: "rate" or "faithful".
         tau_min_s: shortest time constant, bounds the frequencies; None takes max(median gap of the times, span / 200).
         frequency_gain: steady-state amplitude below which a frequency is left out, in (0, 1].
-        source_l2: weight of the penalty on gains.
-        l2_reduction: "mean_over_gaussians" (a sum over frequencies alone) or "sum" over Gaussians and frequencies (the
-            paper), which grows with their number and, in these units, suppresses the source it should only tame.
+        separation: cycles over the record by which frequencies differ at least (``frequency_grid``).
+        penalty: "group" or "ridge".
+        source_penalty: its weight; 0 leaves it out.
+        penalty_reduction: over Gaussians, of the squares: "mean_over_gaussians" or "sum" (the paper and the authors' code),
+            which grows with their number and, in these units, suppresses the source it should only tame.
         gauge_l2: weight of the prior (log C)² in faithful form.
         ambient: "measured" (the scene's, else learned), "learned" (from the measured one, if any) or a number in °C.
         clip: how values outside the range are shown: "straight_through" clamps values but lets gradients pass, so that
             a Gaussian outside comes back; "hard" stops its gradient (the paper's Eq. 9); "none" shows them as they are.
-        lr_initial, lr_gain, lr_rate, lr_ambient: learning rates.
+        lr_initial, lr_rate, lr_ambient: learning rates.
+        lr_source: that of a whole source; each of its K harmonics has lr_source / K. A step of Adam moves every gain by
+            its rate, so that a step moves the temperature by as much whatever K is.
         lr_end: factor on them at the last step, log-linear in between.
         drop_sources_at: steps at which Gaussians lose a source that they do not need (see SparseSources); none by default.
         source_floor: how closely relaxation alone must tell their temperature, in standard deviations of the noise.
@@ -74,13 +83,15 @@ class NewtonHarmonic(ThermalModel):
         param: str = "rate",
         tau_min_s: float | None = None,
         frequency_gain: float = math.sqrt(0.5),
-        source_l2: float = 1e-5,
-        l2_reduction: str = "mean_over_gaussians",
+        separation: float = SEPARATION,
+        penalty: str = "group",
+        source_penalty: float = 1e-3,
+        penalty_reduction: str = "mean_over_gaussians",
         gauge_l2: float = 1e-5,
         ambient: str | float = "measured",
         clip: str = "straight_through",
         lr_initial: float = 2.5e-3,
-        lr_gain: float = 2.5e-3,
+        lr_source: float = 0.16,
         lr_rate: float = 5e-3,
         lr_ambient: float = 1e-3,
         lr_end: float = 0.1,
@@ -90,15 +101,17 @@ class NewtonHarmonic(ThermalModel):
     ) -> None:
         super().__init__()
         check_option("param", param, PARAMS)
-        check_option("l2_reduction", l2_reduction, REDUCTIONS)
+        check_option("penalty", penalty, PENALTIES)
+        check_option("penalty_reduction", penalty_reduction, REDUCTIONS)
         check_option("clip", clip, CLIPS)
         if isinstance(ambient, str) and ambient not in ("measured", "learned"):
             raise ValueError(f"ambient must be measured, learned or a number in °C, got '{ambient}'")
         self.frequencies, self.param = frequencies, param
-        self.tau_min_s, self.frequency_gain = tau_min_s, frequency_gain
-        self.source_l2, self.l2_mean, self.gauge_l2 = source_l2, l2_reduction == "mean_over_gaussians", gauge_l2
+        self.tau_min_s, self.frequency_gain, self.separation = tau_min_s, frequency_gain, separation
+        self.grouped, self.source_penalty, self.gauge_l2 = penalty == "group", source_penalty, gauge_l2
+        self.over_mean = penalty_reduction == "mean_over_gaussians"
         self.clip = clip
-        self.lr_initial, self.lr_gain, self.lr_rate = lr_initial, lr_gain, lr_rate
+        self.lr_initial, self.lr_source, self.lr_rate = lr_initial, lr_source, lr_rate
         self.lr, self.lr_end = lr_ambient, lr_end
         self.sources = SparseSources(drop_sources_at, source_floor, source_noise) if drop_sources_at else None
         self._ambient_from = ambient
@@ -113,7 +126,8 @@ class NewtonHarmonic(ThermalModel):
         self.range.prepare(scene)
         if times.max() > times.min():
             tau_min_s = default_tau_min(times) if self.tau_min_s is None else self.tau_min_s
-            self.omega = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain) * self.clock.span_s
+            grid = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain, self.separation)
+            self.omega = grid * self.clock.span_s
         else:
             log.warning("scene '%s' shows one moment only: the model has no heat source", scene.name)
         if scene.thermal_range is None:
@@ -162,22 +176,37 @@ class NewtonHarmonic(ThermalModel):
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         initial = seeds.values.mean(1)
-        count = initial.shape[0]
-        if self._ambient_unknown and count > 0:
+        if self._ambient_unknown and len(initial) > 0:
             with torch.no_grad():
                 self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
-        log_rate = torch.full_like(initial, math.log(INITIAL_RATE))
-        tensor = partial(PerGaussian, l2_mean=self.l2_mean, lr_end=self.lr_end)
-        tensors = {"initial_state": tensor(initial, self.lr_initial)}
-        if self.param == "rate":
-            tensors["log_rate"] = tensor(log_rate, self.lr_rate)
-        else:
-            tensors["log_capacity"] = tensor(torch.zeros_like(initial), self.lr_rate, self.gauge_l2)
-            tensors["log_conductance"] = tensor(log_rate, self.lr_rate)
-        if self.omega.numel() > 0:
-            gains = initial.new_zeros(count, 2, self.omega.numel())
-            tensors["source_gains"] = tensor(gains, self.lr_gain, self.source_l2)
+        tensors, harmonics = self._bodies(initial), self.omega.numel()
+        if harmonics > 0:
+            gains, ridge = initial.new_zeros(len(initial), 2, harmonics), 0.0 if self.grouped else self.source_penalty
+            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
         return tensors
+
+    def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
+        return PerGaussian(initial, lr, l2, self.over_mean, self.lr_end, paced)
+
+    def _bodies(self, initial: Tensor) -> dict[str, PerGaussian]:
+        """What Gaussians that are first seen at ``initial`` [N] carry beside their gains."""
+        log_rate = torch.full_like(initial, math.log(INITIAL_RATE))
+        tensors = {"initial_state": self._tensor(initial, self.lr_initial)}
+        if self.param == "rate":
+            return tensors | {"log_rate": self._tensor(log_rate, self.lr_rate)}
+        tensors["log_capacity"] = self._tensor(torch.zeros_like(initial), self.lr_rate, self.gauge_l2)
+        return tensors | {"log_conductance": self._tensor(log_rate, self.lr_rate)}
+
+    def _lr_gains(self, harmonics: int) -> float:
+        return self.lr_source / harmonics
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        """ "source_groups", the penalty of the groups; the other one is in the optimiser."""
+        if not self.grouped or self.source_penalty == 0 or self.omega.numel() == 0:
+            return {}
+        strengths = torch.linalg.vector_norm(splats["source_gains"], dim=(0, 1)).sum()
+        reduced = strengths / math.sqrt(len(splats)) if self.over_mean else strengths
+        return {"source_groups": self.source_penalty * reduced}
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         state = self._state(splats, query.time_s, query.ids)
@@ -206,9 +235,12 @@ class NewtonHarmonic(ThermalModel):
         log_rate = splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"]
         return log_rate.clamp(*LOG_RATES).exp()
 
+    def _gain_factor(self, splats: Splats) -> Tensor | None:
+        """What gains are multiplied by to drive a temperature, [N], 1/C; None is 1."""
+        return torch.exp(-splats["log_capacity"]) if self.param == "faithful" else None
+
     def _recorded(self, splats: Splats, spans: float, ids: Tensor | None) -> Tensor:
         """As ``_state`` at a time within the record, counted in spans."""
-        faithful = self.param == "faithful"
         source = self.omega.numel() > 0
         return visible_temperature(
             torch.tensor(spans, dtype=torch.float64, device=self.omega.device),
@@ -217,7 +249,7 @@ class NewtonHarmonic(ThermalModel):
             self._rate(splats),
             self.omega,
             splats["source_gains"] if source else None,
-            torch.exp(-splats["log_capacity"]) if faithful and source else None,
+            self._gain_factor(splats) if source else None,
             ids,
             splats.places("source_gains") if source else None,
         )

@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, evenly_spread
-from heatsplat.physics.noise import MIN_NOISE, noise_of, quantum_of
+from heatsplat.physics.noise import MIN_NOISE, noise_of_views
 
 log = logging.getLogger(__name__)
 
 MOMENTS = 64  # of the record at which temperatures are compared, at most
 RATES = torch.logspace(-2, 2, 512, dtype=torch.float64)  # per span; neighbours tell at most 4e-4 of the start apart
 CHUNK = 8192  # Gaussians fitted at a time: 30 MB
-NOISY_VIEWS = 5  # from which the noise is estimated
 
 
 class SparseSources:
@@ -55,7 +54,7 @@ class SparseSources:
         times = sorted(set(scene.train.times_s))
         self.times_s = [times[i] for i in evenly_spread(len(times), MOMENTS)]
         if self.noise is None:
-            self.noise = _noise_of(scene, modality)
+            self.noise = noise_of_views(scene.train, modality)
             if self.noise <= MIN_NOISE:
                 log.warning(
                     "neighbouring pixels of scene '%s' are equal, so its noise is unknown and no source is dropped; "
@@ -78,15 +77,6 @@ class SparseSources:
         results = [relaxation_of(part, times) for part in above.split(CHUNK, dim=1)]
         start, rate, error = (torch.cat(parts) for parts in zip(*results, strict=True))
         return error <= self.floor * self.noise, (start + ambient).float(), rate.log().float()
-
-
-def _noise_of(scene: SceneData, modality: str) -> float:
-    """Standard deviation of the noise of a pixel, from a few views spread over the record."""
-    views = [scene.train[i] for i in torch.linspace(0, len(scene.train) - 1, min(NOISY_VIEWS, len(scene.train))).long()]
-    images = torch.stack([view.image(modality)[..., 0] for view in views]).double()
-    every = torch.ones(images.shape[1:], dtype=torch.bool)
-    masks = torch.stack([every if view.mask is None else view.mask for view in views])
-    return noise_of(images, quantum_of(images[0]), masks)
 
 
 def relaxation_of(above: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:

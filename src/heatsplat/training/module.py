@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
@@ -23,6 +25,8 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.overlap import Overlap
+from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
@@ -50,6 +54,9 @@ class SplatTraining(pl.LightningModule):
         stages: which parameters are frozen at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
+        merging: what is done to Gaussians after training, before the test; None: nothing.
+        resolution: how large images are over the run; None: full size throughout.
+        overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -73,6 +80,9 @@ class SplatTraining(pl.LightningModule):
         stages: Stages | None = None,
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
+        merging: Merging | None = None,
+        resolution: Resolution | None = None,
+        overlap: Overlap | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -86,6 +96,9 @@ class SplatTraining(pl.LightningModule):
         self.schedule = Schedule(max_steps, self.stages.restarts)
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
+        self.merging = merging or Merging()
+        self.resolution = resolution or Resolution()
+        self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -100,6 +113,8 @@ class SplatTraining(pl.LightningModule):
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
+        self._pixels = 0  # of the last image
+        self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -121,12 +136,15 @@ class SplatTraining(pl.LightningModule):
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.density.prepare(scene, self.modality)
+        learned = (self.modality, *self.thermal.companions)
+        self.resolution.prepare(scene, learned, self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
-        modalities = zip((self.modality, *self.thermal.companions), self.thermal.modality_channels, strict=True)
+        modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
             self.double()
+        self.merging.check(self)
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -147,7 +165,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": item.lr,
+                "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
@@ -169,11 +187,17 @@ class SplatTraining(pl.LightningModule):
         """Steps between validations, none of which measures opacities that were just reset."""
         if not isinstance(interval, int):
             return interval
-        return self.schedule.interval(interval, lambda step: self.density.settled(self.schedule.round_step(step - 1)))
+        parts = (self.density, self.overlap)
+        return self.schedule.interval(
+            interval, lambda step: all(part.settled(self.schedule.round_step(step - 1)) for part in parts)
+        )
 
     # One step ----------------------------------------------------------------------------------------
 
     def on_train_start(self) -> None:
+        for name, gradient in self._waiting.items():
+            self.get_parameter(name).grad = gradient.to(self.device)
+        self._waiting = {}
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -183,15 +207,39 @@ class SplatTraining(pl.LightningModule):
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
 
-    def render(self, frame: Frame, depth: bool = False, absgrad: bool = False, maps: int = 0) -> RenderOutput:
-        """The clean image that the splats send to the camera of ``frame`` at its time."""
+    def on_train_epoch_end(self) -> None:
+        """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
+        if self.global_step < self.schedule.end:  # stopped by hand
+            return
+        optimizer = self.trainer.optimizers[0]
+        found = self.merging(self, self.cloud(getattr(optimizer, "optimizer", optimizer)))
+        if found is not None:
+            self._show(self.splats)
+            self.results.run["merging"] = found
+
+    def render(
+        self,
+        frame: Frame,
+        depth: bool = False,
+        absgrad: bool = False,
+        maps: int = 0,
+        ratio: float = 1.0,
+        signs: Tensor | None = None,
+        values: Tensor | None = None,
+    ) -> RenderOutput:
+        """The clean image that the splats send to the camera of ``frame`` at its time.
+
+        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
+        [N, C] are what they emit in place of what the thermal model makes of them.
+        """
 
         channels = self.thermal.modality_channels[0]
         moved = self.thermal.geometry(self.splats, _query(frame))
 
         def emitted(ids: Tensor) -> Tensor:
             query = _query(frame, ids, moved)
-            return self.composite.encode(self.thermal.features(self.splats, query), channels)
+            told = self.thermal.features(self.splats, query) if values is None else values.index_select(0, ids)
+            return self.composite.encode(told, channels)
 
         output = self.renderer(
             *self._shapes(moved),
@@ -202,6 +250,8 @@ class SplatTraining(pl.LightningModule):
             absgrad=absgrad,
             depth=depth,
             maps=maps,
+            ratio=ratio,
+            signs=signs,
         )
         return replace(output, features=self.composite.decode(output.features, channels))
 
@@ -212,11 +262,15 @@ class SplatTraining(pl.LightningModule):
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
-        view = view.to(self.device, self.dtype)
-        here = self.schedule.round_step(step)
+        here, progress = self.schedule.round_step(step), self.schedule.progress(step)
+        ratio = self.resolution.ratio(progress)
+        camera = rendered(view.camera, self.supersample / ratio)
+        view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
+        frame = replace(view.frame, camera=camera)
         self.thermal.on_step(here)
-        frame = self._fine(view.frame)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=self.density.maps_at(here))
+        signs = self.overlap.signs_at(here, len(self.splats), self.seed)
+        maps = self.density.maps_at(here)
+        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
         prediction = self.sensor(image, frame)
         inputs = LossInputs(
@@ -226,28 +280,34 @@ class SplatTraining(pl.LightningModule):
             view,
             self.splats,
             step,
-            self.schedule.progress(step),
+            progress,
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
+            ratio,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
-        self._rendered = (output, frame.camera)
+        if signs is not None:
+            terms["entropy"] = self.overlap.entropy(output, here)
+        self._rendered = (output, camera)
         loss = sum(terms.values())
-        if output.weighted is not None:  # adds 0 to the loss
-            maps = self.density.pixel_maps(pixel_errors(inputs, frame.camera), here)
-            loss = loss + (output.weighted.image * maps).sum()
-        return {"loss": loss, "terms": {name: term.detach() for name, term in terms.items()}}
-
-    def _fine(self, frame: Frame) -> Frame:
-        """The frame on the grid on which training renders."""
-        if self.supersample == 1:
-            return frame
-        camera, factor = frame.camera, self.supersample
-        return replace(frame, camera=camera.resized(factor * camera.width, factor * camera.height))
+        if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            loss = loss + (output.weighted.image * maps).sum() * ratio**2
+        told = {name: term.detach() for name, term in terms.items()}
+        return {"loss": loss, "terms": told, "prediction": prediction.detach()}
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
+        self._pixels = camera.width * camera.height
         self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
+
+    def _updates(self, step: int) -> bool:
+        """Whether parameters change after ``step``: always, but where gradients of several views are summed."""
+        return self.optim.updates(step, self.schedule.progress(step)) or step + 1 >= self.schedule.end
+
+    def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
+        if self.global_step == 0 or self._updates(self.global_step - 1):
+            optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
@@ -257,10 +317,14 @@ class SplatTraining(pl.LightningModule):
             inner.state.clear()
             for statistic in self._density_state.values():
                 statistic.zero_()
+        update = self._updates(step)
         with self.stages.on_step(step, inner):
-            optimizer.step(closure=optimizer_closure)
-        cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
+            optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
+        cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
+        if self.optim.decoupled is not None and update:
+            self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
+        self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
@@ -270,6 +334,10 @@ class SplatTraining(pl.LightningModule):
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
                     group["weight_decay"] = self._penalty(self._declared[group["name"]])
+
+    def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
+        """The Gaussians with their moments and statistics, through which alone they come and go."""
+        return Cloud(self.splats, optimizer, self._density_state, self.smoothing.kept_opacity)
 
     def _penalty(self, item: PerGaussian) -> float:
         """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
@@ -292,6 +360,34 @@ class SplatTraining(pl.LightningModule):
         images = (self.sensor(image, frame), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
+
+    @contextmanager
+    def showing(self, splats: Splats) -> Iterator[None]:
+        """While it lasts, other splats of the same tensors are rendered in place of its own."""
+        own = self.splats
+        self._show(splats)
+        try:
+            yield
+        finally:
+            self._show(own)
+
+    def _show(self, splats: Splats) -> None:
+        self.splats = splats
+        self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
+
+    @torch.no_grad()
+    def emissions(self, splats: Splats, frame: Frame) -> Tensor:
+        """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
+        return self.thermal.features(splats, _query(frame))
+
+    @property
+    def constants(self) -> frozenset[str]:
+        """Names of tensors of the thermal model that are given and not trained, such as the class of a surface."""
+        return frozenset(name for name, item in self._declared.items() if item.lr == 0)
+
+    def generator(self, number: int, purpose: str) -> torch.Generator:
+        """A generator of random numbers of the run's seed."""
+        return generator_for(self.seed, number, purpose)
 
     @torch.no_grad()
     def attributes(self, frame: Frame) -> dict[str, Tensor]:
@@ -338,6 +434,9 @@ class SplatTraining(pl.LightningModule):
             "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
+        if self.global_step > 0 and not self._updates(self.global_step - 1):
+            gradients = ((name, parameter.grad) for name, parameter in self.named_parameters())
+            checkpoint[CHECKPOINT_KEY]["gradients"] = {name: grad.cpu() for name, grad in gradients if grad is not None}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -350,6 +449,7 @@ class SplatTraining(pl.LightningModule):
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
+        self._waiting = checkpoint[CHECKPOINT_KEY].get("gradients", {})
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

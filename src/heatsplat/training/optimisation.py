@@ -8,6 +8,9 @@ from typing import Any
 import torch
 
 from heatsplat.splats import Splats
+from heatsplat.training.decoupled import DecoupledDecay
+
+PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
 
 
 class Optimisation:
@@ -15,13 +18,19 @@ class Optimisation:
 
     Args:
         means, log_scales, quats, opacity_logits: learning rates; that of the means is multiplied by the scene's extent.
+        length_power: how much faster parameters of Gaussians learn in a run shorter than 30 000 steps, for which the papers chose
+            their rates: (30 000 / steps) ** length_power times, in longer ones as fast. Opacities are left out, they saturate.
+        steps: planned length of the run.
         means_end: factor on the means' learning rate at the last step; log-linear in between.
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to
             its "lr_end" to this power. 1 is what the methods' papers do in 30 000 steps; 0 leaves rates as they are.
         betas, eps: of Adam.
+        accumulate: views whose gradients are summed for one update; 1: every view has an update of its own.
+        accumulate_from: share of the run after which that begins.
+        decoupled: decay of opacities and sizes beside Adam, or None.
 
     Raises:
-        ValueError: ``decay`` is negative.
+        ValueError: ``decay`` is negative, or fewer than one view is accumulated.
     """
 
     def __init__(
@@ -31,22 +40,31 @@ class Optimisation:
         log_scales: float = 5e-3,
         quats: float = 1e-3,
         opacity_logits: float = 5e-2,
+        length_power: float = 0.0,
+        steps: int = PUBLISHED_STEPS,
         decay: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
+        accumulate: int = 1,
+        accumulate_from: float = 0.5,
+        decoupled: DecoupledDecay | None = None,
     ) -> None:
+        if accumulate < 1:
+            raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
         if decay < 0:
             raise ValueError(f"optim.decay must not be negative, got {decay}")
+        self.pace = max(PUBLISHED_STEPS / steps, 1.0) ** length_power
         self.means, self.means_end, self.decay = means, means_end, decay
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps
+        self.accumulate, self.accumulate_from, self.decoupled = accumulate, accumulate_from, decoupled
 
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
         """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""
         rates = {
-            "means": self.means * extent,
-            "log_scales": self.log_scales,
-            "quats": self.quats,
+            "means": self.pace * self.means * extent,
+            "log_scales": self.pace * self.log_scales,
+            "quats": self.pace * self.quats,
             "opacity_logits": self.opacity_logits,
         }
         ends = {"means": self.means_end}
@@ -54,6 +72,10 @@ class Optimisation:
             {"params": [splats[name]], "name": name, "lr": lr, "lr_end": ends.get(name, 1.0)}
             for name, lr in rates.items()
         ]
+
+    def updates(self, step: int, progress: float) -> bool:
+        """Whether parameters change after ``step``, at which ``progress`` of the run is done; else its gradients wait."""
+        return self.accumulate == 1 or progress < self.accumulate_from or (step + 1) % self.accumulate == 0
 
     def build(self, groups: list[dict[str, Any]], progress: Callable[[float], float]):
         """The optimiser over all groups, and the scheduler to call after every step.

@@ -1,0 +1,253 @@
+"""Density control to a budget: Gaussians are split along their longest axis where images are wrong, exactly to B of them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
+from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.ops import Cloud, LongAxisSplit
+from heatsplat.physics.noise import MIN_NOISE, noise_of_views
+
+log = logging.getLogger(__name__)
+
+CURVES: dict[str, Callable[[float], float]] = {
+    "sqrt": lambda x: x**0.5,
+    "linear": lambda x: x,
+    "concave": lambda x: 2 * x - x * x,
+}
+SCORES = ("error", "absgrad", "uniform")
+BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
+DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
+
+
+class Budget(DensityControl):
+    """Splits where the image is wrong until there are exactly B Gaussians, and removes those that show nothing.
+
+    B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start.
+
+    The score of a Gaussian is the error that its pixels have beyond the noise of the camera, weighted by how much of each
+    pixel it is, Σ_v Σ_p w max(e - floor noise, 0), over the last ``views`` steps before an event (the sampler shows each
+    view once a pass). Those to be split are drawn by score, without replacement, and only among those that are wrong on
+    enough pixels for that not to be noise. Of the Gaussians that are still missing, an event adds the share that its part
+    of ``curve`` has of what is left of the curve; so their number follows N0 + (B - N0) curve(x), catches up with what was
+    removed or held back, and is B after the last event if enough of them are wrong.
+
+    Once they have come, Gaussians leave that the training views hardly show: after the first whole pass of the views that
+    begins at a step of ``remove_at`` or later, those outside the share ``keep`` of all blending weights, and those seen in
+    fewer than two of several views. Nothing is added after ``stop``, and opacities are never reset.
+
+    With several modalities, errors are those of all images and blending weights those of the first; what another modality
+    shows is never removed.
+
+    After Taming 3DGS (Mallick et al. 2024: budget, concave curve), Revising Densification (Bulo et al. 2024: error by
+    blending weights), Improved-GS (2025: long-axis split, root curve) and Mini-Splatting2 (2024: removal).
+
+    Args:
+        start, stop: first and last step at which Gaussians are added, or removed as transparent.
+        every: steps between events.
+        cap_max: never more Gaussians than this.
+        multiple: B in Gaussians of the start; None: B is ``cap_max``.
+        score: "error", "absgrad" (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
+        curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
+        views: steps before an event over which the score is summed.
+        floor: errors up to so many standard deviations of the noise do not count; 0 counts all.
+        noise: that standard deviation in image units; None estimates it from the training images.
+        least_pixels: Gaussians wrong on fewer pixels than this, over all views of the score, are not split.
+        prune_opacity: Gaussians below this opacity (in every modality) are removed at events.
+        remove_at: steps from which on a pass of the views tells which Gaussians they hardly show; those leave after it.
+        keep: share of all blending weights that stays.
+        split: how a Gaussian is split.
+
+    Raises:
+        ValueError: an option is out of its range.
+    """
+
+    def __init__(
+        self,
+        start: int = 600,
+        stop: int = 14_400,
+        every: int = 500,
+        cap_max: int = 100_000,
+        multiple: float | None = 3.0,
+        score: str = "error",
+        curve: str = "linear",
+        views: int = 10,
+        floor: float = 3.0,
+        noise: float | None = None,
+        least_pixels: float = 3.0,
+        prune_opacity: float = 0.005,
+        remove_at: Sequence[int] = (14_400,),
+        keep: float = 0.999,
+        split: LongAxisSplit | None = None,
+    ) -> None:
+        check_option("density.score", score, SCORES)
+        check_option("density.curve", curve, CURVES)
+        if min(every, cap_max, views) < 1:
+            raise ValueError(f"density.every, cap_max and views must be at least 1, got {every}, {cap_max} and {views}")
+        if multiple is not None and not multiple > 0:
+            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
+        if not 0 < keep <= 1 or min(floor, least_pixels, noise or 0.0) < 0:
+            raise ValueError(
+                "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
+                f"got {keep}, {floor}, {noise} and {least_pixels}"
+            )
+        self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
+        self.multiple, self.wanted = multiple, math.inf
+        self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
+        self.absgrad = score == "absgrad"
+        self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
+        self.prune_opacity, self.remove_at, self.keep = prune_opacity, tuple(remove_at), keep
+        self.split = split or LongAxisSplit()
+        self.steps_of_pass = 1
+
+    def prepare(self, scene: SceneData, modality: str) -> None:
+        """Takes the number of training views and, unless it is given, their noise (that of the first modality)."""
+        self.steps_of_pass = len(scene.train)
+        if self.noise is None and self.floor > 0:
+            self.noise = noise_of_views(scene.train, modality)
+            if self.noise <= MIN_NOISE:
+                log.warning(
+                    "neighbouring pixels of scene '%s' are equal, so its noise is unknown and every error counts for density "
+                    "control; give density.noise in image units (a third of a quantisation step at least)",
+                    scene.name,
+                )
+
+    def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
+        """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
+        "shown" (pixels) and "seen" (views) for removal."""
+        if self.multiple is not None:
+            self.wanted = round(self.multiple * count)
+        return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
+
+    # When ------------------------------------------------------------------------------------------------------------
+
+    def _event(self, step: int) -> int | None:
+        """The event of growth, counted from 0, at or next after a step; None after the last one."""
+        number = max(step, self.start) // self.every
+        return number if (number + 1) * self.every - 1 < self.stop else None
+
+    def _growth_in(self, step: int) -> int | None:
+        """Steps from here to the next event of growth, 0 where it is now; None after the last one."""
+        number = self._event(step)
+        return None if number is None else (number + 1) * self.every - 1 - step
+
+    def _removal_in(self, step: int) -> int | None:
+        """Steps from here to the next removal, 0 where it is now; None after the last one."""
+        views = self.steps_of_pass
+        ends = [(-(-begin // views) + 1) * views - 1 for begin in self.remove_at]
+        return min((end - step for end in ends if end >= step), default=None)
+
+    def _scores(self, step: int) -> bool:
+        ahead = self._growth_in(step)
+        return ahead is not None and ahead < self.views
+
+    def _judges(self, step: int) -> bool:
+        ahead = self._removal_in(step)
+        return ahead is not None and ahead < self.steps_of_pass
+
+    # What is gathered ------------------------------------------------------------------------------------------------
+
+    def maps_at(self, step: int) -> int:
+        """Three while scores are summed (weight, wrong pixels, error), one while only weights are."""
+        return 3 if self._scores(step) and self.score == "error" else int(self._judges(step))
+
+    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+        beyond = (error - self.floor * (self.noise or 0.0)).clamp(min=0)
+        maps = torch.stack([torch.ones_like(error), (beyond > 0).to(error), beyond], dim=-1)
+        return maps[..., : self.maps_at(step)]
+
+    @torch.no_grad()
+    def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
+        ids = output.meta["visible_ids"]
+        if self._scores(step) and self.absgrad:
+            size = state["score"].new_tensor([camera.width / 2, camera.height / 2])
+            state["score"].index_add_(
+                0, ids, (output.meta["means2d"].absgrad[ids] * size).norm(dim=1).to(state["score"])
+            )
+        if output.weighted is None or output.weighted.sums is None:
+            return
+        sums = output.weighted.sums.to(state["score"])
+        if self._scores(step) and self.score == "error":
+            for name, column in zip(("weight", "wrong", "score"), sums.unbind(1), strict=True):
+                state[name].index_add_(0, ids, column)
+        if self._judges(step):
+            weight = sums[:, 0]
+            state["shown"].index_add_(0, ids, weight)
+            state["seen"].index_add_(0, ids, _outside(weight, DIM).logical_not().to(weight))
+
+    # What is done ----------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
+        removed = added = 0
+        growth, removal = self._growth_in(step) == 0, self._removal_in(step) == 0
+        if removal:
+            removed += self._keep(cloud, self._worth(cloud), step)
+        if growth:
+            removed += self._keep(cloud, self._visible(cloud), step)
+            added = self._grow(cloud, step, generator)
+        for due, names in ((growth, ("score", "wrong", "weight")), (removal, ("shown", "seen"))):
+            for name in names if due else ():
+                cloud.state[name].zero_()
+        return DensityChange(added, removed) if growth or removal else None
+
+    def _visible(self, cloud: Cloud) -> Tensor:
+        opaque = (cloud.splats.opacities > self.prune_opacity).any(dim=0)
+        return opaque & torch.isfinite(cloud.splats.means).all(dim=1)
+
+    def _worth(self, cloud: Cloud) -> Tensor:
+        """Which Gaussians [N] the training views show, by what was summed over a pass of them."""
+        seen = cloud.state["seen"] >= min(2, self.steps_of_pass)
+        elsewhere = (cloud.splats.opacities[1:] > self.prune_opacity).any(dim=0)
+        return ~_outside(cloud.state["shown"], 1 - self.keep) & seen | elsewhere
+
+    def _keep(self, cloud: Cloud, mask: Tensor, step: int) -> int:
+        removed = int((~mask).sum())
+        if removed == len(cloud):
+            raise RuntimeError(
+                f"density control would remove all {removed} Gaussians at step {step}: none is more opaque than "
+                f"{self.prune_opacity} and shown by the training views. Lower the learning rates or density.prune_opacity, "
+                "or start from more points."
+            )
+        if removed:
+            cloud.keep(mask)
+        return removed
+
+    def _grow(self, cloud: Cloud, step: int, generator: torch.Generator) -> int:
+        state = cloud.state
+        score = torch.ones_like(state["score"]) if self.score == "uniform" else state["score"].clone()
+        if self.score == "error":
+            score[state["wrong"] <= self.least_pixels + BY_CHANCE * state["weight"]] = 0
+        wanted = round(self._share(step) * max(min(self.wanted, self.cap_max) - len(cloud), 0))
+        chosen = _drawn(score, wanted, generator)
+        cloud.split(chosen, self.split)
+        return len(chosen)
+
+    def _share(self, step: int) -> float:
+        """Of the Gaussians that are missing, the share that comes at the event of this step."""
+        first, number = self._event(0), self._event(step)
+        last = self.stop // self.every - 1
+        before, after = (self.curve((done - first) / (last - first + 1)) for done in (number, number + 1))
+        return 1.0 if number == last else (after - before) / (1 - before)
+
+
+def _outside(weights: Tensor, share: float) -> Tensor:
+    """The smallest of ``weights`` [n] that together are no more than ``share`` of their sum, [n] bool; zeros are."""
+    order = weights.argsort(stable=True)
+    small = weights[order].double().cumsum(0) <= share * weights.double().sum()
+    return torch.zeros_like(small).scatter_(0, order, small) | (weights <= 0)
+
+
+def _drawn(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """At most ``count`` different ids, each draw by score among those left; none without a score. Ascending."""
+    # The largest keys of log score + Gumbel noise are such a draw (Gumbel-top-k; Efraimidis and Spirakis 2006).
+    uniform = torch.rand(scores.shape, generator=generator, dtype=torch.float64).clamp(min=1e-300)
+    keys = scores.double().log() - (-uniform.log()).log().to(scores.device)
+    count = min(count, int((scores > 0).sum()))
+    return keys.argsort(descending=True, stable=True)[:count].sort().values

@@ -1,0 +1,121 @@
+"""Time to the accuracy of a reference: how long recipes take until they are as good as the standard run, and what they cost.
+
+Rules: recipes are compared with the reference on the same method, scene and seed only. On the way both are measured by the
+validation views, at the end by the test views, each against the reference's own last value there. A compressed schedule is
+worth its end, so ends count beside courses; beside every recipe stands what the standard schedule, made shorter, reaches in
+the same time, on the line between the ends of standard runs of several lengths over log seconds, never beyond them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from heatsplat.contracts import SceneError
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import write_csv
+from heatsplat.studies.child_runs import trained
+from heatsplat.studies.finished import settings_of
+from heatsplat.studies.frontier_runs import find_runs
+from heatsplat.studies.time_to_accuracy_report import markdown, picture, records
+from heatsplat.studies.time_to_accuracy_runs import Panel, panels_of, parsed, without_length
+
+log = logging.getLogger("heatsplat")
+
+CLOCKS = ("train_seconds", "cpu_seconds")
+IDENTITY = ("method", "data", "data.scene", "data.scene_seed", "seed")  # with the settings, what tells runs apart
+
+
+def run(
+    output_dir: Path | str,
+    runs: str | Sequence[str] | None,
+    reference: Sequence[str],
+    recipes: Mapping[str, Sequence[str]],
+    clock: str = "train_seconds",
+    psnr_margin_db: float = 0.2,
+    mae_margin_c: float = 0.02,
+    cases: Mapping[str, Sequence[str]] | None = None,
+    lengths: Sequence[int] = (),
+    seeds: Sequence[int] = (0,),
+    overrides: Sequence[str] = (),
+    train: str | None = None,
+    outputs: str = "outputs",
+) -> list[Panel]:
+    """The panels found; writes time_to_accuracy.md, .csv and .png.
+
+    Args:
+        output_dir: folder of the results, and of the runs that the study trains.
+        runs: folders of finished runs or sweeps, searched to any depth; None: ``outputs`` where there are no cases, else none.
+        reference: overrides of the reference, its max_steps among them; runs of another length with the same overrides are
+            the standard schedule made shorter.
+        recipes: name -> overrides. Finished runs with other overrides are shown under these.
+        clock: "train_seconds" (a quiet machine) or "cpu_seconds" (one that does other work besides); see
+            ``callbacks.timing.CostMeter``.
+        psnr_margin_db, mae_margin_c: by how much a run may be worse than the reference and count as its equal.
+        cases: name -> overrides that choose method and scene; of each, the reference, the standard schedule of ``lengths``
+            and all recipes are trained with every seed, unless they are among ``runs``. None: nothing is trained.
+        lengths: steps of shorter standard runs.
+        seeds: of the runs that are trained.
+        overrides: of the runs that are trained; finished runs count as theirs whether they have them or not.
+        train: path of train.py; None: the installed heatsplat-train.
+        outputs: where runs lie.
+
+    Raises:
+        SceneError: the reference has no length, the clock is none, a run of the study failed, or there is no finished
+            reference.
+    """
+    output_dir = Path(output_dir)
+    if clock not in CLOCKS:
+        raise SceneError(f"study.clock={clock}: give one of {', '.join(CLOCKS)}")
+    if "max_steps" not in parsed(reference):
+        raise SceneError(f"study.reference={list(reference)}: give its length too, such as max_steps=30000")
+    if runs is None:
+        runs = [] if cases else outputs
+    folders = [Path(text).expanduser() for text in ([runs] if isinstance(runs, str) else runs)]
+    known = find_runs(folders, clock)
+    common = set(settings_of(parsed(overrides)))
+    there = {_identity(found, common) for found in known["overrides"]} if len(known) else set()
+    for place, wanted in asked_for(cases or {}, reference, lengths, recipes, seeds):
+        if _identity(parsed(wanted), common) not in there:
+            trained(output_dir / "runs" / place, train, [*overrides, *wanted], output_dir)
+            folders = [*folders, output_dir / "runs" / place]
+    margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
+    panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common)
+    if not panels:
+        raise SceneError(
+            f"runs={', '.join(map(str, folders))}: there is no finished run of the reference ({' '.join(reference)}) that "
+            f"tells its {clock}, PSNR and Gaussians. Give folders that src/train.py wrote with these overrides, or "
+            "study.cases, and they are trained."
+        )
+    write_png(output_dir / "time_to_accuracy.png", figure_picture(picture(panels, clock)))
+    write_csv(output_dir / "time_to_accuracy.csv", records(panels))
+    text = markdown(panels, clock)
+    write_atomically(output_dir / "time_to_accuracy.md", text)
+    log.info("%s", text)
+    return panels
+
+
+def asked_for(
+    cases: Mapping[str, Sequence[str]],
+    reference: Sequence[str],
+    lengths: Sequence[int],
+    recipes: Mapping[str, Sequence[str]],
+    seeds: Sequence[int],
+) -> list[tuple[str, list[str]]]:
+    """Folder and overrides of every run that the study needs."""
+    shorter = {f"standard_{length}": [*without_length(reference), f"max_steps={length}"] for length in lengths}
+    wanted = {"reference": list(reference), **shorter, **recipes}
+    return [
+        (f"{case}_{name}_{seed}", [*cases[case], *wanted[name], f"seed={seed}"])
+        for case, name, seed in itertools.product(cases, wanted, seeds)
+    ]
+
+
+def _identity(overrides: Mapping[str, str], common: set[str]) -> frozenset[str]:
+    """What makes a run the one that was asked for; ``common`` settings say nothing."""
+    default = {"seed": "0"}
+    places = [f"{key}={overrides.get(key, default.get(key))}" for key in IDENTITY]
+    return frozenset([*places, *(text for text in settings_of(overrides) if text not in common)])

@@ -1,0 +1,312 @@
+"""Budget: who grows and when, exactly to B and never above; noise is not detail; what shows nothing goes; resume."""
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, View, ViewSet, WeightedSums
+from heatsplat.density.adaptive import Adaptive
+from heatsplat.density.budget import CURVES, Budget, _drawn
+from heatsplat.density.ops import Cloud
+from heatsplat.renderers.base import rasterization
+from heatsplat.splats import Splats
+
+CAMERA = Camera(torch.eye(4), torch.eye(3), width=20, height=10)
+
+
+def budget(**options) -> Budget:
+    return Budget(**{"multiple": None} | options)
+
+
+def make_cloud(policy, count: int, opacities: list[float] | None = None) -> Cloud:
+    splats = Splats(
+        {
+            "means": torch.arange(count * 3, dtype=torch.float32).reshape(count, 3),
+            "log_scales": torch.full((count, 3), 0.1).log(),
+            "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+            "opacity_logits": torch.logit(torch.tensor(opacities or [0.5] * count))[:, None],
+        }
+    )
+    return Cloud(splats, None, policy.initial_state(count, torch.device("cpu")))
+
+
+def refine(policy: Budget, cloud: Cloud, step: int, seed: int = 0):
+    return policy.refine(cloud, step, 1.0, torch.Generator().manual_seed(seed))
+
+
+def blame(cloud: Cloud, score: list[float], wrong: float = 100.0) -> None:
+    """What observing views would have summed."""
+    cloud.state["score"] = torch.tensor(score)
+    cloud.state["wrong"] = torch.where(cloud.state["score"] > 0, wrong, 0.0)
+    cloud.state["weight"] = torch.full((len(cloud),), 200.0)
+
+
+def observed(policy: Budget, cloud: Cloud, sums: torch.Tensor, step: int) -> None:
+    """A view of all Gaussians, with these sums [n, S]."""
+    rows = torch.zeros_like(sums, requires_grad=True)
+    rows.grad = sums
+    output = RenderOutput(
+        torch.zeros(10, 20, 1), torch.zeros(1, 10, 20), None, {"visible_ids": torch.arange(len(cloud))},
+        WeightedSums(torch.zeros(10, 20, sums.shape[1]), rows),
+    )  # fmt: skip
+    policy.observe(cloud.state, output, CAMERA, step)
+
+
+# Numbers ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("curve", sorted(CURVES))
+def test_numbers_follow_the_curve_to_exactly_b(curve: str):
+    policy = budget(start=20, stop=115, every=10, cap_max=777, curve=curve, score="uniform", remove_at=())
+    cloud = make_cloud(policy, 200)
+    numbers = []
+    for step in range(200):
+        change = refine(policy, cloud, step)
+        assert (change is not None) == (step in range(29, 115, 10))
+        if change:
+            numbers.append(len(cloud))
+    events = range(1, len(numbers) + 1)
+    assert len(numbers) == 9 and numbers[-1] == 777
+    expected = [200 + 577 * CURVES[curve](event / 9) for event in events]
+    unhindered = [min(number, 200 * 2**event) for event, number in zip(events, expected, strict=True)]
+    assert numbers[2:] == pytest.approx(unhindered[2:], abs=6)
+    assert all(after >= before for before, after in zip(numbers, numbers[1:], strict=False)) and max(numbers) <= 777
+
+
+def test_what_was_pruned_comes_back_and_a_cap_that_is_lowered_holds():
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=())
+    cloud = make_cloud(policy, 100)
+    for step in range(100):
+        if step == 39:
+            cloud.splats["opacity_logits"].data[:50] = -20.0
+            before = len(cloud)
+        if step == 60:
+            policy.cap_max = len(cloud)
+        change = refine(policy, cloud, step)
+        if step == 39:
+            assert change.removed == 50 and len(cloud) == before - 50 + change.added
+        if step == 69:
+            assert change.added == 0
+            policy.cap_max = 400
+    assert len(cloud) == 400
+
+
+def test_b_may_count_in_gaussians_of_the_start():
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=(), multiple=2.5)
+    cloud = make_cloud(policy, 100)
+    for step in range(100):
+        refine(policy, cloud, step)
+    assert len(cloud) == 250
+
+
+def test_more_than_b_at_the_start_stay_and_none_is_added():
+    policy = budget(start=0, stop=100, every=10, cap_max=50, score="uniform", remove_at=())
+    cloud = make_cloud(policy, 60)
+    assert [refine(policy, cloud, step).added for step in range(9, 100, 10)] == [0] * 10
+
+
+def test_one_event_splits_each_gaussian_once_at_most():
+    policy = budget(start=0, stop=10, every=10, cap_max=1000, score="uniform", remove_at=())
+    cloud = make_cloud(policy, 10)
+    assert refine(policy, cloud, 9).added == 10
+
+
+# Who -------------------------------------------------------------------------------------------------------------------
+
+
+def test_only_gaussians_with_a_score_grow_the_worst_most_often():
+    scores = torch.tensor([0.0, 1.0, 3.0, 6.0]).repeat(1000)
+    drawn = _drawn(scores, 300, torch.Generator().manual_seed(1))
+    counts = (drawn % 4).bincount(minlength=4)
+    assert len(drawn.unique()) == 300 and counts[0] == 0
+    assert counts[1:].tolist() == pytest.approx([30, 90, 180], abs=25)
+    assert len(_drawn(scores, 9999, torch.Generator())) == 3000
+
+
+def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_event():
+    policy = budget(start=0, stop=100, every=10, views=3, noise=0.1, remove_at=())
+    policy.prepare(noisy_scene(0.0, 1), "thermal")
+    assert [policy.maps_at(step) for step in range(11)] == [0] * 7 + [3] * 3 + [0]
+    assert policy.maps_at(100) == 0
+    maps = policy.pixel_maps(torch.tensor([[0.2, 0.5]]), 7)
+    torch.testing.assert_close(maps, torch.tensor([[[1.0, 0.0, 0.0], [1.0, 1.0, 0.2]]]))
+    cloud = make_cloud(policy, 2)
+    for step in (7, 8):
+        observed(policy, cloud, torch.tensor([[50.0, 40.0, 2.0], [0.0, 0.0, 0.0]]), step)
+    assert cloud.state["score"].tolist() == [4, 0] and cloud.state["wrong"].tolist() == [80, 0]
+    assert refine(policy, cloud, 9).added == 1
+    assert not cloud.state["score"].any() and cloud.splats.means[1].tolist() == [3, 4, 5]
+
+
+def test_gaussians_wrong_on_few_pixels_are_not_split():
+    policy = budget(start=0, stop=100, every=10, cap_max=100, remove_at=())
+    cloud = make_cloud(policy, 3)
+    blame(cloud, [1.0, 1.0, 1.0])
+    cloud.state["wrong"] = torch.tensor([2.9, 4.9, 5.1])  # of 200 pixels each: 3 + 1 %
+    assert refine(policy, cloud, 9).added == 1
+
+
+def test_absgrad_scores_by_the_pull_on_screen_positions():
+    policy = budget(start=0, stop=100, every=10, views=2, score="absgrad", remove_at=())
+    assert policy.absgrad and policy.maps_at(9) == 0
+    cloud = make_cloud(policy, 2)
+    means2d = torch.zeros(2, 2)
+    means2d.absgrad = torch.tensor([[3.0, 0.0], [0.0, 2.0]])
+    meta = {"visible_ids": torch.tensor([0, 1]), "means2d": means2d}
+    output = RenderOutput(torch.zeros(10, 20, 1), torch.zeros(1, 10, 20), None, meta)
+    for step in (7, 8, 9):
+        policy.observe(cloud.state, output, CAMERA, step)
+    assert cloud.state["score"].tolist() == [60, 20]
+
+
+def noisy_scene(noise: float, views: int) -> SceneData:
+    frames = [Frame(str(i), i, CAMERA) for i in range(views)]
+    image = torch.linspace(0.3, 0.6, 64)[:, None] * torch.ones(1, 80)
+
+    def view(i: int) -> View:
+        return View(
+            frames[i], (image + noise * torch.randn(64, 80, generator=torch.Generator().manual_seed(i)))[..., None]
+        )
+
+    train = ViewSet(frames, view)
+    return SceneData("noisy", train, train.subset([]), train.subset([]), torch.rand(9, 3))
+
+
+def selected(policy: Budget, noise: float) -> float:
+    """Share of many Gaussians of many sizes that may be split where the image is right but for noise."""
+    generator = torch.Generator().manual_seed(5)
+    count, width, height = 400, 160, 120
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 3.0, 1.0]) - torch.tensor([2.0, 1.5, -4.0])
+    scales = (0.02 * 12 ** torch.rand(count, 1, generator=generator)).repeat(1, 3)
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
+    K = torch.tensor([[160.0, 0.0, 80.0], [0.0, 160.0, 60.0], [0.0, 0.0, 1.0]])
+    cloud = make_cloud(policy, count)
+    for step in range(policy.every - policy.views, policy.every):
+        output = rasterization(
+            means, quats, scales, torch.full((1, count), 0.6), torch.zeros(count, 1), torch.eye(4), K, width, height,
+            backend="cpu", depth=False, maps=3,
+        )  # fmt: skip
+        error = (noise * torch.randn(height, width, generator=generator)).abs()
+        (output.weighted.image * policy.pixel_maps(error, step)).sum().backward()
+        policy.observe(cloud.state, output, CAMERA, step)
+    return refine(policy, cloud, policy.every - 1).added / count
+
+
+def test_noise_is_not_detail():
+    def policy(floor: float) -> Budget:
+        made = budget(start=0, stop=100, every=50, cap_max=10**6, floor=floor, remove_at=())
+        made.prepare(noisy_scene(0.02, 3), "thermal")
+        return made
+
+    assert policy(3.0).noise == pytest.approx(0.02, rel=0.15)
+    assert policy(0.0).noise is None
+    assert selected(policy(3.0), 0.02) < 0.01
+    assert selected(policy(0.0), 0.02) > 0.9
+    assert selected(policy(3.0), 0.06) > 0.9  # an error of three times that is none of the camera's
+
+
+# Removal ---------------------------------------------------------------------------------------------------------------
+
+
+def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
+    policy = budget(start=0, stop=10, every=10, cap_max=6, score="uniform", remove_at=(11,), keep=0.99)
+    policy.prepare(noisy_scene(0.01, 4), "thermal")
+    assert [step for step in range(40) if policy.maps_at(step)] == [12, 13, 14, 15]
+    cloud = make_cloud(policy, 6)
+    for step in range(12, 16):
+        once = 500.0 if step == 13 else 0.0
+        observed(policy, cloud, torch.tensor([[300.0], [300.0], [1.0], [0.0], [once], [30.0]]), step)
+    assert refine(policy, cloud, 14) is None
+    change = refine(policy, cloud, 15)  # of 2 to 5: below 1 % together, never seen, seen once, seen
+    assert (change.added, change.removed) == (0, 3)
+    assert cloud.splats.means[:, 0].tolist() == [0, 3, 15] and not cloud.state["shown"].any()
+
+
+def test_what_another_modality_shows_stays():
+    policy = budget(start=0, stop=10, every=10, remove_at=(0,))
+    cloud = make_cloud(policy, 3)
+    cloud.splats.raw["opacity_logits"] = torch.nn.Parameter(torch.tensor([[0.0, 0.0], [-30.0, 0.0], [-30.0, -30.0]]))
+    cloud.state["shown"] = torch.tensor([1.0, 0.0, 0.0])
+    cloud.state["seen"] = torch.tensor([2.0, 0.0, 0.0])
+    assert policy._worth(cloud).tolist() == [True, True, False]
+
+
+def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
+    policy = budget(start=0, stop=100, every=10, cap_max=3, remove_at=())
+    cloud = make_cloud(policy, 3, [0.5, 0.001, 0.5])
+    assert refine(policy, cloud, 9).removed == 1 and len(cloud) == 2
+    with pytest.raises(RuntimeError, match="remove all 2 Gaussians at step 9"):
+        refine(policy, make_cloud(policy, 2, [0.001] * 2), 9)
+
+
+@pytest.mark.parametrize(
+    "options", [{"every": 0}, {"keep": 0.0}, {"floor": -1.0}, {"curve": "steep"}, {"score": "luck"}]
+)
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Budget(**options)
+
+
+# Training --------------------------------------------------------------------------------------------------------------
+
+
+def plane_view(texture, noise: float, step: int) -> tuple[Camera, torch.Tensor]:
+    """A camera before the plane z = 4, a little aside at every step, and what it records."""
+    size, focal = 64, 64.0
+    draw = torch.Generator().manual_seed(step)
+    shift = 0.4 * (torch.rand(2, generator=draw) - 0.5)
+    viewmat = torch.eye(4)
+    viewmat[:2, 3] = -shift
+    K = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    places = (torch.arange(size) + 0.5 - size / 2) * 4 / focal
+    image = texture(places[None, :] + shift[0], places[:, None] + shift[1])
+    return Camera(viewmat, K, size, size), (image + noise * torch.randn(size, size, generator=draw))[..., None]
+
+
+def share_of_new_on_the_right(policy, steps: int, noise: float) -> float:
+    """Trains Gaussians on a plane whose left half is flat and whose right half is textured."""
+
+    def texture(x, y):
+        return 0.5 + torch.where(x > 0, 0.2 * torch.sin(12 * x) * torch.sin(12 * y), 0.0)
+
+    grid = torch.linspace(-2.0, 2.0, 16)
+    x, y = torch.meshgrid(grid, grid, indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((256,), 4.0)], dim=1)
+    splats = Splats(
+        {
+            "means": means,
+            "log_scales": torch.tensor([0.12, 0.13, 0.02]).log().repeat(256, 1),
+            "quats": torch.tensor([1.0, 0, 0, 0]).repeat(256, 1),
+            "opacity_logits": torch.full((256, 1), 1.0),
+            "heat": torch.full((256, 1), 0.4),
+        }
+    )
+    rates = {"means": 1e-3, "log_scales": 5e-3, "quats": 1e-3, "opacity_logits": 5e-2, "heat": 1e-2}
+    optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name, "lr": lr} for name, lr in rates.items()])
+    cloud = Cloud(splats, optimizer, policy.initial_state(256, torch.device("cpu")))
+    for step in range(steps):
+        camera, target = plane_view(texture, noise, step)
+        output = rasterization(
+            splats.means, splats.quats, splats.scales, splats.opacities, splats["heat"], camera.viewmat.float(),
+            camera.K.float(), camera.width, camera.height, backend="cpu", depth=False, maps=policy.maps_at(step),
+        )  # fmt: skip
+        error = (output.features - target).abs()
+        loss = error.mean()
+        if output.weighted is not None:
+            loss = loss + (output.weighted.image * policy.pixel_maps(error.detach()[..., 0], step)).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        policy.observe(cloud.state, output, camera, step)
+        optimizer.step()
+        policy.refine(cloud, step, 1.0, torch.Generator().manual_seed(step))
+    assert len(splats) > 300
+    right = int((splats.means[:, 0] > 0).sum())
+    return (right - 128) / (len(splats) - 256)
+
+
+def test_new_gaussians_come_where_there_is_texture():
+    steps, noise = 160, 0.01
+    ours = budget(start=40, stop=160, every=20, cap_max=512, noise=noise, remove_at=())
+    theirs = Adaptive(start=40, stop=160, every=20, cap_max=512, duplicate_scale=0.05, reset_every=None)
+    share = share_of_new_on_the_right(ours, steps, noise)
+    assert share >= 0.8
+    assert share_of_new_on_the_right(theirs, steps, noise) < share

@@ -1,0 +1,84 @@
+"""Whole runs under rules of density control: every method lives through them, and a stopped run goes on bit for bit."""
+
+import itertools
+
+import pytest
+import torch
+from helpers import ALL_METHODS
+from running import TINY, run
+
+from heatsplat.training.module import SplatTraining
+
+RULES = {
+    "multiview_gate": (
+        "density.start=5", "density.every=10", "density.views=5", "density.stop=20", "density.gate_pixels=0.1",
+        "density.late_every=10", "density.late_stop=40",
+    ),
+    "budget": ("density.start=5", "density.every=10", "density.stop=30", "density.remove_at=[1,17]"),
+    "mcmc": ("density.start=5", "density.every=10", "density.stop=40", "density.dead_opacity=0.0999"),
+}  # fmt: skip
+
+
+def overrides(rule: str, *more: str) -> tuple[str, ...]:
+    return (
+        *TINY,
+        f"density={rule}",
+        *RULES[rule],
+        "max_steps=40",
+        "test=false",
+        "trainer.val_check_interval=40",
+        *more,
+    )
+
+
+def state_of(module, trainer) -> dict[str, torch.Tensor]:
+    found = {name: value.clone() for name, value in module.state_dict().items()}
+    for group in trainer.optimizers[0].param_groups:
+        for key, value in trainer.optimizers[0].state[group["params"][0]].items():
+            found[f"{group['name']}.{key}"] = torch.as_tensor(value).clone()
+    return found
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(rule, tmp_path):
+    given = overrides(rule, "method=etgs", "callbacks.checkpoint.every_n_train_steps=17")
+    module, trainer = run(tmp_path / "whole", *given)
+    whole = state_of(module, trainer)
+    half = tmp_path / "whole" / "checkpoints" / "step_000017.ckpt"  # between refinements, whose statistics it holds
+    resumed = state_of(*run(tmp_path / "resumed", *given, f"ckpt={half}"))
+    assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
+    assert len(module.splats) > 600  # density control was at work
+
+
+def test_a_run_that_sums_gradients_of_views_moves_at_every_second_step_and_resumes_between_them(tmp_path, monkeypatch):
+    given = (
+        *TINY, "method=etgs", "density=fixed", "optim=adamw", "optim.decoupled.opacity=0.1", "optim.accumulate=2",
+        "max_steps=12", "test=false", "trainer.val_check_interval=12", "callbacks.checkpoint.every_n_train_steps=9",
+    )  # fmt: skip
+    opacities = []
+    end = SplatTraining.on_train_batch_end
+    monkeypatch.setattr(
+        SplatTraining,
+        "on_train_batch_end",
+        lambda self, *rest: (opacities.append(self.splats["opacity_logits"].detach().clone()), end(self, *rest)),
+    )
+    whole = state_of(*run(tmp_path / "whole", *given))
+    moved = [not torch.equal(one, two) for one, two in itertools.pairwise(opacities)]
+    assert moved == [True] * 5 + [False, True] * 3  # from step 6 on, after 7, 9 and 11
+    half = tmp_path / "whole" / "checkpoints" / "step_000009.ckpt"  # one view waits
+    resumed = state_of(*run(tmp_path / "resumed", *given, f"ckpt={half}"))
+    assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
+
+
+PAIRS = [  # every method under one of the rules; under the others where there is time
+    pytest.param(rule, method, marks=() if i % len(RULES) == j else pytest.mark.slow)
+    for i, method in enumerate(ALL_METHODS)
+    for j, rule in enumerate(RULES)
+]
+
+
+@pytest.mark.parametrize(("rule", "method"), PAIRS)
+def test_every_method_lives_through_every_rule(rule, method, tmp_path):
+    module, _ = run(tmp_path, *overrides(rule, f"method={method}", "max_steps=22"))
+    assert len(module.splats) > 0
+    assert all(bool(torch.isfinite(module.splats[name]).all()) for name in module.splats.names)

@@ -1,0 +1,109 @@
+"""Presets: every method with every one of them, what a preset leaves to the method, and what the command line overrules."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+from running import TINY, run
+
+from heatsplat.composition import CONF, compose
+from heatsplat.contracts import SceneError
+from heatsplat.runs.checks import checked
+
+PRESETS = ("draft", "fast", "balanced", "full")
+METHODS = sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml"))
+TURNS = list(zip(METHODS, itertools.cycle(PRESETS), strict=False))
+GROUPS = {"draft": ("Budget", "CoarseToFine"), "full": ("Adaptive", "Resolution")}
+GROUPS |= dict.fromkeys(("fast", "balanced"), GROUPS["draft"])
+OWN = {"ravigs": "CoSupport", "ti3dgs": "Proximity", "ntr_gaussian": "Adaptive", "mftg": "Adaptive"}
+
+
+def density_of(config: dict) -> str:
+    return kind(config["density"])
+
+
+def kind(settings: dict) -> str:
+    """The class that settings build."""
+    return settings["_target_"].rpartition(".")[2]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_keeps_what_is_its_own_with_every_preset(method):
+    """Its schedule is shares of the preset's steps, and none ends beyond them."""
+    plain, own = compose([f"method={method}"]), (Path(CONF) / "method" / f"{method}.yaml").read_text()
+    for preset in PRESETS:
+        config = compose([f"method={method}", f"preset={preset}"])
+        steps, stop = config["max_steps"], config["density"]["stop"]
+        assert config["density"]["cap_max"] == config["cap_max"]
+        assert stop <= steps / 2
+        for group in ("thermal", "loss", "stages", "sensor"):
+            assert config[group].get("_target_") == plain[group].get("_target_"), (preset, group)
+        assert kind(config["schedule"]) == GROUPS[preset][1]
+        if density_of(plain) != "Adaptive" or "two_rounds" in own or "first_stage" in own:
+            assert stop == pytest.approx(plain["density"]["stop"] * steps / 30000, abs=1)
+            assert density_of(config) == density_of(plain)
+        else:
+            assert density_of(config) == GROUPS[preset][0]
+
+
+def test_presets_are_ordered():
+    found = [compose([f"preset={preset}"]) for preset in PRESETS]
+    for name in ("max_steps", "cap_max"):
+        values = [config[name] for config in found]
+        assert values == sorted(values) and len(set(values)) == len(PRESETS)
+
+
+def test_what_is_given_beside_a_preset_wins():
+    config = compose(["preset=fast", "max_steps=70", "cap_max=7", "optim.decay=0.5", "density=proximity"])
+    assert (config["max_steps"], config["density"]["cap_max"], config["optim"]["decay"]) == (70, 7, 0.5)
+    assert config["density"]["stop"] == 35 and density_of(config) == "Proximity"
+    assert compose(["preset=fast", "density=fixed"])["density"] == {"_target_": "heatsplat.density.fixed.Fixed"}
+    assert compose(["preset=fast", "debug=fast"])["max_steps"] == 60
+
+
+def test_a_preset_chooses_among_groups_only_where_the_method_does_not(tmp_path):
+    """A preset of another density control: methods that need one of their own keep it, the command line overrules both."""
+    (tmp_path / "preset").mkdir()
+    (tmp_path / "preset" / "other.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /density: fixed\nmax_steps: 11\n"
+    )
+    found = f"hydra.searchpath=[file://{tmp_path}]"
+
+    def chosen(*overrides: str) -> str:
+        config = compose(["preset=other", found, *overrides])
+        assert config["max_steps"] == 11
+        return density_of(config)
+
+    assert chosen("method=3dgs") == chosen("method=etgs") == "Fixed"
+    assert {method: chosen(f"method={method}") for method in OWN} == OWN
+    assert chosen("method=ravigs", "density=fixed") == "Fixed" and chosen("density=proximity") == "Proximity"
+
+
+def test_a_budget_beside_a_preset_is_refused():
+    """Both choose the steps."""
+    with pytest.raises(SceneError, match=r"budget and preset both choose .* leave out one of them"):
+        checked(compose(["preset=fast", "budget=60s"]))
+
+
+@pytest.mark.parametrize(("method", "preset"), TURNS)
+def test_every_method_trains_with_a_preset(method, preset, tmp_path):
+    """First steps of the preset's own schedule; presets take turns."""
+    module, trainer = run(
+        tmp_path, f"method={method}", f"preset={preset}", *TINY, "trainer.max_steps=3", "trainer.limit_val_batches=0",
+        "test=false",
+    )  # fmt: skip
+    assert trainer.global_step == 3
+    assert module.schedule.end == compose([f"preset={preset}"])["max_steps"]
+
+
+@pytest.mark.parametrize("method", ["3dgs", "msmg", "ravigs", "mftg"])
+def test_growth_under_a_preset_stays_within_its_cap(method, tmp_path):
+    """Each kind of density control, made short: Gaussians come, and never more than the cap."""
+    growing = ["density.grad_threshold=1e-7"] if method in OWN else ["density.least_pixels=0"]
+    module, _ = run(
+        tmp_path, f"method={method}", "preset=draft", *TINY, "max_steps=100", "cap_max=600", "density.every=10", *growing,
+        "trainer.limit_val_batches=0", "test=false",
+    )  # fmt: skip
+    assert 550 < len(module.splats) <= 600 and kind(compose([f"method={method}", "preset=draft"])["density"]) == (
+        OWN.get(method, "Budget")
+    )
