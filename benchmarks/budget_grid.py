@@ -1,8 +1,10 @@
-"""The curves behind budget=SECONDS: a grid of run lengths, caps on Gaussians and learning rates; planned runs beside it.
+"""The curves behind budget=SECONDS: a grid of run lengths, caps on Gaussians, learning rates and further settings.
 
 Rules: every run is whole, its schedule as long as it is, so a grid point is what a user would get; scores are those of the
-test views at full resolution. The curves hold no seconds, so they may be measured on a busy machine; the comparison of
-planned runs with the grid holds seconds, so it may not.
+test views at full resolution. The curves hold no seconds, so they may be measured on a busy machine. What further settings
+cost is told in parts of a step without them: processor seconds by processor seconds, of which a line over the Gaussians says
+what a step without takes, so runs are on one thread. Planned runs are set beside the grid by their seconds: not on a busy
+machine.
 """
 
 from __future__ import annotations
@@ -10,12 +12,14 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
+from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
@@ -34,6 +38,7 @@ class Trained:
         method, scene, steps, cap, decay, seed: which; ``cap`` None is that of the method.
         results: what it found.
         mean_gaussians: over its steps.
+        settings: its further overrides, sorted.
     """
 
     method: str
@@ -44,6 +49,13 @@ class Trained:
     seed: int
     results: RunResults
     mean_gaussians: float
+    settings: tuple[str, ...] = ()
+
+    @property
+    def step_cpu_s(self) -> float:
+        """Processor seconds of one of its steps, in the mean."""
+        cost = self.results.cost
+        return cost["cpu_seconds"] / (cost["train_seconds"] * cost["steps_per_second"])
 
     @property
     def growth(self) -> float:
@@ -63,6 +75,7 @@ def run(
     overrides: Sequence[str],
     curves: str | None,
     threads: int | None = None,
+    further: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Trains the grid and the planned runs; writes the curves, budget.md and budget.png.
 
@@ -80,6 +93,8 @@ def run(
         curves: curves file into which the points go: those of the same method, scene, steps, cap and decay are replaced,
             others stay. None: only the study's folder has the points.
         threads: CPU threads of every run; None takes all cores.
+        further: what else is measured: "set", overrides such as [density=budget, schedule=coarse_to_fine], and, where they
+            differ, scenes, steps, caps, decays and seeds of its own. The same is measured without "set", to know its cost.
 
     Raises:
         SceneError: ``scenes`` or ``curves`` cannot be used as they are, or a run failed.
@@ -87,17 +102,22 @@ def run(
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *overrides]
     grid = []
-    pairs = [tuple(pair.split("/")) for pair in scenes]
-    if any(len(pair) != 2 for pair in pairs):
-        raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {list(scenes)}")
+    pairs = _pairs(scenes)
     _known(curves)  # a file that is none is told before the runs, not after them
-    for (method, scene), length, cap, decay, seed in itertools.product(pairs, steps, caps, decays, seeds):
-        place = folder / "runs" / f"{method}_{scene}_{length}_{cap or 'free'}_{decay:g}" / str(seed)
-        wanted = [f"max_steps={length}", f"optim.decay={decay:g}", "density.reset_every=null"]
+    whole = {"scenes": scenes, "steps": steps, "caps": caps, "decays": decays, "seeds": seeds}
+    for (method, scene), length, cap, decay, seed, settings in _asked(whole, further):
+        names = [method, scene, str(length), str(cap or "free"), f"{decay:g}", *settings]
+        place = folder / "runs" / "_".join(names).replace("/", "-") / str(seed)
+        wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
+        chosen = [*_of(method, scene, seed), *settings]
+        density = compose(chosen)["density"]
+        wanted += [
+            f"density.{name}=null" for name in ("reset_every", "multiple") if name in density
+        ]  # as budget= trains
         wanted += [f"density.cap_max={cap}"] if cap else []
         results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
-        grid.append(Trained(method, scene, length, cap, decay, seed, results, mean))
+        grid.append(Trained(method, scene, length, cap, decay, seed, results, mean, settings))
     points = means(grid)
     source = folder / POINTS_FILE
     write_points(points, source)
@@ -120,6 +140,55 @@ def _known(curves: str | None) -> list[Point]:
     return read_points(Path(curves)) if curves is not None and Path(curves).exists() else []
 
 
+def _pairs(scenes: Sequence[str]) -> list[tuple[str, ...]]:
+    """Method and scene of each entry."""
+    pairs = [tuple(pair.split("/")) for pair in scenes]
+    if any(len(pair) != 2 for pair in pairs):
+        raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {list(scenes)}")
+    return pairs
+
+
+def _asked(whole: Mapping[str, Sequence[Any]], further: Sequence[Mapping[str, Any]]) -> list[tuple[Any, ...]]:
+    """(method, scene), steps, cap, decay, seed and settings of every run, each once."""
+    asked: dict[tuple[Any, ...], None] = {}
+    for part in [{}, *further]:
+        own = {name: part.get(name, values) for name, values in whole.items()}
+        choices = [(), tuple(sorted(part["set"]))] if "set" in part else [()]
+        if "density=budget" in choices[-1] and None in own["caps"]:
+            raise SceneError(
+                "study.further with density=budget needs caps of its own, without null: it grows to its cap"
+            )
+        grid = (_pairs(own["scenes"]), own["steps"], own["caps"], own["decays"], own["seeds"], choices)
+        asked |= dict.fromkeys(itertools.product(*grid))
+    return list(asked)
+
+
+def costs(grid: Sequence[Trained]) -> list[float]:
+    """For each run what its steps cost in parts of steps without settings and with as many Gaussians."""
+    lines = {}
+    for method, scene in {(one.method, one.scene) for one in grid if one.settings}:
+        plain = [one for one in grid if (one.method, one.scene, one.settings) == (method, scene, ())]
+        lines[method, scene] = _line_through([(one.mean_gaussians, one.step_cpu_s) for one in plain])
+
+    def cost(one: Trained) -> float:
+        if not one.settings:
+            return 1.0
+        base, slope = lines[one.method, one.scene]
+        return one.step_cpu_s / (base + slope * one.mean_gaussians)
+
+    return [cost(one) for one in grid]
+
+
+def _line_through(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Value at zero and slope, neither below zero, of the line nearest to points (x, y)."""
+    x, y = zip(*points, strict=True)
+    middle = statistics.fmean(x), statistics.fmean(y)
+    if len(set(x)) < 2:
+        return middle[1], 0.0
+    slope = min(max(statistics.linear_regression(x, y).slope, 0.0), middle[1] / middle[0])
+    return middle[1] - slope * middle[0], slope
+
+
 def _of(method: str, scene: str, seed: int) -> list[str]:
     return [f"method={method}", "data=synthetic", f"data.scene={scene}", f"data.scene_seed={seed}", f"seed={seed}"]
 
@@ -133,11 +202,12 @@ def mean_gaussians(curve: Path, start: int) -> float:
     return total / last
 
 
-def means(grid: Iterable[Trained]) -> list[Point]:
+def means(grid: Sequence[Trained]) -> list[Point]:
     """The points of the curves: means over the seeds."""
     groups: dict[tuple, list[Trained]] = {}
+    cost = dict(zip(map(id, grid), costs(grid), strict=True))
     for one in grid:
-        groups.setdefault((one.method, one.scene, one.steps, one.cap, one.decay), []).append(one)
+        groups.setdefault((one.method, one.scene, one.steps, one.cap, one.decay, one.settings), []).append(one)
     return [
         Point(
             method=own[0].method,
@@ -148,6 +218,8 @@ def means(grid: Iterable[Trained]) -> list[Point]:
             psnr=statistics.fmean(one.results.test["psnr"] for one in own),
             seeds=len(own),
             decay=own[0].decay,
+            settings=own[0].settings,
+            cost=statistics.fmean(cost[id(one)] for one in own),
         )
         for own in groups.values()
     ]
@@ -157,14 +229,18 @@ def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, Run
     """The grid, and each planned run beside the best run of the grid that was no slower."""
     rows = [
         (
-            one.method, one.scene, f"{one.steps:,}", _cap(one.cap), f"{one.decay:g}", one.seed,
+            one.method, one.scene, f"{one.steps:,}", _cap(one.cap), f"{one.decay:g}", " ".join(one.settings), one.seed,
+            f"{part:.2f}",
             number(one.results.cost["train_seconds"], 1), number(one.results.cost["gaussians"], 0),
             number(one.results.test["psnr"], 2),
         )
-        for one in grid
+        for one, part in zip(grid, costs(grid), strict=True)
     ]  # fmt: skip
-    head = ("method", "scene", "steps", "Gaussians at most", "decay", "seed", "train (s)", "Gaussians", "PSNR (dB)")
-    lines = ["# Accuracy against steps and Gaussians, and planned runs", "", *markdown_table(head, rows, "llrrrrrrr")]
+    head = (
+        "method", "scene", "steps", "Gaussians at most", "decay", "further", "seed", "cost of a step", "train (s)",
+        "Gaussians", "PSNR (dB)",
+    )  # fmt: skip
+    lines = ["# Accuracy against steps and Gaussians, and planned runs", "", *markdown_table(head, rows, "llrrrlrrrrr")]
     if not planned:
         return "\n".join([*lines, ""])
     rows = []
@@ -178,7 +254,8 @@ def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, Run
         rival = ("none", NONE, NONE)
         if best is not None:
             rival = (
-                f"{best.steps:,} steps, {_cap(best.cap)}, decay {best.decay:g}", number(best.results.test["psnr"], 2),
+                ", ".join([f"{best.steps:,} steps", _cap(best.cap), f"decay {best.decay:g}", *best.settings]),
+                number(best.results.test["psnr"], 2),
                 number(best.results.cost["train_seconds"], 1),
             )  # fmt: skip
         spent = number(found["train_s"] + found["calibration_s"], 1)
@@ -214,9 +291,9 @@ def picture(points: Sequence[Point]) -> Figure:
             (("psnr", "PSNR (dB)"), ("mean_growth", "mean Gaussians / those of the start"))
         ):
             axes = figure.add_subplot(len(pairs), 2, 2 * row + column + 1)
-            for i, ((growth, decay), curve) in enumerate(curves_of(own)[method, scene].items()):
+            for i, ((growth, decay, settings), curve) in enumerate(curves_of(own)[method, scene].items()):
                 cap = "free" if math.isinf(growth) else f"at most {growth:g} times the start"
-                _line(axes, curve, name, i, f"{cap}, decay {decay:g}")
+                _line(axes, curve, name, i, ", ".join([cap, f"decay {decay:g}", *settings]))
             lengths = sorted({point.steps for point in own})
             axes.set(xscale="log", xlabel="steps", ylabel=label, title=f"{method} on {scene}")
             axes.set_xticks(lengths, [f"{length:,}" for length in lengths])

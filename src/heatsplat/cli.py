@@ -78,6 +78,7 @@ EXAMPLES = {
     ),
     "evaluate": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
+    "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
     "study": ("study=frontier study.runs=outputs",),
 }
 
@@ -277,6 +278,24 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c")}
     written = write_shot(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
+
+
+@_command
+@_job
+def simplify(config: dict[str, Any], output_dir: Path) -> None:
+    """Merges the Gaussians of a checkpoint into fewer: a checkpoint and a PLY for each level of detail."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.runs.levels import write_levels
+    from heatsplat.runs.run import load
+    from heatsplat.training.session import prepare_machine
+
+    if HydraConfig.get().runtime.choices.merge == "none":
+        raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
+    prepare_machine(config["threads"])
+    trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
+    merging = build(config["merge"])
+    written = write_levels(trained, merging, config["levels_c"], output_dir, config["ply"], config["time"])
+    log.info("%d files in %s", len(written), output_dir)
 
 
 @_command

@@ -5,6 +5,7 @@ Only Hydra is imported here, so that --help, --cfg and typing errors answer at o
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +34,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
 
     Args:
         overrides: as the command line has them.
-        name: of the command: train | evaluate | render | study.
+        name: of the command: train | evaluate | render | simplify | study.
     """
     return plain(composed(overrides, name), overrides)
 
@@ -46,6 +47,14 @@ def composed(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+
+
+def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
+    """Which option of each group a training run with these overrides has, such as {"density": "adaptive"}."""
+    open_already = GlobalHydra.instance().is_initialized()
+    with contextlib.nullcontext() if open_already else hydra.initialize_config_dir(CONF, version_base="1.3"):
+        config = hydra.compose("train", list(overrides), return_hydra_config=True)
+    return dict(config.hydra.runtime.choices)
 
 
 def plain(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
@@ -81,6 +90,11 @@ def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
     return max(int(minimum), round(float(fraction) * int(_root_.max_steps)))
 
 
+def _rate(travel: float, least: float, most: float, *, _root_: DictConfig) -> float:
+    """A learning rate that covers ``travel`` within the run, within bounds: Adam moves a number by up to one rate a step."""
+    return min(max(float(least), float(travel) / int(_root_.max_steps)), float(most))
+
+
 def _cores_of(asked: int | None) -> int | None:
     """Threads of a job that asked for so many cores; a run outside a sweep, or with nothing asked, takes all."""
     return asked if HydraConfig.get().mode == RunMode.MULTIRUN else None
@@ -94,6 +108,7 @@ def _cores_by(jobs: int) -> int | None:
 OmegaConf.register_new_resolver("checkout", lambda path: CHECKOUT and str(CHECKOUT / path), replace=True)
 OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
+OmegaConf.register_new_resolver("rate", _rate, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
 OmegaConf.register_new_resolver("run_of", run_of, replace=True)
 OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)

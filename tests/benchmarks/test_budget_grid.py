@@ -8,7 +8,7 @@ import pytest
 import running
 
 from benchmarks import budget_grid
-from benchmarks.budget_grid import Trained, mean_gaussians, means, picture, tables
+from benchmarks.budget_grid import Trained, costs, mean_gaussians, means, picture, tables
 from heatsplat.composition import CONF
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
@@ -46,6 +46,67 @@ def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
     text = tables(grid, [("etgs", "heated", 30.0, planned)])
     assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000, decay 1 | 25.00 | 32.0 |" in text
     assert len(picture(points).axes) == 2
+
+
+def paced(step_s: float, mean: float, *settings: str) -> Trained:
+    """A run whose steps took so many processor seconds with so many Gaussians in the mean."""
+    one = a_run(1000, None, 0, 30.0, 50.0)
+    one.results.put("cost", "steps_per_second", 10.0)
+    one.results.put("cost", "cpu_seconds", step_s * 500)
+    return replace(one, mean_gaussians=mean, settings=settings)
+
+
+def test_what_settings_cost_is_told_at_equal_gaussians():
+    """A step takes 2 ms and 1 ms per 1000 Gaussians; settings that halve all of it do so with few and with many."""
+    few, many = paced(0.006, 4000.0), paced(0.014, 12000.0)
+    half, same = paced(0.005, 8000.0, "schedule=coarse_to_fine"), paced(0.022, 20000.0, "thermal.frequencies=8")
+    assert costs([few, half, many, same]) == pytest.approx([1.0, 0.5, 1.0, 1.0])
+    assert costs([few, half]) == pytest.approx([1.0, 5 / 6])  # one number of Gaussians says nothing of others
+    found = {point.settings: point.cost for point in means([few, many, half])}
+    assert found[half.settings] == pytest.approx(0.5) and found[()] == 1.0
+    assert "| etgs | heated | 1,000 | free | 1 | schedule=coarse_to_fine | 0 | 0.50 |" in tables([few, many, half], [])
+
+
+def test_further_settings_are_measured_beside_the_same_without(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides, study):
+        asked.append((place.parent.name, overrides))
+        place.mkdir(parents=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        return paced(0.01, 5000.0).results
+
+    monkeypatch.setattr(budget_grid, "trained", trained)
+    grid = {
+        "scenes": ["etgs/heated"],
+        "steps": [250, 500],
+        "caps": [8000],
+        "decays": [1.0],
+        "seeds": [0],
+        "budgets": [],
+    }
+    common = {"train": None, "overrides": [], "curves": str(tmp_path / "curves.csv")}
+    further = [
+        {"set": ["schedule=coarse_to_fine", "density=budget"], "caps": [4000]},
+        {"set": ["dtype=float64"], "steps": [250]},
+    ]
+    budget_grid.run(tmp_path / "study", **grid, **common, further=further)
+    names = [name for name, _ in asked]
+    both = "density=budget_schedule=coarse_to_fine"
+    assert set(names) == {
+        "etgs_heated_250_8000_1", "etgs_heated_500_8000_1", "etgs_heated_250_4000_1", "etgs_heated_500_4000_1",
+        f"etgs_heated_250_4000_1_{both}", f"etgs_heated_500_4000_1_{both}", "etgs_heated_250_8000_1_dtype=float64",
+    }  # fmt: skip
+    assert len(names) == len(set(names))
+    for name, overrides in asked:
+        assert ("density.reset_every=null" in overrides) == ("density=budget" not in overrides), name
+        assert ("density.multiple=null" in overrides) == ("density=budget" in overrides), name  # the cap counts
+    points = read_points(tmp_path / "curves.csv")
+    assert {point.settings for point in points} == {
+        (), ("density=budget", "schedule=coarse_to_fine"), ("dtype=float64",),
+    }  # fmt: skip
+    with pytest.raises(SceneError, match="density=budget needs caps of its own"):
+        budget_grid.run(tmp_path / "other", **grid | {"caps": [None]}, **common, further=[{"set": ["density=budget"]}])
 
 
 def test_the_grid_trains_every_combination_and_leaves_the_curves_of_other_scenes(tmp_path, monkeypatch):

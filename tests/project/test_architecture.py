@@ -26,7 +26,7 @@ ALLOWED = {
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "composition": {"training", "heatsplat"},
-    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "training"},
+    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
     "studies": {"contracts", "metrics", "io", "training"},
     "training": {
         "contracts",

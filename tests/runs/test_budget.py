@@ -16,7 +16,7 @@ from heatsplat.callbacks.timing import CostMeter
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.io.results import RunResults
-from heatsplat.runs.budget import CALIBRATION_SHARE, Pace, Plan, _denser, plan, seconds_of
+from heatsplat.runs.budget import CALIBRATION_SHARE, Pace, Plan, _denser, open_points, plan, seconds_of
 from heatsplat.runs.curves import (
     CURVES_FILE,
     Choice,
@@ -74,9 +74,20 @@ def test_a_curve_passes_through_its_points_and_gains_less_and_less_beyond_them()
     assert (curve.psnr(4001) - 32) / math.log2(4001 / 4000) == pytest.approx(slope, rel=1e-3)
 
 
+# Half of the price from 1000 steps on, and better in the end.
+COARSE = ("density=budget", "schedule=coarse_to_fine")
+CHEAP = [
+    replace(point, settings=COARSE, cost=cost, psnr=point.psnr + 1)
+    for point, cost in zip(POINTS[3:], (0.75, 0.5, 0.5), strict=True)
+]
+
+
 def test_points_survive_their_file_and_a_bad_one_is_named(tmp_path):
-    write_points(reversed(POINTS), tmp_path / "curves.csv")
-    assert sorted(read_points(tmp_path / "curves.csv"), key=str) == sorted(POINTS, key=str)
+    points = [*reversed(POINTS), *CHEAP, replace(POINTS[0], settings=("thermal.frequencies=8",), cost=0.9)]
+    write_points(points, tmp_path / "curves.csv")
+    assert sorted(read_points(tmp_path / "curves.csv"), key=str) == sorted(points, key=str)
+    head = (tmp_path / "curves.csv").read_text().partition("\n")[0]
+    assert head.endswith(",decay,cost,density,schedule,thermal.frequencies")
 
 
 @pytest.mark.parametrize(
@@ -86,13 +97,14 @@ def test_points_survive_their_file_and_a_bad_one_is_named(tmp_path):
         "",
         "method,steps\netgs,ten\n",
         "{header}",
-        "{header}etgs,heated,0,inf,1,20,1,1\n",
+        "{header}etgs,heated,0,inf,1,20,1,1,1\n",
+        "{header}etgs,heated,9,inf,1,20,1,1,0\n",
         b"\0\xff".decode("latin-1"),
     ],
 )
 def test_a_file_without_curves_is_named_with_the_remedy(tmp_path, text):
     if text is not None:
-        header = "method,scene,steps,growth,mean_growth,psnr,seeds,decay\n"
+        header = "method,scene,steps,growth,mean_growth,psnr,seeds,decay,cost\n"
         (tmp_path / "bad.csv").write_text(text.replace("{header}", header))
     with pytest.raises(
         SceneError, match=r"bad.csv holds no curves.*study=budget.*study.curves=FILE.*budget_curves=FILE"
@@ -202,7 +214,7 @@ def test_methods_without_curves_choose_among_all_that_was_measured():
     points = [*EASY, *POINTS, *KEPT]
     short, long = (plan(points, "ravigs", PACE, asked, cap_max=100_000) for asked in (4.0, 300.0))
     assert (short.decay, long.decay) == (0.25, 1.0)
-    assert any("not measured on 3dgs/static; what they gain elsewhere stands in" in reason for reason in short.reasons)
+    assert any("not measured on 3dgs/static; what it gains elsewhere stands in" in reason for reason in short.reasons)
     assert not any("not measured on" in reason for reason in long.reasons)
     least = [replace(point, growth=0.5) for point in EASY[:3]]  # at decay 1 only: it would tell nothing of the decay
     fixed = plan([*points, *least], "ravigs", PACE, 4.0, cap_max=None)
@@ -215,6 +227,38 @@ def test_every_choice_of_the_repository_is_open_to_methods_without_curves(method
     assert set(Outlook(points).choices) == {point.choice for point in points}
     for asked in (10.0, 30.0):  # 3.7 to 6 dB for etgs
         assert plan(points, method, PACE, asked, cap_max=100_000).decay == 0.25
+
+
+def test_settings_are_chosen_where_they_are_worth_their_price():
+    found = plan([*POINTS, *CHEAP], "etgs", PACE, 60.0, cap_max=100_000)
+    assert found.settings == COARSE and ", density=budget, schedule=coarse_to_fine for 60 s" in found.lines()[0]
+    curve = curves_of(CHEAP)["etgs", "heated"][Choice(FREE, 1.0, COARSE)]
+    seconds = found.steps * PACE.step_s(4000 * curve.mean_growth(found.steps)) * curve.cost(found.steps)
+    assert seconds == pytest.approx(59.0, rel=0.01)
+    dear = [replace(point, cost=4.0) for point in CHEAP]
+    assert plan([*POINTS, *dear], "etgs", PACE, 60.0, cap_max=100_000).settings == ()
+    assert [curve.cost(steps) for steps in (10, 250, 500, 1000, 10**6)] == pytest.approx([0.75, 0.75, 0.625, 0.5, 0.5])
+    assert Outlook([*CHEAP, *POINTS[3:]]).usual == Choice(FREE, 1.0)  # of as many scenes, that with nothing set
+    assert Plan.from_dict(json.loads(json.dumps(found.as_dict()))) == found
+
+
+def test_settings_are_open_to_runs_that_leave_them_open():
+    """What the command line gives stays, and so does what a method has of its own."""
+    model = [replace(point, settings=("thermal.frequencies=8",)) for point in POINTS]
+    points = [*POINTS, *CHEAP, *model]
+
+    def settings(method: str, *overrides: str) -> set[tuple[str, ...]]:
+        return {point.settings for point in open_points(points, method, [f"method={method}", *overrides])}
+
+    assert settings("etgs") == {(), COARSE, model[0].settings}
+    assert (
+        settings("etgs", "density.grad_threshold=1e-4") == settings("etgs", "schedule=off") == {(), model[0].settings}
+    )
+    assert settings("etgs", "thermal.frequencies=24") == {(), COARSE}
+    assert settings("3dgs") == {(), COARSE}  # knows no frequencies
+    assert settings("ravigs") == settings("mftg") == settings("ntr_gaussian") == {()}  # densities of their own
+    own = [replace(point, method="ravigs") for point in CHEAP]
+    assert len(open_points(own, "ravigs", ["method=ravigs"])) == 3  # measured with the method itself
 
 
 def test_twice_the_time_is_what_a_plan_for_it_would_choose():
@@ -414,6 +458,9 @@ class Hours:
     def perf_counter(self) -> float:
         return self.now
 
+    def process_time(self) -> float:
+        return self.now
+
     def step(self, module: SplatTraining) -> dict:
         calibrates = not isinstance(module.trainer, pl.Trainer)
         if module.global_step == self.dies_at and not calibrates:
@@ -482,6 +529,25 @@ def test_a_budget_is_planned_from_the_curves_that_it_is_pointed_at(tmp_path, mon
     left_by(tmp_path, other, 50, 100.0)  # its plan is kept by a run that is planned from the same curves only
     assert planned("budget_curves=curves.csv")["budget"] == other["budget"]
     assert planned()["budget"]["decay"] != 0.4
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_run_has_the_settings_of_its_plan(tmp_path, monkeypatch):
+    """And nothing of the density control that it had before; a resumed run keeps them."""
+    Hours(monkeypatch, 1.0)
+    write_points([*POINTS, *(replace(point, psnr=point.psnr + 9) for point in CHEAP)], tmp_path / "curves.csv")
+    config = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv")
+    assert config["budget"]["settings"] == list(COARSE)
+    for density in (config["density"], config["module"]["density"]):
+        assert density["_target_"].endswith("Budget") and not {"grad_threshold", "reset_every"} & density.keys()
+        assert density["stop"] == round(0.48 * config["max_steps"]) and density["cap_max"] == 100_000
+    assert config["module"]["schedule"]["_target_"].endswith("CoarseToFine")
+    left_by(tmp_path, config, 50, 100.0)
+    again = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv")
+    assert again["density"] == config["density"] and again["budget"] == config["budget"]
+    module, _ = running.run(tmp_path / "whole", *BLIND, f"budget_curves={tmp_path}/curves.csv")
+    assert module.results.run["budget"]["settings"] == list(COARSE)
+    assert abs(module.results.run["budget"]["off_percent"]) < 3
 
 
 @pytest.mark.slow

@@ -115,6 +115,7 @@ class BudgetClock(pl.Callback):
             "steps": trainer.global_step,
             "max_gaussians": self.plan["cap"],
             "learning_rate_decay": self.plan["decay"],
+            "settings": self.plan["settings"],
             "growth_held_at_step": self._held,
             "schedule_done": round(done, 4),
             "expected_psnr_on_demo_scenes": self.plan["expected_psnr"],

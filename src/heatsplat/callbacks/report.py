@@ -38,7 +38,7 @@ COST_UNITS = {
 # Parts of the configuration that say what was learned and how; the others say where and when, or repeat these.
 HYPERPARAMETERS = (
     "name", "seed", "max_steps", "dtype", "data", "thermal", "sensor", "composite", "renderer", "smoothing", "density",
-    "loss", "init", "optim", "stages", "effects",
+    "merge", "loss", "init", "optim", "stages", "effects",
 )  # fmt: skip
 
 

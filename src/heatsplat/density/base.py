@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,3 +74,20 @@ class DensityControl:
     def settled(self, step: int) -> bool:
         """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of opacities."""
         return True
+
+
+class Merging:
+    """Says what is done to the Gaussians of a run once it is trained, before its test. The default leaves them as they are."""
+
+    def check(self, module: Any) -> None:
+        """Raises SceneError, before training, where the Gaussians of a training module cannot be merged."""
+        return
+
+    def __call__(self, module: Any, cloud: Cloud) -> dict[str, Any] | None:
+        """Merges Gaussians of a trained module; what came of it, for the report. None when it did nothing.
+
+        Args:
+            module: ``training.module.SplatTraining`` with its scene.
+            cloud: its Gaussians with their moments, through which alone they come and go.
+        """
+        return None

@@ -1,4 +1,4 @@
-"""Budget in, best recipe out: steps, Gaussians and learning rates that make the most of so many seconds of training.
+"""Budget in, best recipe out: the steps, Gaussians, learning rates and settings that make the most of seconds of training.
 
 Three measurements meet. Curves (``heatsplat.runs.curves``) say how well a method does after so many steps with so many
 Gaussians. A calibration of a few steps says what a step costs here, on this scene, with few and with many Gaussians. The plan
@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from scipy.spatial import cKDTree
 
-from heatsplat.composition import build, compose, keys_of
+from heatsplat.composition import build, choices_of, compose, keys_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
 from heatsplat.runs.stepping import Stepper, device_of
@@ -143,6 +143,7 @@ class Plan:
         cap: Gaussians at most, or None where the method keeps what it has.
         growth: that cap in Gaussians of the start; None is no cap but the configuration's.
         decay: ``optim.decay``, or None where the configuration's stays.
+        settings: other overrides, such as ("schedule=coarse_to_fine",).
         expected_psnr: of the demo scenes on which the curves were measured, dB; None where the method has none.
         twice_steps, twice_growth: what would be chosen in twice the time.
         twice_gain_db: and what it would gain.
@@ -163,22 +164,24 @@ class Plan:
     twice_gain_db: float
     step_ms: float
     reasons: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in a checkpoint."""
-        return asdict(self) | {"reasons": list(self.reasons)}
+        return asdict(self) | {"reasons": list(self.reasons), "settings": list(self.settings)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Plan:
         """The plan of ``as_dict``."""
-        return cls(**values | {"reasons": tuple(values["reasons"])})
+        return cls(**values | {"reasons": tuple(values["reasons"]), "settings": tuple(values["settings"])})
 
     def lines(self) -> list[str]:
         """What the log says."""
         cap = "no Gaussians are added" if self.cap is None else f"at most {self.cap:,} Gaussians"
         left = f"{self.asked_s:g} s less {self.calibration_s:.1f} s of calibration (a step takes {self.step_ms:.1f} ms at first)"
         decay = "" if self.decay is None else f", {self.decay:.0%} of the decay of learning rates"
-        first = f"budget: {self.steps:,} steps, {cap}{decay} for {left}"
+        others = "".join(f", {text}" for text in self.settings)
+        first = f"budget: {self.steps:,} steps, {cap}{decay}{others} for {left}"
         if self.expected_psnr is not None:
             first += f"; such runs reach {self.expected_psnr:.1f} dB on the demo scenes"
         return [first, self.twice(), *(f"budget: {reason}" for reason in self.reasons)]
@@ -207,7 +210,7 @@ class Prices:
         gaussians = self.pace.points
         if self.cap_max is not None:
             gaussians = min(gaussians * self.outlook.mean_growth(choice, steps), max(self.cap_max, gaussians))
-        return steps * self.pace.step_s(gaussians)
+        return steps * self.pace.step_s(gaussians) * self.outlook.cost(choice, steps)
 
     def affordable(self, choice: Choice, seconds: float) -> float:
         """Steps that take so many seconds; the cost rises with the steps."""
@@ -238,13 +241,13 @@ class Prices:
 def plan(
     points: Sequence[Point], method: str, pace: Pace, asked_s: float, cap_max: int | None, free_decay: bool = True
 ) -> Plan:
-    """The steps, the cap on Gaussians and the decay of learning rates with the best expected PSNR in ``asked_s`` seconds.
+    """The steps, the cap on Gaussians, the decay of learning rates and the settings with the best expected PSNR in the time.
 
     Args:
-        points: measured curves of any methods.
+        points: measured curves of any methods, of settings that this run may have (``open_points``).
         method: name of the method.
         pace: what a step costs here.
-        asked_s: seconds for calibration and training.
+        asked_s: seconds for calibration and training; a step of the calibration has none of the settings.
         cap_max: Gaussians that the configuration allows; None where the method adds none.
         free_decay: whether the decay may be chosen; else the configuration's stays, about which curves of 1 must do.
 
@@ -264,9 +267,7 @@ def plan(
     score, chosen, steps = prices.best(train_s)
     better, more, longer = prices.best(train_s + asked_s)
     if without := outlook.missing(chosen):
-        reasons.append(
-            f"this cap and decay were not measured on {', '.join(without)}; what they gain elsewhere stands in there"
-        )
+        reasons.append(f"this choice was not measured on {', '.join(without)}; what it gains elsewhere stands in there")
     measured = outlook.last(more)
     if longer > measured:
         reasons.append(
@@ -286,6 +287,7 @@ def plan(
         twice_gain_db=round(max(better - score, 0.0), 2),
         step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),
+        settings=chosen.settings,
     )
 
 
@@ -303,13 +305,39 @@ def _of_method(points: Sequence[Point], method: str, grows: bool, free_decay: bo
         raise SceneError("there are no measured curves to plan from; run python src/study.py study=budget")
     own = [point for point in own if free_decay or point.decay == 1.0] or own
     if not grows:
-        decays: dict[float, set[float]] = {}
+        others: dict[float, set[tuple[Any, ...]]] = {}
         for point in own:
-            decays.setdefault(point.growth, set()).add(point.decay)
-        alike = min(decays, key=lambda growth: (-len(decays[growth]), growth))  # so that choices differ in decay alone
+            others.setdefault(point.growth, set()).add(point.choice[1:])
+        alike = min(
+            others, key=lambda growth: (-len(others[growth]), growth)
+        )  # so that choices differ in the rest alone
         own = [point for point in own if point.growth == alike]
         reasons.append("this method adds no Gaussians, so their number was not chosen")
     return own, reasons
+
+
+def open_points(points: Sequence[Point], method: str, overrides: Sequence[str]) -> list[Point]:
+    """The points whose settings a run of this method with these overrides may be given.
+
+    What the command line says stays. So does what belongs to a method: settings that another method was measured with are
+    open only where they choose an option of a group of which this method has the default, as ``density=budget`` is to
+    methods without a density control of their own.
+    """
+    given = keys_of(overrides)
+    here, default = choices_of(overrides), choices_of()
+
+    def is_open(point: Point) -> bool:
+        keys = keys_of(point.settings)
+        if any(_overlap(key, other) for key in keys for other in given):
+            return False
+        return point.method == method or all(key in default and here[key] == default[key] for key in keys)
+
+    return [point for point in points if is_open(point)]
+
+
+def _overlap(key: str, other: str) -> bool:
+    """Whether one of two dotted keys is the other or lies below it."""
+    return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
 
 
 # The run ------------------------------------------------------------------------------------------------------------
@@ -326,12 +354,13 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
         return config
     made = Plan.from_dict(asked) if isinstance(asked, Mapping) else _measured(config, scene)
     decay = [] if made.decay is None else [f"optim.decay={made.decay}"]
-    overrides, density = config["overrides"], config["density"]
+    overrides = config["overrides"]
+    density = compose([*overrides, *made.settings])["density"]
     growth = {"cap_max": made.cap, "multiple": "null"}  # as many as planned
     if "density.reset_every" not in keys_of(overrides):
         growth["reset_every"] = "null"  # as in the runs behind the curves
     growing = [f"density.{key}={value}" for key, value in growth.items() if density.get(key) is not None]
-    planned = [f"max_steps={made.steps}", *growing, *decay]
+    planned = [*made.settings, f"max_steps={made.steps}", *growing, *decay]
     config = _followed(config, compose(overrides), compose([*overrides, *planned]))
     clock = {"_target_": "heatsplat.callbacks.budget.BudgetClock", "plan": made.as_dict(), "twice": made.twice()}
     return config | {
@@ -342,13 +371,14 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
 
 
 def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
-    points = read_points(Path(config["budget_curves"] or CURVES_FILE))
+    overrides = config["overrides"]
+    points = open_points(read_points(Path(config["budget_curves"] or CURVES_FILE)), config["name"], overrides)
     log.info("measuring what a step costs here")
     module, seconds = filled(config)["module"], config["budget"]
     device = device_of(config["trainer"]["accelerator"])
     pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
     cap_max = config["density"].get("cap_max")
-    made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(config["overrides"]))
+    made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(overrides))
     for line in made.lines():
         log.info("%s", line)
     return made
@@ -359,4 +389,5 @@ def _followed(config: Any, before: Any, after: Any) -> Any:
     if not isinstance(config, Mapping) or not isinstance(after, Mapping):
         return after
     changed = {key for key in after if before.get(key) != after[key]}
-    return {**config, **{key: _followed(config.get(key), before.get(key), after[key]) for key in changed}}
+    kept = {key: value for key, value in config.items() if key in after or key not in before}
+    return kept | {key: _followed(config.get(key), before.get(key), after[key]) for key in changed}

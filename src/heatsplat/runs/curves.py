@@ -11,7 +11,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,10 +22,14 @@ CURVES_FILE = Path(__file__).with_name("budget_curves.csv")
 
 
 class Choice(NamedTuple):
-    """Knobs besides the number of steps: cap on the Gaussians in those of the start, and ``optim.decay``."""
+    """Knobs besides the number of steps: cap on the Gaussians in those of the start, ``optim.decay``, and other overrides.
+
+    Those are sorted, such as ("density=budget", "schedule=coarse_to_fine"); none: all else is as the method has it.
+    """
 
     growth: float
     decay: float
+    settings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Point:
         psnr: of the test views at full resolution, dB.
         seeds: runs behind the mean.
         decay: share of the decay of the learning rates, ``optim.decay``.
+        settings: other overrides that the run had, sorted; a column of the file for each key.
+        cost: what a step cost in the mean over the run, in parts of one without ``settings`` and with as many Gaussians.
     """
 
     method: str
@@ -50,11 +56,16 @@ class Point:
     psnr: float
     seeds: int = 1
     decay: float = 1.0
+    settings: tuple[str, ...] = ()
+    cost: float = 1.0
 
     @property
     def choice(self) -> Choice:
         """What a plan may choose."""
-        return Choice(self.growth, self.decay)
+        return Choice(self.growth, self.decay, self.settings)
+
+
+COLUMNS = tuple(name for name in Point.__dataclass_fields__ if name != "settings")
 
 
 @dataclass(frozen=True)
@@ -70,6 +81,11 @@ class Curve:
     def mean_growth(self, steps: float) -> float:
         """Expected Gaussians in the mean over the run, in those of the start; never fewer than there or in a measured run."""
         return max(self._at(steps, "mean_growth"), min(1.0, *(point.mean_growth for point in self.points)))
+
+    def cost(self, steps: float) -> float:
+        """Expected cost of a step, in parts of one without settings; never outside what was measured."""
+        costs = [point.cost for point in self.points]
+        return min(max(self._at(steps, "cost"), min(costs)), max(costs))
 
     def _at(self, steps: float, name: str) -> float:
         """Straight between measured points over log steps; beyond the last one the slope halves with every doubling."""
@@ -94,6 +110,8 @@ class Curve:
 def read_points(path: Path = CURVES_FILE) -> list[Point]:
     """The measured points of a curves file.
 
+    Columns that are no number of a point are overrides; where they are empty, the run had none of this key.
+
     Raises:
         SceneError: the file is not one, or empty.
     """
@@ -109,13 +127,15 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
                     float(row["psnr"]),
                     int(row["seeds"]),
                     float(row["decay"]),
+                    tuple(sorted(f"{key}={row[key]}" for key in row if key not in COLUMNS and row[key])),
+                    float(row["cost"]),
                 )
                 for row in csv.DictReader(file)
             ]
         if not points:
             raise ValueError("it has no rows")
-        if not all(min(p.steps, p.growth, p.mean_growth) > 0 and math.isfinite(p.psnr) for p in points):
-            raise ValueError("steps, growth and mean_growth must be above zero, psnr finite")
+        if not all(min(p.steps, p.growth, p.mean_growth, p.cost) > 0 and math.isfinite(p.psnr) for p in points):
+            raise ValueError("steps, growth, mean_growth and cost must be above zero, psnr finite")
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise SceneError(
             f"{path} holds no curves: {error!r}. Measure them with python src/study.py study=budget, which writes them to "
@@ -128,7 +148,8 @@ def merged(kept: Iterable[Point], measured: Iterable[Point]) -> list[Point]:
     """The points of both; where the same run was measured anew, the new one."""
 
     def key(point: Point) -> tuple[str, ...]:  # numbers as a file holds them
-        return point.method, point.scene, str(point.steps), f"{point.growth:.3g}", f"{point.decay:.3g}"
+        numbers = f"{point.growth:.3g}", f"{point.decay:.3g}"
+        return point.method, point.scene, str(point.steps), *numbers, *point.settings
 
     return list(({key(point): point for point in kept} | {key(point): point for point in measured}).values())
 
@@ -136,15 +157,22 @@ def merged(kept: Iterable[Point], measured: Iterable[Point]) -> list[Point]:
 def write_points(points: Iterable[Point], path: Path) -> None:
     """Writes a curves file, in one order whatever that of ``points``."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(Point.__dataclass_fields__), lineterminator="\n")
+    points = sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps))
+    keys = sorted({key for point in points for key in _by_key(point.settings)})
+    writer = csv.DictWriter(text, [*COLUMNS, *keys], lineterminator="\n")
     writer.writeheader()
-    for point in sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps)):
+    for point in points:
         writer.writerow(
-            asdict(point)
+            {name: getattr(point, name) for name in COLUMNS}
             | {"psnr": f"{point.psnr:.3f}"}
-            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay")}
+            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay", "cost")}
+            | _by_key(point.settings)
         )
     write_atomically(path, text.getvalue())
+
+
+def _by_key(settings: Iterable[str]) -> dict[str, str]:
+    return dict(text.partition("=")[::2] for text in settings)
 
 
 def curves_of(points: Iterable[Point]) -> dict[tuple[str, str], dict[Choice, Curve]]:
@@ -164,7 +192,8 @@ class Outlook:
     where all scenes measured all choices, what comes out is their mean. Gains are differences for PSNR and ratios for
     Gaussians, of which there are never more than the cap.
 
-    The usual choice is the one that most scenes measured; of several, that with the most Gaussians, then with the whole decay.
+    The usual choice is the one that most scenes measured; of several, that with the fewest settings, then with the most
+    Gaussians, then with the whole decay.
     What was measured at one length only says nothing of others, and counts where there is nothing better.
 
     Args:
@@ -179,7 +208,7 @@ class Outlook:
             for scene, choices in curves.items()
         }
         counts = Counter(choice for choices in able.values() for choice in choices)
-        self.usual = max(counts, key=lambda choice: (counts[choice], *choice))
+        self.usual = max(counts, key=lambda one: (counts[one], -len(one.settings), one.growth, one.decay, one.settings))
         self._scenes = {scene: choices for scene, choices in able.items() if self.usual in choices}
         self.choices = sorted({choice for choices in self._scenes.values() for choice in choices})
 
@@ -204,6 +233,10 @@ class Outlook:
             else min(max(ratio * choices[self.usual].mean_growth(steps), least), choice.growth)
             for choices in self._scenes.values()
         )
+
+    def cost(self, choice: Choice, steps: float) -> float:
+        """What a step costs in the mean over the run, in parts of one without settings and with as many Gaussians."""
+        return statistics.fmean(own.cost(steps) for own, _ in self._measured(choice))
 
     def last(self, choice: Choice) -> int:
         """The longest run that was measured with the choice, in steps."""

@@ -77,6 +77,8 @@ class PerGaussian:
             weight decay of 2 * l2 is exactly its gradient).
         l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them.
         lr_end: factor on lr at the last step of the run, log-linear in between.
+        paced: whether it learns faster in shorter runs (``Optimisation.length_power``). Not what many numbers make up
+            together, such as the gains of a series or the input of a network: their steps add up.
     """
 
     initial: Tensor
@@ -84,6 +86,7 @@ class PerGaussian:
     l2: float = 0.0
     l2_mean: bool = False
     lr_end: float = 1.0
+    paced: bool = True
 
 
 class Heat(nn.Module, ABC):
@@ -94,12 +97,14 @@ class Heat(nn.Module, ABC):
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
         lr: learning rate of its own parameters (those that are not per Gaussian).
         lr_end: factor on it at the last step of the run, log-linear in between.
+        inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
     """
 
     needs: frozenset[str] = frozenset()
     narrowest_range_k: float = 0.0
+    inseparable: str = ""
     beyond_record: str = "it is evaluated as within the record, which nothing has tested"
     lr: float = 1e-3
     lr_end: float = 1.0

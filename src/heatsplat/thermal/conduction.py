@@ -43,6 +43,7 @@ class Conducting(Wrapper):
         ValueError: an option is out of its range.
     """
 
+    inseparable = "heat flows between them, so the temperature of each depends on how many there are"
     own_beyond_record = "heat goes on flowing between neighbours"
 
     def __init__(

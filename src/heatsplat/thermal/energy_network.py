@@ -273,7 +273,7 @@ class EnergyNetwork(ThermalModel):
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
             spread = value.std(correction=0).clamp(min=1e-3)  # of a single Gaussian it is 0
             feature[:, 0] = (value - value.mean()) / spread  # warm and cold differ from the start
-            tensors["feature"] = PerGaussian(feature, self.lr_feature)
+            tensors["feature"] = PerGaussian(feature, self.lr_feature, paced=False)
         self.network.heads["temperature"].bias.fill_(self._raw_of(value.mean()))
         if self._stored is not None:
             own = self.state_dict()

@@ -66,6 +66,7 @@ class HexPlane(Wrapper):
         ValueError: a head is unknown, there is none, or a size is not positive.
     """
 
+    inseparable = "opacities, and sizes if asked for, change in time with the place of each"
     own_beyond_record = "what the planes change stays as at the nearest moment of the record"
 
     def __init__(

@@ -182,11 +182,11 @@ class NewtonHarmonic(ThermalModel):
         tensors, harmonics = self._bodies(initial), self.omega.numel()
         if harmonics > 0:
             gains, ridge = initial.new_zeros(len(initial), 2, harmonics), 0.0 if self.grouped else self.source_penalty
-            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge)
+            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
         return tensors
 
-    def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0) -> PerGaussian:
-        return PerGaussian(initial, lr, l2, self.over_mean, self.lr_end)
+    def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
+        return PerGaussian(initial, lr, l2, self.over_mean, self.lr_end, paced)
 
     def _bodies(self, initial: Tensor) -> dict[str, PerGaussian]:
         """What Gaussians that are first seen at ``initial`` [N] carry beside their gains."""

@@ -116,7 +116,7 @@ class NtrGaussian(ThermalModel):
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((module for module in self.modules() if isinstance(module, nn.Linear)), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
-        tensors = {"feature": PerGaussian(feature, self.lr_feature)}
+        tensors = {"feature": PerGaussian(feature, self.lr_feature, paced=False)}
         if self.first_steps > 0:
             tensors["first_value"] = PerGaussian(seeds.values.mean(1), self.lr_first)
         return tensors

@@ -81,7 +81,7 @@ class TimeMlp(Wrapper):
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((self.moment, self.code, self.of_code, self.of_feature, self.hidden), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
-        return super().per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature)}
+        return super().per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature, paced=False)}
 
     def on_step(self, step: int) -> None:
         super().on_step(step)

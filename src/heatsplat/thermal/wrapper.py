@@ -42,6 +42,7 @@ class Wrapper(ThermalModel):
         every, models = self.members.values(), self._models
         self.needs = frozenset(needs).union(*(member.needs for member in every))
         self.narrowest_range_k = max(member.narrowest_range_k for member in every)
+        self.inseparable = self.inseparable or next(filter(None, (member.inseparable for member in every)), "")
         self.shared_opacity = models[0].shared_opacity
         explained = [(name, count) for model in models for name, count in _images_of(model)]
         if own_channels:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
@@ -52,6 +54,7 @@ class SplatTraining(pl.LightningModule):
         stages: which parameters are frozen at which steps, and where training begins anew; None: all train throughout.
         composite: in which quantity splats are blended; None: in image values, as they are.
         smoothing: what is done to Gaussians before they are projected; None: nothing.
+        merging: what is done to Gaussians after training, before the test; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
         max_steps: planned length of a run.
@@ -77,6 +80,7 @@ class SplatTraining(pl.LightningModule):
         stages: Stages | None = None,
         composite: Composite | None = None,
         smoothing: Smoothing | None = None,
+        merging: Merging | None = None,
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
         max_steps: int = 30_000,
@@ -92,6 +96,7 @@ class SplatTraining(pl.LightningModule):
         self.schedule = Schedule(max_steps, self.stages.restarts)
         self.composite = composite or Composite()
         self.smoothing = smoothing or Smoothing()
+        self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
         self.seed, self.output_dir = seed, Path(output_dir)
@@ -139,6 +144,7 @@ class SplatTraining(pl.LightningModule):
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
             self.double()
+        self.merging.check(self)
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -159,7 +165,7 @@ class SplatTraining(pl.LightningModule):
             {
                 "params": [self.splats[name]],
                 "name": name,
-                "lr": self.optim.pace * item.lr,
+                "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
                 "weight_decay": self._penalty(item),
             }
@@ -201,6 +207,16 @@ class SplatTraining(pl.LightningModule):
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
 
+    def on_train_epoch_end(self) -> None:
+        """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
+        if self.global_step < self.schedule.end:  # stopped by hand
+            return
+        optimizer = self.trainer.optimizers[0]
+        found = self.merging(self, self.cloud(getattr(optimizer, "optimizer", optimizer)))
+        if found is not None:
+            self._show(self.splats)
+            self.results.run["merging"] = found
+
     def render(
         self,
         frame: Frame,
@@ -209,10 +225,12 @@ class SplatTraining(pl.LightningModule):
         maps: int = 0,
         ratio: float = 1.0,
         signs: Tensor | None = None,
+        values: Tensor | None = None,
     ) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time.
 
-        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there.
+        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
+        [N, C] are what they emit in place of what the thermal model makes of them.
         """
 
         channels = self.thermal.modality_channels[0]
@@ -220,7 +238,8 @@ class SplatTraining(pl.LightningModule):
 
         def emitted(ids: Tensor) -> Tensor:
             query = _query(frame, ids, moved)
-            return self.composite.encode(self.thermal.features(self.splats, query), channels)
+            told = self.thermal.features(self.splats, query) if values is None else values.index_select(0, ids)
+            return self.composite.encode(told, channels)
 
         output = self.renderer(
             *self._shapes(moved),
@@ -273,7 +292,8 @@ class SplatTraining(pl.LightningModule):
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
-        return {"loss": loss, "terms": {name: term.detach() for name, term in terms.items()}}
+        told = {name: term.detach() for name, term in terms.items()}
+        return {"loss": loss, "terms": told, "prediction": prediction.detach()}
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
@@ -300,7 +320,7 @@ class SplatTraining(pl.LightningModule):
         update = self._updates(step)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
-        cloud = Cloud(self.splats, inner, self._density_state, self.smoothing.kept_opacity)
+        cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
             self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
@@ -314,6 +334,10 @@ class SplatTraining(pl.LightningModule):
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
                     group["weight_decay"] = self._penalty(self._declared[group["name"]])
+
+    def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
+        """The Gaussians with their moments and statistics, through which alone they come and go."""
+        return Cloud(self.splats, optimizer, self._density_state, self.smoothing.kept_opacity)
 
     def _penalty(self, item: PerGaussian) -> float:
         """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
@@ -336,6 +360,34 @@ class SplatTraining(pl.LightningModule):
         images = (self.sensor(image, frame), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
+
+    @contextmanager
+    def showing(self, splats: Splats) -> Iterator[None]:
+        """While it lasts, other splats of the same tensors are rendered in place of its own."""
+        own = self.splats
+        self._show(splats)
+        try:
+            yield
+        finally:
+            self._show(own)
+
+    def _show(self, splats: Splats) -> None:
+        self.splats = splats
+        self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
+
+    @torch.no_grad()
+    def emissions(self, splats: Splats, frame: Frame) -> Tensor:
+        """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
+        return self.thermal.features(splats, _query(frame))
+
+    @property
+    def constants(self) -> frozenset[str]:
+        """Names of tensors of the thermal model that are given and not trained, such as the class of a surface."""
+        return frozenset(name for name, item in self._declared.items() if item.lr == 0)
+
+    def generator(self, number: int, purpose: str) -> torch.Generator:
+        """A generator of random numbers of the run's seed."""
+        return generator_for(self.seed, number, purpose)
 
     @torch.no_grad()
     def attributes(self, frame: Frame) -> dict[str, Tensor]:
