@@ -305,7 +305,7 @@ def share_of_new_on_the_right(policy, steps: int, noise: float) -> float:
 
 def test_new_gaussians_come_where_there_is_texture():
     steps, noise = 160, 0.01
-    ours = budget(start=40, stop=160, every=20, cap_max=512, noise=noise, remove_at=())
+    ours = budget(start=40, stop=160, every=20, cap_max=512, curve="sqrt", noise=noise, remove_at=())
     theirs = Adaptive(start=40, stop=160, every=20, cap_max=512, duplicate_scale=0.05, reset_every=None)
     share = share_of_new_on_the_right(ours, steps, noise)
     assert share >= 0.8
