@@ -52,7 +52,7 @@ class Radiative(Wrapper):
             gradient (the paper's Eq. 5); "none" shows them as they are.
         color_l2: λ_sh, weight of the squared higher harmonics of the colour, summed over harmonics and channels and
             averaged over Gaussians (Eq. 14); applied inside the optimiser. 0 leaves it out.
-        lr_attributes: learning rate of constant harmonics of ε, T and ρ.
+        lr_attributes: learning rate of constant harmonics of ε, T and ρ; not paced, as the recipe's follows the run.
         lr_rest: that of the further ones.
         lr_attributes_end: factor on both at the end of the run.
         lr: learning rate of σ and L before softplus and sigmoid.
@@ -126,10 +126,10 @@ class Radiative(Wrapper):
         grey, tensors = seeds.values[:, :1], {}
         for name, start in self._starts(grey).items():
             constant = start[:, None] / spherical_harmonics.C0
-            tensors[name] = PerGaussian(constant, self.lr_attributes, lr_end=self.lr_attributes_end)
+            tensors[name] = PerGaussian(constant, self.lr_attributes, lr_end=self.lr_attributes_end, paced=False)
             if self.bands[name] > 1:
                 rest = grey.new_zeros(len(grey), self.bands[name] - 1, 1)
-                tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end)
+                tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end, paced=False)
         colored = super().per_gaussian(seeds)
         for name, part in colored.items():
             if name.endswith("_rest") and self.color_l2 > 0:
