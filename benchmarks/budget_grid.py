@@ -111,7 +111,9 @@ def run(
         wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
         chosen = [*_of(method, scene, seed), *settings]
         density = compose(chosen)["density"]
-        wanted += [f"density.{name}=null" for name in ("reset_every", "multiple") if name in density]  # as budget= trains
+        wanted += [
+            f"density.{name}=null" for name in ("reset_every", "multiple") if name in density
+        ]  # as budget= trains
         wanted += [f"density.cap_max={cap}"] if cap else []
         results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])

@@ -31,7 +31,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "forward": [(compositing, "composite")],
     "loss": [(ssim, "forward"), (ssim, "backward")],
     "backward": [(compositing, "composite_backward")],
-    "gradients": [(compositing, "sum_slots"), (projection, "project_backward")],
+    "gradients": [(projection, "project_backward")],
     "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
     "optimiser": [(torch, "_fused_adam_")],
 }

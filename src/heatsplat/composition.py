@@ -90,6 +90,11 @@ def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
     return max(int(minimum), round(float(fraction) * int(_root_.max_steps)))
 
 
+def _rate(travel: float, least: float, most: float, *, _root_: DictConfig) -> float:
+    """A learning rate that covers ``travel`` within the run, within bounds: Adam moves a number by up to one rate a step."""
+    return min(max(float(least), float(travel) / int(_root_.max_steps)), float(most))
+
+
 def _cores_of(asked: int | None) -> int | None:
     """Threads of a job that asked for so many cores; a run outside a sweep, or with nothing asked, takes all."""
     return asked if HydraConfig.get().mode == RunMode.MULTIRUN else None
@@ -103,6 +108,7 @@ def _cores_by(jobs: int) -> int | None:
 OmegaConf.register_new_resolver("checkout", lambda path: CHECKOUT and str(CHECKOUT / path), replace=True)
 OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
+OmegaConf.register_new_resolver("rate", _rate, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
 OmegaConf.register_new_resolver("run_of", run_of, replace=True)
 OmegaConf.register_new_resolver("scene_name", scene_name, replace=True)

@@ -14,6 +14,7 @@ RULES = {
         "density.start=5", "density.every=10", "density.views=5", "density.stop=20", "density.gate_pixels=0.1",
         "density.late_every=10", "density.late_stop=40",
     ),
+    "budget": ("density.start=5", "density.every=10", "density.stop=30", "density.remove_at=[1,17]"),
     "mcmc": ("density.start=5", "density.every=10", "density.stop=40", "density.dead_opacity=0.0999"),
 }  # fmt: skip
 

@@ -98,3 +98,13 @@ def test_splitting_none_changes_nothing():
     splats = lone()
     Cloud(splats).split(torch.tensor([], dtype=torch.long), LongAxisSplit())
     assert len(splats) == 1
+
+
+@pytest.mark.parametrize("scales", [[0.5, 0.45, 0.4], [0.4, 0.5, 0.4], [0.3, 0.3, 0.3], [0.5, 0.1, 0.3]])
+def test_the_shortest_axis_stays_the_shortest_since_models_take_it_for_the_normal(scales: list[float]):
+    splats = lone()
+    splats["log_scales"].data[:] = torch.tensor([scales]).log()
+    before = splats.scales.argmin(1)
+    Cloud(splats).split(torch.tensor([0]), LongAxisSplit())
+    assert splats.scales.argmin(1).tolist() == before.tolist() * 2
+    assert (splats.scales <= torch.tensor(scales) + 1e-6).all()

@@ -119,12 +119,22 @@ def test_prior_of_what_acts_and_of_coefficients():
     splats = bodies([8.0, -2.0, 0.5], [1.0, 3.0, 0.5])
     shares = [torch.sigmoid(C0 * splats[name].detach()).flatten() for name in ("emissivity", "reflectance")]
     expected = (shares[0] + shares[1] - 1.05).clamp(min=0).square().mean()
-    assert PhysicalPrior()(inputs(splats=splats)).item() == pytest.approx(expected.item()) and expected > 0
-    printed = PhysicalPrior(of="coefficients")(inputs(splats=splats))
+    assert PhysicalPrior(reduction="mean")(inputs(splats=splats)).item() == pytest.approx(expected.item())
+    assert PhysicalPrior()(inputs(splats=splats)).item() == pytest.approx(3 * expected.item()) and expected > 0
+    printed = PhysicalPrior(of="coefficients", reduction="mean")(inputs(splats=splats))
     # ε⁰: 8 is 7 above 1, -2 is 2 below 0; ρ⁰: 3 is 2 above 1; sums 9, 1 and 1 exceed 1.05 once.
     assert printed.item() == pytest.approx((7**2 + 2**2 + 2**2 + 7.95**2) / 3)
     printed.backward()
     assert splats["emissivity"].grad[2] == 0 and splats["emissivity"].grad[0] > 0 > splats["emissivity"].grad[1]
+
+
+def test_the_prior_pulls_on_one_as_hard_among_many():
+    pulls = []
+    for count in (1, 1000):
+        splats = bodies([8.0] + [0.0] * (count - 1), [6.0] + [0.0] * (count - 1))
+        PhysicalPrior()(inputs(splats=splats)).backward()
+        pulls.append(splats["emissivity"].grad[0].item())
+    assert pulls[0] == pytest.approx(pulls[1]) and pulls[0] > 0
 
 
 def test_without_both_attributes_there_is_no_prior():
@@ -132,6 +142,8 @@ def test_without_both_attributes_there_is_no_prior():
     assert Loss({"prior": Weighted(PhysicalPrior(), 0.01)})(inputs()) == {}
     with pytest.raises(ValueError, match="of must be one of activated, coefficients, got 'raw'"):
         PhysicalPrior(of="raw")
+    with pytest.raises(ValueError, match="reduction must be one of sum, mean, got 'max'"):
+        PhysicalPrior(reduction="max")
 
 
 def test_weight_zero_is_absent():

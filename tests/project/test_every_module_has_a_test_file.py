@@ -55,8 +55,8 @@ ELSEWHERE = {
     "physics/test_physics_energy_balance": "kernels/heat_balance",
     "physics/test_responses": "physics/sky",
     "renderers/test_contract": (
-        "kernels/buffers kernels/compositing kernels/constants kernels/layout kernels/projection kernels/spherical_harmonics "
-        "renderers/base renderers/cpu renderers/reference"
+        "kernels/buffers kernels/compositing kernels/constants kernels/layout kernels/projection kernels/slots "
+        "kernels/spherical_harmonics renderers/base renderers/cpu renderers/reference"
     ),
     "renderers/test_mip_filters": "renderers/smoothing",
     "runs/test_budget": "callbacks/budget runs/curves runs/stepping",

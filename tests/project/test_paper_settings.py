@@ -237,6 +237,7 @@ OWN = {
     "ti3dgs": {
         "thermal.position_frequencies": (10, "Eq. 9: L"),
         "thermal.time_frequencies": (10, "Eq. 9: L"),
+        "thermal.exponent": ("printed", "Eq. 9-10: no constraint"),
         "thermal.lr": (8e-4, "section IV-A"),
         "thermal.lr_end": (1.6e-6 / 8e-4, "section IV-A"),
         f"{TERM}.dssim_weight": (0.2, "3DGS"),
@@ -258,6 +259,7 @@ DEPARTURES = {  # ours and the published number
         "thermal.clip": ("straight_through", "hard"),
     },
     "ntr_gaussian": {"thermal.width": (32, 64), "thermal.feature_size": (8, 32)},
+    "ravigs": {"loss.terms.physical_prior.term.reduction": ("sum", "mean")},
     "srgs": {"teacher": ("lanczos", "SwinIR")},
     "supirgs": {"teacher": ("lanczos", "SwinIR-S"), f"{TERM}.term.boost_weight": (0.0, "undefined")},
     "thermal3dgs": {
@@ -268,7 +270,7 @@ DEPARTURES = {  # ours and the published number
     },
     "thermogs": {"thermal.projected_area": ("exact", "printed")},
     "ti3dgs": {
-        "thermal.exponent": ("positive", "printed"),
+        "thermal.frames_per_cycle": (4.0, None),
         "thermal.exponent_max": (4.0, None),
         "thermal.applies_to": ("radiance", "harmonics"),
     },
@@ -294,6 +296,14 @@ def at(config, key):
     for name in key.split("."):
         config = config[name]
     return config
+
+
+@pytest.mark.parametrize(
+    ("steps", "rate", "rest"), [(20, 1e-2, 5e-4), (1500, 1e-2, 5e-4), (5000, 3e-3, 1.5e-4), (30000, 2.5e-3, 1.25e-4)]
+)
+def test_short_runs_of_ravigs_reach_as_far_with_its_attributes(steps, rate, rest):
+    thermal = compose(["method=ravigs", f"max_steps={steps}"])["thermal"]
+    assert (thermal["lr_attributes"], thermal["lr_rest"]) == pytest.approx((rate, rest))
 
 
 def test_every_method_here_exists():

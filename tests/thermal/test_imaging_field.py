@@ -75,7 +75,7 @@ def test_all_four_quantities_learn_from_the_first_step_on(exponent):
 @settings(max_examples=40, deadline=None)
 @given(scale=st.floats(0.0, 1e4), limit=st.floats(0.1, 4.0), seed=st.integers(0, 100))
 def test_the_factor_is_bounded_and_positive_whatever_the_network_says(scale, limit, seed):
-    model, splats = make(20, exponent_max=limit)
+    model, splats = make(20, exponent="positive", exponent_max=limit)
     with torch.no_grad():
         model.head.weight.normal_(0.0, 1.0, generator=torch.Generator().manual_seed(seed)).mul_(scale)
     factor = model.factor(splats.means, query())
@@ -94,7 +94,7 @@ def test_attenuation_only_weakens_while_sensitivity_stays():
 
 
 def test_the_formula_agrees_with_fifty_digits():
-    model, splats = make(8, disturb=0.5)
+    model, splats = make(8, exponent="positive", disturb=0.5)
     raw = model._network(model._code_of(splats.means.detach()), model._moment_of(query())).double()
     got = model.factor(splats.means, query())
     with mpmath.workdps(50):
@@ -160,6 +160,34 @@ def test_time_changes_the_factor_and_can_be_absent():
     assert torch.equal(still.factor(splats.means, query(5.0)), still.factor(splats.means, query(None)))
 
 
+@pytest.mark.parametrize(("frames", "kept"), [(63, 5), (33, 5), (32, 4), (16, 3), (2, 1), (1, 1), (5000, 10)])
+@pytest.mark.parametrize("timed", [True, False])
+def test_time_keeps_octaves_with_four_images_to_a_cycle(frames, kept, timed):
+    """Octave k goes through 2^(k - 1) cycles over the record: 16 of them take 63 images at least, the first three."""
+    times = [10.0 * i if timed else None for i in range(frames)]
+    model, splats = make(times=(*times, times[0]), skip=1)  # a moment that is seen twice counts once
+    if not timed:
+        kept = {63: 5, 33: 5, 32: 5, 16: 4, 2: 1, 1: 1, 5000: 10}[frames]  # but each image has an index of its own
+    assert model.slow_octaves == kept
+    cycles = 2.0 ** (kept - 1) / 2
+    assert kept == 1 or (frames + (not timed) - 1) / cycles >= 4 and (kept == 10 or (frames - timed) / cycles < 8)
+    assert model.features(splats, query(0.0)).isfinite().all()
+
+
+def test_the_network_sees_slow_octaves_alone():
+    times = torch.linspace(0.0, 40.0, 17).tolist()
+    slow, splats = make(times=times, disturb=0.3, skip=1)
+    every, _ = make(times=times, disturb=0.3, skip=1, frames_per_cycle=None)
+    assert torch.equal(slow._moment_of(query())[:4], every._moment_of(query())[:4])
+    before = [model.factor(splats.means, query()).detach() for model in (slow, every)]
+    with torch.no_grad():
+        for model in (slow, every):
+            for layer in model.moment_layers.values():
+                layer.weight.view(-1, 2, 10)[..., 4:] += 1.0
+    assert torch.equal(slow.factor(splats.means, query()), before[0])
+    assert not torch.allclose(every.factor(splats.means, query()), before[1], atol=1e-3)
+
+
 def test_without_times_the_index_of_the_frame_takes_their_place():
     model, splats = make(times=(None, None, None), disturb=0.3)
     assert model.effects()["attenuation"]["time"] == "index"
@@ -192,7 +220,7 @@ def test_the_box_makes_the_code_one_to_one_and_far_points_stay_in_it():
 
 
 def test_the_gauge_pulls_the_mean_sensitivity_to_one():
-    model, splats = make()
+    model, splats = make(exponent="positive")
     with torch.no_grad():
         model.head.bias[3] = 1.0
     model.features(splats, query())
@@ -234,7 +262,7 @@ def test_companions_pass_untouched():
             return torch.cat((emitted, emitted.expand(-1, 3)), 1)
 
     _, splats = make()
-    model = ImagingField(Joint())
+    model = ImagingField(Joint(), exponent="positive")
     with torch.no_grad():
         model.head.bias[3] = 1.0
     features = model.features(splats, query())

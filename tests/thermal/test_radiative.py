@@ -97,6 +97,19 @@ def test_emission_starts_at_the_seed_values(options):
     assert torch.allclose(emitted, start.values, atol=2e-5)
 
 
+@pytest.mark.parametrize("reflectance", ["free", "kirchhoff"])
+def test_bright_seeds_start_as_bright_as_they_are(reflectance):
+    """With a gain of 1 nothing could start above 0.85, as T stays below 0.98."""
+    start = Seeds(torch.randn(5, 3), torch.linspace(0.8, 1.0, 5)[:, None].expand(5, 4), torch.Generator())
+    for gain, brightest in ((None, 1.0), (1.0, 0.8 + 0.1)):
+        thermal = model(gain=gain, reflectance=reflectance)
+        splats = splats_of(thermal, start)
+        emitted = thermal.features(splats, query())[:, 0]
+        assert emitted.max() <= brightest + 1e-5
+        assert torch.allclose(emitted, start.values[:, 0], atol=1e-5) == (gain is None)
+        assert thermal.attributes(splats, query())["temperature"].max() <= 0.98 + 1e-5
+
+
 def test_a_dark_seed_starts_warm_enough_to_learn():
     """T⁴ has no slope at T = 0: a black seed that started there would never light up."""
     thermal = model()

@@ -141,7 +141,7 @@ def test_gradients_of_several_views_wait_for_one_update():
 def test_shorter_runs_learn_faster_as_a_power_of_their_length():
     cloud = splats(4)
     papers = {group["name"]: group["lr"] for group in Optimisation().geometry_groups(cloud, 2.0)}
-    for steps, pace in ((1875, 4.0), (7500, 2.0), (30_000, 1.0), (60_000, 1.0)):
+    for steps, pace in ((100, 5.0), (1875, 4.0), (7500, 2.0), (30_000, 1.0), (60_000, 1.0)):
         settings = Optimisation(length_power=0.5, steps=steps)
         rates = {group["name"]: group["lr"] for group in settings.geometry_groups(cloud, 2.0)}
         expected = {name: lr * (1.0 if name == "opacity_logits" else pace) for name, lr in papers.items()}

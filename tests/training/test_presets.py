@@ -13,8 +13,7 @@ from heatsplat.runs.checks import checked
 PRESETS = ("draft", "fast", "balanced", "full")
 METHODS = sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml"))
 TURNS = list(zip(METHODS, itertools.cycle(PRESETS), strict=False))
-GROUPS = {"draft": ("Budget", "CoarseToFine"), "full": ("Adaptive", "Resolution")}
-GROUPS |= dict.fromkeys(("fast", "balanced"), GROUPS["draft"])
+DENSITY = dict.fromkeys(("draft", "fast", "balanced"), "Budget") | {"full": "Adaptive"}
 OWN = {"ravigs": "CoSupport", "ti3dgs": "Proximity", "ntr_gaussian": "Adaptive", "mftg": "Adaptive"}
 
 
@@ -38,12 +37,11 @@ def test_a_method_keeps_what_is_its_own_with_every_preset(method):
         assert stop <= steps / 2
         for group in ("thermal", "loss", "stages", "sensor"):
             assert config[group].get("_target_") == plain[group].get("_target_"), (preset, group)
-        assert kind(config["schedule"]) == GROUPS[preset][1]
-        if density_of(plain) != "Adaptive" or "two_rounds" in own or "first_stage" in own:
+        if density_of(plain) != "Budget" or "two_rounds" in own or "first_stage" in own:
             assert stop == pytest.approx(plain["density"]["stop"] * steps / 30000, abs=1)
             assert density_of(config) == density_of(plain)
         else:
-            assert density_of(config) == GROUPS[preset][0]
+            assert density_of(config) == DENSITY[preset]
 
 
 def test_presets_are_ordered():

@@ -27,8 +27,11 @@ from heatsplat.training.resolution import (
     spectrum,
 )
 
-GROWING = {"coarse_to_fine": CoarseToFine, "cosine": Cosine, "pyramid": lambda **options: Pyramid(STARTS, **options)}
-STARTS = {8: 0.0, 4: 0.1, 2: 0.25, 1: 0.5}
+GROWING = {
+    "coarse_to_fine": CoarseToFine,
+    "cosine": Cosine,
+    "pyramid": lambda: Pyramid([8, 4, 2, 1], [0, 0.1, 0.25, 0.5]),
+}
 PROGRESS = np.linspace(0, 1, 201)
 
 
@@ -171,9 +174,10 @@ def test_fine_renders_are_whole_multiples_of_the_training_images_or_not_finer():
         (lambda: CoarseToFine(until=0), "until"),
         (lambda: CoarseToFine(share=1), "share"),
         (lambda: Cosine(start=0), "start"),
-        (lambda: Pyramid({8: 0.1, 1: 0.5}), "starts"),
-        (lambda: Pyramid({2: 0.0, 4: 0.1, 1: 0.5}), "starts"),
-        (lambda: Pyramid({4: 0.0, 2: 0.5}), "starts"),
+        (lambda: Pyramid([8, 1], [0.1, 0.5]), "ratios"),
+        (lambda: Pyramid([2, 4, 1], [0, 0.1, 0.5]), "ratios"),
+        (lambda: Pyramid([4, 2], [0, 0.5]), "ratios"),
+        (lambda: Pyramid([4, 1], [0, 0.2, 0.5]), "ratios"),
     ],
 )
 def test_what_is_out_of_range_is_named(make, said):
@@ -306,19 +310,34 @@ def test_screen_gradients_of_soft_scenes_are_the_same_at_half_size():
     assert (found[1] - found[0]).norm() < 0.1 * found[0].norm()
 
 
-def test_gaussians_are_as_thick_in_coarse_images_as_in_fine_ones():
-    plain = compose([*TINY, "method=3dgs", "init.count=400"])
-    module = build(plain["module"])
-    module.attach(build(plain["data"]).scene)
-    with torch.no_grad():
-        module.splats["log_scales"].fill_(math.log(1e-3))  # all blur
+def small_gaussians(method, pixels):
+    """A module on the tiny scene whose Gaussians are about so many pixels wide, and a frame."""
+    module = build(compose([*TINY, f"method={method}", "init.count=400"])["module"])
+    module.attach(build(compose([*TINY])["data"]).scene)
     frame = module.scene.train.frames[0]
-    small = replace(frame, camera=rendered(frame.camera, 0.5))
+    depth = frame.camera.project(module.splats.means.detach())[1].median()
     with torch.no_grad():
-        full, scaled, thick = (
-            module.render(frame).alpha.mean(),
-            module.render(small, ratio=2.0).alpha.mean(),
-            module.render(small).alpha.mean(),
-        )
-    assert scaled.item() == pytest.approx(full.item(), rel=0.1)
+        module.splats["log_scales"].fill_(math.log(pixels * depth / frame.camera.K[0, 0]))
+    return module, frame
+
+
+@torch.no_grad()
+def test_gaussians_are_as_thick_in_coarse_images_as_in_fine_ones():
+    module, frame = small_gaussians("3dgs", pixels=0.05)  # all blur
+    small = replace(frame, camera=rendered(frame.camera, 0.5))
+    full, scaled, thick = (
+        seen.alpha.mean().item() for seen in (module.render(frame), module.render(small, ratio=2), module.render(small))
+    )
+    assert scaled == pytest.approx(full, rel=0.1)
     assert thick > 1.5 * full
+
+
+@torch.no_grad()
+def test_where_opacity_pays_for_blur_coarse_pixels_average_over_fine_ones():
+    module, frame = small_gaussians("mip_splatting", pixels=0.7)
+    small = replace(frame, camera=rendered(frame.camera, 0.25))
+    wanted, _ = area_average(module.render(frame).alpha[0, ..., None], None, small.camera.height, small.camera.width)
+    averaged = module.render(small, ratio=4).alpha[0, ..., None]
+    module.renderer.eps2d /= 16
+    sampled = module.render(small).alpha[0, ..., None]
+    assert (averaged - wanted).norm() < 0.6 * (sampled - wanted).norm()

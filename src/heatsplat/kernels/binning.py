@@ -51,7 +51,7 @@ from heatsplat.kernels.simd import (
 
 RADIX_BITS = 11
 BUCKETS = 1 << RADIX_BITS
-SLABS = 8  # per thread, since near slabs hold more instances than far ones
+SLABS = 64  # per thread, since near slabs hold more instances than far ones
 AHEAD = 16  # Gaussians ahead of their use that rows are fetched
 MARGIN = 0.02  # pixels, more than the rounding of an interval's ends: a mask may hold too much, never too little
 
@@ -223,7 +223,7 @@ def find_instances(
 
 @inline
 def _deal_slabs(
-    _worker, share, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, instances
+    _worker, share, ids, found, found_starts, found_counts, counts, ticket, slab_starts, spans, instances
 ):  # fmt: skip
     """``deal_to_tiles`` in slabs, as long as there are any."""
     slabs, count = counts.shape[0], found_counts.shape[0]
@@ -231,7 +231,8 @@ def _deal_slabs(
     while slab < slabs:
         slot, source = slab_starts[slab], found_starts[slab]
         for rank in range(slab * share, min(count, (slab + 1) * share)):
-            slot_starts[rank] = slot
+            gaussian = np.int64(ids[rank])
+            spans[gaussian, 0] = slot
             for _instance in range(found_counts[rank]):
                 tile = found[source, 0]
                 place = counts[slab, tile]
@@ -240,19 +241,20 @@ def _deal_slabs(
                 instances[place, 1] = found[source, 1]
                 slot += 1
                 source += 1
+            spans[gaussian, 1] = slot
         slab = take(ticket, 1)
 
 
 @kernel
 def deal_to_tiles(
-    workers, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, tile_starts, instances
+    workers, ids, found, found_starts, found_counts, counts, ticket, slab_starts, spans, tile_starts, instances
 ):  # fmt: skip
     """Deals the instances out to the tiles, front to back, and numbers their gradient slots.
 
     Args:
-        found, found_starts, found_counts, counts: what ``find_instances`` found; ``counts`` is overwritten.
+        ids, found, found_starts, found_counts, counts: what ``find_instances`` took and found; ``counts`` is overwritten.
         ticket, slab_starts: [1] int64, zero, and scratch [slabs].
-        slot_starts: out [n + 1], the first gradient slot of a Gaussian; its instances have consecutive ones.
+        spans: out [N, 2] int32, the first gradient slot of a visible Gaussian and the one after its last.
         tile_starts: out [tiles + 1], the first instance of a tile.
         instances: out [instances, 2] int64, tile by tile: rank of the Gaussian and slot (32 bits each), block mask.
     """
@@ -270,12 +272,11 @@ def deal_to_tiles(
             slab_starts[slab] += here
             running += here
     tile_starts[tiles] = running
-    slot_starts[count] = running
     running = np.int64(0)
     for slab in range(slabs):
         running += slab_starts[slab]
         slab_starts[slab] = running - slab_starts[slab]
     parallel_for(
         _deal_slabs, workers,
-        (share, found, found_starts, found_counts, counts, ticket, slab_starts, slot_starts, instances),
+        (share, ids, found, found_starts, found_counts, counts, ticket, slab_starts, spans, instances),
     )  # fmt: skip

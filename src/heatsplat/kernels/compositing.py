@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from heatsplat.kernels.binning import feature_row
 from heatsplat.kernels.buffers import aligned
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.constants import (
@@ -31,23 +30,18 @@ from heatsplat.kernels.constants import (
     ALPHA_MIN,
     BLOCK,
     BLOCKS,
-    CHUNK,
-    DEPTH_GRADIENT,
     ELLIPSE,
     FIRST,
     LOG2_ALPHA_MIN,
     LOG_OPACITY,
-    LOG_OPACITY_GRADIENT,
     MEAN_X,
     MEAN_Y,
     MIXED,
     OPACITY_GRADIENTS,
     SECOND,
-    SUMS,
     TILE,
     TILE_BLOCKS,
     TRANSMITTANCE_MIN,
-    TWO_LN_2,
 )
 from heatsplat.kernels.layout import (
     channels,
@@ -63,7 +57,6 @@ from heatsplat.kernels.simd import (
     absolute,
     bits,
     exp2,
-    load,
     load_vector,
     lowest_bit,
     minimum,
@@ -79,7 +72,6 @@ from heatsplat.kernels.simd import (
 
 BATCH = 64  # instances between two looks at which blocks are finished
 AHEAD = 8  # instances ahead of their use that records are fetched
-RANKS_AHEAD = 16
 
 
 def pixel_centres() -> np.ndarray:
@@ -414,70 +406,4 @@ def composite_backward(
         _composite_tiles_backward, workers,
         (layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
          v_features, v_alpha, v_depth, v_pixels, state, slots, v_background),
-    )  # fmt: skip
-
-
-@inline
-def _sum_chunk(
-    chunk, ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
-    sums, v_opacities, v_features, absgrad,
-):  # fmt: skip
-    """``sum_slots`` of CHUNK visible Gaussians."""
-    modalities, colours = opacities.shape[0], v_features.shape[1]
-    size = slots.shape[1]
-    for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, ids.shape[0])):
-        ahead = np.int64(ids[min(rank + RANKS_AHEAD, ids.shape[0] - 1)])
-        prefetch(sums, ahead * SUMS)
-        prefetch(opacities, ahead)
-        prefetch(v_opacities, ahead)
-        prefetch(v_features, ahead * colours)
-        gaussian = np.int64(ids[rank])
-        slot, end = slot_starts[rank], slot_starts[rank + 1]
-        if slot == end:
-            store_first(sums, gaussian * SUMS, splat(0.0), SUMS)
-            continue
-        for column in range(0, size, LANES):
-            added = load(slots, slot * size + column)
-            for other in range(slot + 1, end):
-                added = added + load(slots, other * size + column)
-            store_first(slots, slot * size + column, added, size - column)
-        store_first(sums, gaussian * SUMS, load(slots, slot * size), SUMS)
-        sums[gaussian, LOG_OPACITY_GRADIENT] = 0.0
-        for modality in range(modalities):
-            v_log_opacity = slots[slot, OPACITY_GRADIENTS + modality]
-            opacity = opacities[modality, gaussian]
-            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else 0.0
-            sums[gaussian, LOG_OPACITY_GRADIENT] += v_log_opacity
-        column = OPACITY_GRADIENTS + modalities
-        row = feature_row(gaussian, screen, rows_are_ranks, first_ranks)
-        for channel in range(colours):
-            v_features[row, channel] = slots[slot, column + channel]
-        column += colours
-        sums[gaussian, DEPTH_GRADIENT] = slots[slot, column] if with_depth else np.float32(0.0)
-        column += np.int64(with_depth)
-        for axis in range(absgrad.shape[1]):
-            absgrad[gaussian, axis] = slots[slot, column + axis] * TWO_LN_2
-
-
-@kernel
-def sum_slots(
-    ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
-    sums, v_opacities, v_features, absgrad,
-):  # fmt: skip
-    """Adds up the slots of each visible Gaussian and finishes the gradients that need no projection.
-
-    A Gaussian's slots lie side by side and are added one after the other, so the result depends on nothing but the
-    image: not on threads, not on the run.
-
-    Args:
-        ids, slot_starts, screen, rows_are_ranks, first_ranks: see ``binning``.
-        slots: [slots, slot_size], the first slot of each Gaussian is overwritten with the sum.
-        sums: out [N, SUMS], for ``projection.project_backward``; rows of visible Gaussians only, as below.
-        v_opacities, v_features: out [M, N], and [N, C] or [n, C].
-        absgrad: out [N, 2], or [0, 0] where it is not wanted.
-    """
-    parallel_for(
-        _sum_chunk, (ids.shape[0] + CHUNK - 1) // CHUNK,
-        (ids, slot_starts, slots, screen, opacities, with_depth, rows_are_ranks, first_ranks,
-         sums, v_opacities, v_features, absgrad),
     )  # fmt: skip

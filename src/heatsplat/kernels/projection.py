@@ -64,6 +64,7 @@ from heatsplat.kernels.simd import (
     to_int,
     total,
 )
+from heatsplat.kernels.slots import clear_invisible, fetch_slots, sum_slots
 
 # A camera is one float32 vector: rotation row by row in 0-8, translation in 9-11, then
 FX, FY, CX, CY = range(12, 16)
@@ -435,10 +436,10 @@ def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_her
 
 @inline
 def _project_block_backward(
-    first, visible, sums, means, quats, scales, camera, eps2d, antialiased,
+    first, visible, sums, place, means, quats, scales, camera, eps2d, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
-    """Gradients of Gaussians ``first`` to ``first + 15``; a name v_x stands for the gradient of x."""
+    """Gradients of Gaussians ``first`` to ``first + 15`` from their sums; a name v_x stands for the gradient of x."""
     rows = means.shape[0] - first
     world, here, slopes, (q, length), rotation, jacobian, turned, axes = _seen_from(
         camera, means, quats, scales, first, rows
@@ -447,7 +448,7 @@ def _project_block_backward(
     a, b, c, determinant, sharp = _covariance(eps2d, u, v)
     whitening = _whitening(b, c, determinant)
 
-    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, first, SUMS, rows)
+    m1, m2, m11, m12, m22, v_depth, v_log_opacity, _unused = load_columns(sums, place // SUMS, SUMS, LANES)
     m1, m2 = m1 * INVERSE_WHITENING, m2 * INVERSE_WHITENING
     moments = m11 * TWO_LN_2, m12 * TWO_LN_2, m22 * TWO_LN_2
     v_mean_x, v_mean_y = whitening[0] * m1, whitening[1] * m1 + whitening[2] * m2
@@ -480,30 +481,47 @@ def _project_block_backward(
 
 @inline
 def _project_chunk_backward(
-    chunk, means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
+    chunk, means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
+    sums, v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
     """``project_backward`` of the Gaussians of a chunk."""
     eps2d = camera[EPS2D], camera[EPS2D_SQUARED]
-    for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0]), LANES):
+    begin, end = chunk * CHUNK, min((chunk + 1) * CHUNK, means.shape[0])
+    place, row = chunk * (sums.shape[0] // v_cameras.shape[0]), first_ranks[chunk]
+    fetch_slots(begin, np.int64(seen[begin // LANES]), spans, slots)
+    for block in range(begin, end, LANES):
+        lanes = np.int64(seen[block // LANES])
+        if block + LANES < end:
+            fetch_slots(block + LANES, np.int64(seen[block // LANES + 1]), spans, slots)
+        clear_invisible(block, min(LANES, end - block), lanes, rows_are_ranks, v_opacities, v_features, absgrad)
+        row = sum_slots(
+            block, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place,
+            v_opacities, v_features, absgrad,
+        )  # fmt: skip
         _project_block_backward(
-            block, mask_of(seen[block // LANES]), sums, means, quats, scales, camera, eps2d, antialiased,
+            block, mask_of(lanes), sums, place, means, quats, scales, camera, eps2d, antialiased,
             v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
         )  # fmt: skip
 
 
 @kernel
 def project_backward(
-    means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras
+    means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots, sums,
+    v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
-    """Gradients of the geometry from the summed gradient slots of each Gaussian.
+    """Gradients of the Gaussians from the gradient slots that compositing filled.
 
     Args:
-        seen: see ``project``.
-        sums: [N, SUMS], see ``compositing.sum_slots``.
-        v_means, v_quats, v_scales, v_means2d: out, all rows are written.
+        first_ranks, seen: see ``project``.
+        with_depth, rows_are_ranks: see ``binning.find_instances``.
+        spans, slots: see ``slots.sum_slots``.
+        sums: scratch, flat: for each chunk sixteen rows of SUMS numbers and room for a slot, in whole rows of SUMS.
+        v_means, v_quats, v_scales, v_opacities, v_features, v_means2d: out, all rows are written.
+        absgrad: out [N, 2], or [0, 0] where it is not wanted.
         v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
     parallel_for(
         _project_chunk_backward, v_cameras.shape[0],
-        (means, quats, scales, camera, antialiased, seen, sums, v_means, v_quats, v_scales, v_means2d, v_cameras),
+        (means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
+         sums, v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras),
     )  # fmt: skip

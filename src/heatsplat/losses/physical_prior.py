@@ -9,6 +9,7 @@ from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.losses.compose import LossInputs
 
 OF = ("activated", "coefficients")
+REDUCTIONS = ("sum", "mean")
 
 
 def outside(shares: Tensor) -> Tensor:
@@ -22,7 +23,7 @@ def kirchhoff_excess(emissivity: Tensor, reflectance: Tensor, tolerance: float) 
 
 
 class PhysicalPrior:
-    """The mean over Gaussians of B(ε)² + B(ρ)² + ReLU(ε + ρ - (1 + δ))² (RaViGS, Eq. 15), of the constant harmonics.
+    """B(ε)² + B(ρ)² + ReLU(ε + ρ - (1 + δ))² of all Gaussians (RaViGS, Eq. 15), of the constant harmonics.
 
     Gaussians without both attributes have no such prior, and the term is absent.
 
@@ -31,21 +32,25 @@ class PhysicalPrior:
         of: "activated" takes ε and ρ as they act, the sigmoid of the constant harmonic: B is then zero by construction
             and the sum is what counts. "coefficients" takes the coefficients of the constant harmonics themselves, as
             the paper prints; it pulls ε and ρ towards 1/2, as a coefficient in [0, 1] is a share of 0.50 to 0.57.
+        reduction: "sum" over Gaussians, which pulls on each as it would on one alone, or "mean", as the paper prints: its
+            pull falls with their number, and among tens of thousands no image notices it.
         emissivity, reflectance: names of the tensors, [N, 1, 1] before the sigmoid.
 
     Raises:
-        ValueError: ``of`` is unknown.
+        ValueError: ``of`` or ``reduction`` is unknown.
     """
 
     def __init__(
         self,
         tolerance: float = 0.05,
         of: str = "activated",
+        reduction: str = "sum",
         emissivity: str = "emissivity",
         reflectance: str = "reflectance",
     ) -> None:
         check_option("of", of, OF)
-        self.tolerance, self.activated = tolerance, of == "activated"
+        check_option("reduction", reduction, REDUCTIONS)
+        self.tolerance, self.activated, self.summed = tolerance, of == "activated", reduction == "sum"
         self.names = emissivity, reflectance
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
@@ -57,4 +62,5 @@ class PhysicalPrior:
             emissivity, reflectance = ((C0 * values).sigmoid() for values in (emissivity, reflectance))
         else:
             excess = outside(emissivity).square() + outside(reflectance).square()
-        return (excess + kirchhoff_excess(emissivity, reflectance, self.tolerance).square()).mean()
+        terms = excess + kirchhoff_excess(emissivity, reflectance, self.tolerance).square()
+        return terms.sum() if self.summed else terms.mean()

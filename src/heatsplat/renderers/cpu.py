@@ -1,7 +1,7 @@
 """The fast renderer of this machine's processor: drives heatsplat.kernels and puts them into autograd.
 
 Forward: project, (features of what is visible), sort_by_depth, find_instances, deal_to_tiles, composite. Backward:
-composite_backward, sum_slots, project_backward. What they pass to each other lies in buffers that outlive the call.
+composite_backward, project_backward. What they pass to each other lies in buffers that outlive the call.
 """
 
 from __future__ import annotations
@@ -75,15 +75,12 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, v_image, v_alpha, v_depth):
         means, quats, scales, opacities, features = ctx.saved_tensors
         v_background = ctx.frame.composite_backward(v_image, v_alpha, v_depth)
-        v_opacities, v_features, absgrad = ctx.frame.sum_slots(opacities, features)
+        *v_gaussians, v_means2d, absgrad, v_viewmat = ctx.frame.project_backward(
+            means, quats, scales, opacities, features, camera=ctx.needs_input_grad[9]
+        )
         if absgrad is not None:
             ctx.means2d.absgrad = absgrad
-        v_means, v_quats, v_scales, v_means2d, v_viewmat = ctx.frame.project_backward(
-            means, quats, scales, camera=ctx.needs_input_grad[9]
-        )
-        return (
-            None, None, None, v_means, v_quats, v_scales, v_opacities, v_features, v_background, v_viewmat, v_means2d
-        )  # fmt: skip
+        return None, None, None, *v_gaussians, v_background, v_viewmat, v_means2d
 
 
 class _Frame:
@@ -145,12 +142,12 @@ class _Frame:
             self.first_ranks, _numpy(inputs.opacities), inputs.depth, np.zeros((2, 1), np.int64),
             self.records, found, found_starts, found_counts, counts,
         )  # fmt: skip
-        self.slot_starts = array("slot_starts", np.int64, count + 1)
+        self.spans = array("spans", np.int32, self.count, 2)
         self.tile_starts = array("tile_starts", np.int64, self.tiles_x * self.tiles_y + 1)
         self.instances = array("instances", np.int64, self.bound, 2)
         binning.deal_to_tiles(
-            self.workers, found, found_starts, found_counts, counts, np.zeros(1, np.int64),
-            array("slab_starts", np.int64, slabs), self.slot_starts, self.tile_starts, self.instances,
+            self.workers, self.ids, found, found_starts, found_counts, counts, np.zeros(1, np.int64),
+            array("slab_starts", np.int64, slabs), self.spans, self.tile_starts, self.instances,
         )  # fmt: skip
 
     def composite(self, background: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -172,7 +169,7 @@ class _Frame:
     def composite_backward(self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None) -> Tensor:
         """The gradient of the background [C]. Leaves what the Gaussians need in their slots."""
         array, layout, rows = self.buffers.array, self.backward_layout, self.workers * BLOCKS
-        self.slots = array("slots", np.float32, int(self.slot_starts[-1]), layout.slot_size)
+        self.slots = array("slots", np.float32, int(self.tile_starts[-1]), layout.slot_size)
         v_background = array("v_background", np.float32, self.tiles_x * self.tiles_y, v_image.shape[2])
         compositing.composite_backward(
             layout, self.workers, self.records, self.instances, self.tile_starts, self.tile_ends, _CENTRES,
@@ -183,34 +180,29 @@ class _Frame:
         )  # fmt: skip
         return torch.from_numpy(v_background.sum(axis=0, dtype=np.float64).astype(np.float32))
 
-    def sum_slots(self, opacities: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Gradients of opacities and features, and absolute screen gradients [N, 2] or None."""
-        v_opacities, v_features = torch.zeros(opacities.shape), torch.zeros(features.shape)
-        absgrad = torch.zeros(self.count, 2) if self.inputs.absgrad else None
-        self.sums = self.buffers.array("sums", np.float32, self.count, SUMS)
-        compositing.sum_slots(
-            self.ids, self.slot_starts, self.slots, self.screen, _numpy(opacities), self.inputs.depth,
-            callable(self.inputs.features), self.first_ranks, self.sums, v_opacities.numpy(), v_features.numpy(),
-            _UNWANTED if absgrad is None else absgrad.numpy(),
-        )  # fmt: skip
-        return v_opacities, v_features, absgrad
-
     def project_backward(
-        self, means: Tensor, quats: Tensor, scales: Tensor, camera: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
-        """Gradients of means, quats, scales, ``means2d`` and, where ``camera`` wants it, the view matrix."""
-        v = [torch.empty(tensor.shape) for tensor in (means, quats, scales, self.means2d)]
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """Gradients of the Gaussians and of ``means2d``; absolute screen gradients [N, 2] where they are wanted; and the
+        gradient of the view matrix where ``camera`` wants it."""
+        v = [torch.empty(tensor.shape) for tensor in (means, quats, scales, opacities, features)]
+        absgrad = torch.empty(self.count, 2) if self.inputs.absgrad else None
+        v_means2d = torch.empty(self.count, 2)
         v_cameras = np.zeros((self.chunks, 12 if camera else 0))
+        scratch = LANES * SUMS + -(-self.backward_layout.slot_size // LANES) * LANES
         projection.project_backward(
-            _numpy(means), _numpy(quats), _numpy(scales), self.camera, self.inputs.antialiased, self.seen, self.sums,
-            *(gradient.numpy() for gradient in v), v_cameras,
+            _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera, self.inputs.antialiased,
+            self.inputs.depth, callable(self.inputs.features), self.first_ranks, self.seen, self.spans, self.slots,
+            self.buffers.array("sums", np.float32, self.chunks * scratch),
+            *(gradient.numpy() for gradient in v), _UNWANTED if absgrad is None else absgrad.numpy(),
+            v_means2d.numpy(), v_cameras,
         )  # fmt: skip
         if not camera:
-            return *v, None
+            return *v, v_means2d, absgrad, None
         v_viewmat = torch.zeros(4, 4)
         v_camera = torch.from_numpy(v_cameras.sum(axis=0))
         v_viewmat[:3, :3], v_viewmat[:3, 3] = v_camera[:9].view(3, 3), v_camera[9:]
-        return *v, v_viewmat
+        return *v, v_means2d, absgrad, v_viewmat
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:

@@ -74,8 +74,12 @@ class Renderer:
         Args:
             ratio: how many pixels of full size fit beside one of ``camera``. The screen blur is that of full size, so that
                 Gaussians have the same size in the scene; a blur of coarse pixels would thicken them, and their training
-                would make up for it.
+                would make up for it. Where opacity is compensated, a coarse pixel also averages over the r² of full size
+                in it, whose variance is (1 - 1 / r²) / 12 of its own size.
         """
+        blur = self.eps2d / ratio**2
+        if self.antialiased:
+            blur += (1 - 1 / ratio**2) / 12
         given = means.dtype
         dtype = given if self.backend == "reference" else torch.float32
 
@@ -100,7 +104,7 @@ class Renderer:
             backend=self.backend,
             absgrad=absgrad,
             depth=depth,
-            eps2d=self.eps2d / ratio**2,
+            eps2d=blur,
             maps=maps,
             signs=signs,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
@@ -37,6 +39,8 @@ class AtmosphericField(Wrapper):
         width, depth: hidden layers of the network.
         skip: hidden layer that sees the encoded position again (Mildenhall et al. 2020), or None.
         position_frequencies, time_frequencies: octaves of the encodings sin(2^k π p), cos(2^k π p).
+        frames_per_cycle: training images to a cycle of an octave of time, at least: the network does not see faster ones,
+            which mean nothing between images. None shows it all.
         positions: "box" fits the central 98 % of the scene's points into a cube of edge 1 first, so that the code is
             one-to-one; "world" encodes world units as they are.
         time: "seconds" of the views over the recorded span, "index" of the frame over the number of frames, "none", or
@@ -61,6 +65,7 @@ class AtmosphericField(Wrapper):
         skip: int | None = None,
         position_frequencies: int = 10,
         time_frequencies: int = 10,
+        frames_per_cycle: float | None = None,
         positions: str = "box",
         time: str = "auto",
         exponent: str = "printed",
@@ -79,11 +84,14 @@ class AtmosphericField(Wrapper):
             )
         if skip is not None and not 1 <= skip < depth:
             raise ValueError(f"skip must name a hidden layer from 1 to {depth - 1}, or be null, got {skip}")
+        if frames_per_cycle is not None and not frames_per_cycle > 0:
+            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
         if exponent_max is not None and not exponent_max > 0:
             raise ValueError(f"exponent_max must be positive or null, got {exponent_max}")
         self.positive, self.exponent_max = exponent == "positive", exponent_max
         self.positions = positions
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
+        self.frames_per_cycle = frames_per_cycle
         self.time, self.lr, self.lr_end = time, lr, lr_end
         codes = 6 * position_frequencies
         inputs = [codes if i == 0 else width + codes if i == skip else width for i in range(depth)]
@@ -100,6 +108,7 @@ class AtmosphericField(Wrapper):
         self.register_buffer("start", self.head.bias.detach().clone())
         self.box, self.clock = Box(), Clock()  # where there are no times, the clock counts frames
         self.register_buffer("by_index", torch.tensor(time == "index"))
+        self.register_buffer("slow_octaves", torch.tensor(time_frequencies))  # those of time that the network sees
 
     # What the contract asks -----------------------------------------------------------------------------
 
@@ -113,6 +122,12 @@ class AtmosphericField(Wrapper):
             self.clock.record.copy_(torch.tensor([0.0, max(*ids, 1)]))
         elif self.time != "none":
             self.clock.prepare(scene)
+        if self.frames_per_cycle is not None:
+            moments = {frame.frame_id if self.by_index else frame.time_s for frame in scene.train.frames}
+            cycles = max(
+                (len(moments) - 1) / self.frames_per_cycle, 0.5
+            )  # octave k has 2^k / 2 of them over the record
+            self.slow_octaves.fill_(min(self.time_frequencies, 1 + math.floor(math.log2(2 * cycles))))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((*self.layers, *self.moment_layers.values()), seeds.generator)
@@ -189,7 +204,11 @@ class AtmosphericField(Wrapper):
         else:
             fraction = self.clock.within(moment)
         when = torch.tensor([[fraction]], dtype=torch.float64, device=self.start.device)
-        return octaves(when, self.time_frequencies)[0].to(self.head.weight)
+        code = octaves(when, self.time_frequencies)[0].to(self.head.weight)
+        if self.frames_per_cycle is None:
+            return code
+        slow = torch.arange(self.time_frequencies, device=code.device) < self.slow_octaves
+        return code * slow.repeat(2)
 
     @property
     def _time_source(self) -> str:

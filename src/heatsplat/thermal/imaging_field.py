@@ -28,7 +28,8 @@ class ImagingField(AtmosphericField):
             (Eq. 12), which leaves the constant 1/2 of an emission as it is. The same where emission was above zero.
         gauge: weight of the penalty (mean R in view - 1)², which keeps the level with the emission.
         exponent: as in ``AtmosphericField``; "positive" also keeps R within (0, 2) by 2 sigmoid. The paper prints no
-            constraint.
+            constraint, and learns faster for it.
+        frames_per_cycle: as in ``AtmosphericField``.
         field: further options of ``AtmosphericField``.
 
     Raises:
@@ -43,11 +44,12 @@ class ImagingField(AtmosphericField):
         emission: ThermalModel,
         applies_to: str = "radiance",
         gauge: float = 1e-3,
-        exponent: str = "positive",
+        exponent: str = "printed",
+        frames_per_cycle: float | None = 4.0,
         **field: Any,
     ) -> None:
         check_option("applies_to", applies_to, TARGETS)
-        super().__init__(emission, exponent=exponent, **field)
+        super().__init__(emission, exponent=exponent, frames_per_cycle=frames_per_cycle, **field)
         self.on_radiance, self.gauge = applies_to == "radiance", gauge
         self._sensitivity: Tensor | None = None
 

@@ -46,12 +46,13 @@ class Radiative(Wrapper):
         reflectance: "free", as the paper has it, or "kirchhoff": ρ = 1 - ε, as it is for opaque bodies.
         degrees: degree of the harmonics of each attribute, 0 to 3; that of "temperature" serves "radiance" too.
         emissivity, reflectance_start, gain, surroundings: ε, ρ, σ and L before training. T starts at what then gives
-            the grey value of the training images, within 0.05 and 0.98.
+            the grey value of the training images, within 0.05 and 0.98. None is the gain with which 0.98 gives white: with
+            a lower one no Gaussian starts as bright as images are.
         clip: how values above 1 are shown: "straight_through" clamps them but lets gradients pass; "hard" stops their
             gradient (the paper's Eq. 5); "none" shows them as they are.
         color_l2: λ_sh, weight of the squared higher harmonics of the colour, summed over harmonics and channels and
             averaged over Gaussians (Eq. 14); applied inside the optimiser. 0 leaves it out.
-        lr_attributes: learning rate of constant harmonics of ε, T and ρ.
+        lr_attributes: learning rate of constant harmonics of ε, T and ρ; not paced, as the recipe's follows the run.
         lr_rest: that of the further ones.
         lr_attributes_end: factor on both at the end of the run.
         lr: learning rate of σ and L before softplus and sigmoid.
@@ -69,19 +70,21 @@ class Radiative(Wrapper):
         degrees: Mapping[str, int] = DEGREES,
         emissivity: float = 0.9,
         reflectance_start: float = 0.1,
-        gain: float = 1.0,
+        gain: float | None = None,
         surroundings: float = 0.2,
         clip: str = "straight_through",
         color_l2: float = 5e-5,
         lr_attributes: float = 2.5e-3,
         lr_rest: float = 1.25e-4,
-        lr_attributes_end: float = 0.1,
+        lr_attributes_end: float = 1.0,
         lr: float = 1e-3,
     ) -> None:
         super().__init__({"color": color}, own_channels=1)
         check_option("reflectance", reflectance, REFLECTANCES)
         check_option("clip", clip, CLIPS)
-        if not (0 < emissivity < 1 and 0 < reflectance_start < 1 and 0 < surroundings < 1 and gain > 0):
+        if not (
+            0 < emissivity < 1 and 0 < reflectance_start < 1 and 0 < surroundings < 1 and (gain is None or gain > 0)
+        ):
             raise ValueError(
                 "emissivity, reflectance_start and surroundings lie between 0 and 1 and gain is positive, got "
                 f"{emissivity}, {reflectance_start}, {surroundings} and {gain}"
@@ -101,6 +104,8 @@ class Radiative(Wrapper):
         self.color_l2, self.lr = color_l2, lr
         self.lr_attributes, self.lr_rest, self.lr_attributes_end = lr_attributes, lr_rest, lr_attributes_end
         if three_parameter:
+            if gain is None:
+                gain = (1.0 - self.reflectance * surroundings) / (emissivity * START[1] ** 4)
             self.raw_gain = nn.Parameter(torch.tensor(math.log(math.expm1(gain))))
             self.raw_surroundings = nn.Parameter(torch.logit(torch.tensor(surroundings)))
 
@@ -121,10 +126,10 @@ class Radiative(Wrapper):
         grey, tensors = seeds.values[:, :1], {}
         for name, start in self._starts(grey).items():
             constant = start[:, None] / spherical_harmonics.C0
-            tensors[name] = PerGaussian(constant, self.lr_attributes, lr_end=self.lr_attributes_end)
+            tensors[name] = PerGaussian(constant, self.lr_attributes, lr_end=self.lr_attributes_end, paced=False)
             if self.bands[name] > 1:
                 rest = grey.new_zeros(len(grey), self.bands[name] - 1, 1)
-                tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end)
+                tensors[f"{name}_rest"] = PerGaussian(rest, self.lr_rest, lr_end=self.lr_attributes_end, paced=False)
         colored = super().per_gaussian(seeds)
         for name, part in colored.items():
             if name.endswith("_rest") and self.color_l2 > 0:

@@ -11,6 +11,7 @@ from heatsplat.splats import Splats
 from heatsplat.training.decoupled import DecoupledDecay
 
 PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
+FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does worse than at four (docs/presets.md)
 
 
 class Optimisation:
@@ -18,8 +19,9 @@ class Optimisation:
 
     Args:
         means, log_scales, quats, opacity_logits: learning rates; that of the means is multiplied by the scene's extent.
-        length_power: how much faster parameters of Gaussians learn in a run shorter than 30 000 steps, for which the papers chose
-            their rates: (30 000 / steps) ** length_power times, in longer ones as fast. Opacities are left out, they saturate.
+        length_power: how much faster parameters of Gaussians learn in a run shorter than the 30 000 steps for which the
+            papers chose their rates: (30 000 / steps) ** length_power times, at most five. Longer runs learn at those
+            rates. Opacities are left out: they saturate.
         steps: planned length of the run.
         means_end: factor on the means' learning rate at the last step; log-linear in between.
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to
@@ -53,7 +55,7 @@ class Optimisation:
             raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
         if decay < 0:
             raise ValueError(f"optim.decay must not be negative, got {decay}")
-        self.pace = max(PUBLISHED_STEPS / steps, 1.0) ** length_power
+        self.pace = min(max(PUBLISHED_STEPS / steps, 1.0) ** length_power, FASTEST)
         self.means, self.means_end, self.decay = means, means_end, decay
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps

@@ -134,8 +134,9 @@ class Growing(Resolution):
 class CoarseToFine(Growing):
     """As coarse as the images' own spectrum allows (the idea of DashGaussian, Chen et al. 2025, section 3.2).
 
-    Begins where pixels hold ``share`` of the amplitudes of the spectrum, and shows a share that grows exponentially until it
-    is all of it. Where several modalities are learned, the finest decides. Noise of the camera is no detail (``spectrum``).
+    Begins where pixels hold ``share`` of the amplitudes of the spectrum, or what a ratio of ``coarsest`` to the training
+    images leaves if that is more, and shows a share that grows exponentially until it is all of it. Where several
+    modalities are learned, the finest decides. Noise of the camera is no detail (``spectrum``).
 
     Args:
         share: of the summed amplitudes that the first images hold.
@@ -167,36 +168,35 @@ class CoarseToFine(Growing):
         if curve[-1] == 0 or most <= 1:
             return most
         edges = np.linspace(0.0, 1.0, len(curve))
-        first = max(self.share, float(np.interp(1 / most, edges, curve)))
-        shown = min(first ** (1 - share), 1.0)
-        return 1 / float(np.interp(shown, curve, edges))
+        first = max(self.share, float(np.interp(1 / self.coarsest, edges, curve)))
+        return min(1 / float(np.interp(first ** (1 - share), curve, edges)), most)
 
 
 class Pyramid(Growing):
-    """Halves the ratio at given shares of the run.
+    """Fixed ratios, one after the other.
 
     Args:
-        starts: share of the run from which on each ratio holds, the coarsest first: ratio -> share. The last is full size.
+        ratios: falling, the last is 1.
+        starts: share of the run from which on each holds, the first from 0 on.
         short_side: as for ``Growing``.
 
     Raises:
-        ValueError: they do not begin at 0 with falling ratios.
+        ValueError: they are not as many, not in order, or begin or end elsewhere.
     """
 
-    def __init__(self, starts: dict[float, float], short_side: int = 64) -> None:
-        ratios, shares = [float(ratio) for ratio in starts], [float(share) for share in starts.values()]
+    def __init__(self, ratios: Sequence[float], starts: Sequence[float], short_side: int = 64) -> None:
         falling = all(after < before for before, after in zip(ratios, ratios[1:], strict=False))
-        rising = all(after > before for before, after in zip(shares, shares[1:], strict=False))
-        if not (falling and rising and shares[:1] == [0.0] and ratios[-1] == 1.0 and len(ratios) > 1):
+        rising = all(after > before for before, after in zip(starts, starts[1:], strict=False))
+        if not (falling and rising and len(ratios) == len(starts) > 1 and starts[0] == 0 and ratios[-1] == 1):
             raise ValueError(
-                "schedule.starts gives falling ratios down to 1 and the shares of the run at which they begin, 0 first, "
-                f"got {starts}"
+                "schedule.ratios falls to 1, and schedule.starts rises from 0 and has as many entries, got "
+                f"{list(ratios)} and {list(starts)}"
             )
-        super().__init__(shares[-1], ratios[0], short_side)
-        self._ratios, self._shares = ratios, [share / shares[-1] for share in shares]
+        super().__init__(starts[-1], ratios[0], short_side)
+        self._ratios, self._starts = list(ratios), [start / starts[-1] for start in starts]
 
     def wanted(self, share: float) -> float:
-        return self._ratios[bisect_right(self._shares, share) - 1]
+        return self._ratios[bisect_right(self._starts, share) - 1]
 
 
 class Cosine(Growing):
