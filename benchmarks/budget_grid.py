@@ -84,7 +84,7 @@ def run(
         train: path of train.py; None: the installed heatsplat-train.
         scenes: "method/scene" of synthetic scenes, such as "etgs/heated".
         steps: lengths of a run.
-        caps: most Gaussians; None is the method's own cap.
+        caps: most Gaussians; None is what the method's density control makes by itself.
         decays: shares of the decay of the learning rates (``optim.decay``).
         seeds: of every run of the grid.
         budgets: seconds for which a planned run is set beside the grid. These runs are planned from ``curves`` with the new
@@ -111,9 +111,8 @@ def run(
         wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
         chosen = [*_of(method, scene, seed), *settings]
         density = compose(chosen)["density"]
-        wanted += [
-            f"density.{name}=null" for name in ("reset_every", "multiple") if name in density
-        ]  # as budget= trains
+        off = ("reset_every", "multiple") if cap else ("reset_every",)  # as budget= trains
+        wanted += [f"density.{name}=null" for name in off if name in density]
         wanted += [f"density.cap_max={cap}"] if cap else []
         results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
@@ -154,10 +153,6 @@ def _asked(whole: Mapping[str, Sequence[Any]], further: Sequence[Mapping[str, An
     for part in [{}, *further]:
         own = {name: part.get(name, values) for name, values in whole.items()}
         choices = [(), tuple(sorted(part["set"]))] if "set" in part else [()]
-        if "density=budget" in choices[-1] and None in own["caps"]:
-            raise SceneError(
-                "study.further with density=budget needs caps of its own, without null: it grows to its cap"
-            )
         grid = (_pairs(own["scenes"]), own["steps"], own["caps"], own["decays"], own["seeds"], choices)
         asked |= dict.fromkeys(itertools.product(*grid))
     return list(asked)

@@ -251,9 +251,7 @@ def test_settings_are_open_to_runs_that_leave_them_open():
         return {point.settings for point in open_points(points, method, [f"method={method}", *overrides])}
 
     assert settings("etgs") == {(), COARSE, model[0].settings}
-    assert (
-        settings("etgs", "density.grad_threshold=1e-4") == settings("etgs", "schedule=off") == {(), model[0].settings}
-    )
+    assert settings("etgs", "density.views=5") == settings("etgs", "schedule=off") == {(), model[0].settings}
     assert settings("etgs", "thermal.frequencies=24") == {(), COARSE}
     assert settings("3dgs") == {(), COARSE}  # knows no frequencies
     assert settings("ravigs") == settings("mftg") == settings("ntr_gaussian") == {()}  # densities of their own
@@ -469,12 +467,22 @@ class Hours:
         return {"loss": module.splats.means.square().mean(), "terms": {}}
 
 
-BLIND = ("method=etgs", *running.TINY, "threads=1", "budget=4s", "trainer.limit_val_batches=0", "test=false")
+BLIND = (
+    "method=etgs",
+    "density=adaptive",
+    *running.TINY,
+    "threads=1",
+    "budget=4s",
+    "trainer.limit_val_batches=0",
+    "test=false",
+)
+
+BLIND = (*SIGHTED, "density=adaptive")  # density control that does without images, which these runs never make
 
 
-def prepared(folder: Path, *overrides: str) -> dict:
+def prepared(folder: Path, *overrides: str, settings: tuple[str, ...] = BLIND) -> dict:
     """The configuration of a run that is ready to train in a folder."""
-    return begin(compose([*BLIND, *overrides]), folder).config
+    return begin(compose([*settings, *overrides]), folder).config
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -536,14 +544,14 @@ def test_a_run_has_the_settings_of_its_plan(tmp_path, monkeypatch):
     """And nothing of the density control that it had before; a resumed run keeps them."""
     Hours(monkeypatch, 1.0)
     write_points([*POINTS, *(replace(point, psnr=point.psnr + 9) for point in CHEAP)], tmp_path / "curves.csv")
-    config = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv")
+    config = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv", settings=SIGHTED)
     assert config["budget"]["settings"] == list(COARSE)
     for density in (config["density"], config["module"]["density"]):
         assert density["_target_"].endswith("Budget") and not {"grad_threshold", "reset_every"} & density.keys()
         assert density["stop"] == round(0.48 * config["max_steps"]) and density["cap_max"] == 100_000
     assert config["module"]["resolution"]["_target_"].endswith("CoarseToFine")
     left_by(tmp_path, config, 50, 100.0)
-    again = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv")
+    again = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv", settings=SIGHTED)
     assert again["density"] == config["density"] and again["budget"] == config["budget"]
     clock = BudgetClock(config["budget"], "")
     _, module = simulate(clock, lambda step: 4.0 / config["max_steps"], module=a_module(config["max_steps"]))

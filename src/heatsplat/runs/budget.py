@@ -356,7 +356,9 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     decay = [] if made.decay is None else [f"optim.decay={made.decay}"]
     overrides = config["overrides"]
     density = compose([*overrides, *made.settings])["density"]
-    growth = {"cap_max": made.cap, "multiple": "null"}  # as many as planned
+    growth = {"cap_max": made.cap}
+    if made.growth is not None:
+        growth["multiple"] = "null"  # as many as planned
     if "density.reset_every" not in keys_of(overrides):
         growth["reset_every"] = "null"  # as in the runs behind the curves
     growing = [f"density.{key}={value}" for key, value in growth.items() if density.get(key) is not None]
