@@ -467,16 +467,7 @@ class Hours:
         return {"loss": module.splats.means.square().mean(), "terms": {}}
 
 
-BLIND = (
-    "method=etgs",
-    "density=adaptive",
-    *running.TINY,
-    "threads=1",
-    "budget=4s",
-    "trainer.limit_val_batches=0",
-    "test=false",
-)
-
+SIGHTED = ("method=etgs", *running.TINY, "threads=1", "budget=4s", "trainer.limit_val_batches=0", "test=false")
 BLIND = (*SIGHTED, "density=adaptive")  # density control that does without images, which these runs never make
 
 
