@@ -29,8 +29,8 @@ $(READY): pyproject.toml constraints/torch.txt
 	@UV_FIND_LINKS="$(PIP_FIND_LINKS)" $(RUN) -m uv pip install -q --python $(RUN) $(TORCH_BUILD) -c constraints/torch.txt -e '.[$(EXTRAS)]'
 	@touch $@
 
-demo: $(READY)  ## train ETGS on the embedded synthetic scene, one to four minutes; ends with the metrics and a picture
-	@$(RUN) src/train.py method=etgs max_steps=7000 $(ARGS)
+demo: $(READY)  ## train ETGS on the embedded synthetic scene, about a minute; ends with the metrics and a picture
+	@$(RUN) src/train.py method=etgs preset=balanced $(ARGS)
 
 test: $(READY)  ## run the tests, side by side on up to four cores (a file's tests stay together)
 	@$(RUN) -m pytest -m "not slow" -n auto --maxprocesses 4 --dist loadfile $(ARGS)

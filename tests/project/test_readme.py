@@ -123,7 +123,7 @@ def test_make_demo_trains_etgs(tmp_path):
     shown = shell(["make", "-n", "demo", "ARGS=seed=7"], ROOT)
     words = re.search(r"src/train\.py (.*)", shown)[1].split()
     config = compose_run(tmp_path, *words)
-    assert (config.name, config.max_steps, config.seed) == ("etgs", 7000, 7)
+    assert (config.name, config.max_steps, config.seed) == ("etgs", 5000, 7)
 
 
 @pytest.mark.slow
