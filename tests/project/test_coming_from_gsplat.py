@@ -9,7 +9,7 @@ import pytest
 from heatsplat.composition import compose
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "coming_from_gsplat.md").read_text(encoding="utf-8")
-CONFIG = compose(["method=3dgs", "max_steps=30000"])  # the published number of steps
+CONFIG = compose(["method=3dgs", "preset=full"])  # published length, density control and rates
 NAMED = re.findall(r"`([^`]+)`", TEXT)
 KEYS = sorted({name for name in NAMED if re.fullmatch(r"[a-z]+(\.\w+)+", name) and name.split(".")[0] in CONFIG})
 ROWS = re.findall(r"^\| (`\w+`|opacity|[\d.]+ extents) ?([\d.e-]*) \|.*`([a-z]+(?:\.\w+)+)`[^`|]* \|$", TEXT, re.M)
