@@ -29,7 +29,7 @@ def test_keys_are_in_the_configuration(key):
 
 
 def test_settings_in_commands_are_keys_of_a_command():
-    keys = {*CONFIG, *compose([], "render"), "method", "hydra"}
+    keys = {*CONFIG, *compose([], "render"), "method", "preset", "hydra"}
     given = {word.partition("=")[0] for name in NAMED for word in name.split() if re.match(r"[a-z_.]+=[^\"]", word)}
     wrong = {key for key in given if key.split(".")[0] not in keys}
     assert wrong == {"antialiased", "depth"}  # arguments of rasterization, in Python
