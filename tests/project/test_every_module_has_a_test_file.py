@@ -55,7 +55,7 @@ ELSEWHERE = {
     "physics/test_physics_energy_balance": "kernels/heat_balance",
     "physics/test_responses": "physics/sky",
     "renderers/test_contract": (
-        "kernels/buffers kernels/compositing kernels/constants kernels/layout kernels/projection kernels/slots "
+        "kernels/buffers kernels/compositing kernels/constants kernels/layout kernels/projection "
         "kernels/spherical_harmonics renderers/base renderers/cpu renderers/reference"
     ),
     "renderers/test_mip_filters": "renderers/smoothing",

@@ -1,4 +1,5 @@
-"""The papers' hyperparameters, held against the configuration as composed for a run of 30000 steps.
+"""The papers' hyperparameters, held against the configuration as composed with ``preset=full``: that of the
+papers, where the defaults have ways of ours (``density=budget``, rates that follow the length of a run).
 
 A number here was read in the paper or in its authors' code, as the third column says, and never from conf/. Steps that conf/
 gives as shares of a run may differ by what rounding the share does. Where a method departs from its paper, both numbers
@@ -23,6 +24,7 @@ GAUSSIANS = {  # 3D Gaussian Splatting, arguments/__init__.py of the authors' co
     "optim.log_scales": (5e-3, "scaling_lr"),
     "optim.quats": (1e-3, "rotation_lr"),
     "optim.opacity_logits": (5e-2, "opacity_lr"),
+    "optim.length_power": (0.0, "the same rates, whatever --iterations"),
     "optim.betas": ([0.9, 0.999], "torch.optim.Adam"),
     "optim.eps": (1e-15, "training_setup"),
     "init.opacity": (0.1, "create_from_pcd"),
@@ -286,7 +288,7 @@ def composed():
 
     def of(method):
         if method not in known:
-            known[method] = compose([f"method={method}"])
+            known[method] = compose([f"method={method}", "preset=full"])
         return known[method]
 
     return of

@@ -37,6 +37,7 @@ class Probe(ThermalModel):
 
     needs = frozenset({"time", "ambient"})
     narrowest_range_k = 0.25
+    inseparable = "it is probed as a whole"
     beyond_record = "it probes on"
 
     def __init__(self, modality="thermal"):
@@ -144,7 +145,15 @@ def test_no_hook_of_a_model_is_left_out():
     """A new hook of models must come to the wrapper and to the probe, too."""
     hooks = {name for kind in (Heat, ThermalModel) for name in vars(kind) if not name.startswith("_")}
     own = {"lr", "lr_end"}  # of the wrapper's own parameters; see rate_of
-    made = {"modality", "companions", "modality_channels", "shared_opacity", "needs", "narrowest_range_k"}
+    made = {
+        "modality",
+        "companions",
+        "modality_channels",
+        "shared_opacity",
+        "needs",
+        "narrowest_range_k",
+        "inseparable",
+    }
     hooks -= own | {"opacity_channels"}  # which follows from others
     assert hooks - made <= vars(Wrapper).keys()
     assert hooks - made <= vars(Probe).keys()
@@ -154,6 +163,8 @@ def test_no_hook_of_a_model_is_left_out():
 def test_what_the_model_inside_answers_comes_out(wrapped):
     model, probe, splats = wrapped.model, wrapped.probe, wrapped.splats
     assert model.needs >= probe.needs and model.narrowest_range_k == 0.25
+    clauses = [type(one).inseparable for one in model.modules() if isinstance(one, Wrapper)]  # from the outside in
+    assert model.inseparable == next(filter(None, [*clauses, probe.inseparable]))
     assert model.geometry(splats, QUERY) is MOVED
     assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
     model.features(splats, QUERY)
