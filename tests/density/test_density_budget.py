@@ -98,6 +98,19 @@ def test_b_may_count_in_gaussians_of_the_start():
     assert len(cloud) == 250
 
 
+def test_a_round_that_begins_anew_fills_up_to_the_same_b():
+    policy = budget(start=0, stop=100, every=10, cap_max=400, score="uniform", remove_at=(), multiple=2.5)
+    cloud = make_cloud(policy, 100)
+    for step in range(100):
+        refine(policy, cloud, step)
+    cloud.splats["opacity_logits"].data[:60] = -20.0
+    numbers = []
+    for step in range(100):
+        change = refine(policy, cloud, step)
+        numbers += [] if change is None else [len(cloud)]
+    assert numbers[0] < 230 and numbers[-1] == max(numbers) == 250  # 190 stayed, and not all that are missing come at once
+
+
 def test_more_than_b_at_the_start_stay_and_none_is_added():
     policy = budget(start=0, stop=100, every=10, cap_max=50, score="uniform", remove_at=())
     cloud = make_cloud(policy, 60)

@@ -16,7 +16,9 @@ from heatsplat.training.session import restore
 SHORT = (
     *TINY,
     "method=mip_splatting",
+    "density=adaptive",
     "max_steps=30",
+    "optim.length_power=0",  # centres move little in six steps
     "density.start=5",
     "density.every=10",
     "density.stop=18",

@@ -144,7 +144,15 @@ def test_clouds_of_their_own_do_not_see_each_other(scene, tmp_path):
 
 
 def test_gaussians_stay_with_their_image_through_density_control(tmp_path):
-    grow = ("density.start=5", "density.every=5", "density.stop=18", "density.reset_every=10", "max_steps=20")
+    grow = (
+        "density=adaptive",
+        "optim.length_power=0",
+        "density.start=5",
+        "density.every=5",
+        "density.stop=18",
+        "density.reset_every=10",
+        "max_steps=20",
+    )
     module, _ = run(tmp_path, *SHORT, "method=msmg", "test=false", *grow, "density.grad_threshold=1e-5")
     logits = module.splats["opacity_logits"].detach()
     absent = logits == ABSENT
@@ -162,7 +170,7 @@ def test_density_control_sees_the_weighted_gradients(scene, tmp_path):
     """Twice the weight of the loss is twice the statistic by which Gaussians are added."""
     seen = []
     for weight in (0.3, 0.6):
-        one = stepper(scene, tmp_path, "method=msmg", f"loss.terms.rgb.weight={weight}")
+        one = stepper(scene, tmp_path, "method=msmg", "density=adaptive", f"loss.terms.rgb.weight={weight}")
         one.step(scene.train[0])
         colour = one.module.splats["opacity_logits"].argmax(1) == 1
         seen.append(one.module._density_state["gradient"][colour].sum().item())

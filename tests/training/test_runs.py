@@ -113,7 +113,8 @@ def test_a_method_that_needs_time_refuses_a_scene_without(tmp_path, monkeypatch)
 def test_penalties_inside_the_optimiser_are_logged_beside_the_loss_terms(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    module, _ = run(tmp_path, *SHORT, "method=etgs", "test=false", "callbacks.statistics.every=40")
+    ridge = ("thermal.penalty=ridge", "thermal.source_penalty=1e-5")
+    module, _ = run(tmp_path, *SHORT, "method=etgs", *ridge, "test=false", "callbacks.statistics.every=40")
     events = EventAccumulator(str(tmp_path / "tb"))
     events.Reload()
     logged = events.Scalars("loss/penalty/source_gains")[-1]
@@ -123,18 +124,19 @@ def test_penalties_inside_the_optimiser_are_logged_beside_the_loss_terms(tmp_pat
 
 
 def test_density_control_draws_anew_at_every_step(tmp_path, monkeypatch):
-    from heatsplat.density.adaptive import Adaptive
+    from heatsplat.density.budget import Budget
     from heatsplat.training.rng import generator_for
 
     seeds = []
-    monkeypatch.setattr(Adaptive, "refine", lambda self, cloud, step, extent, draw: seeds.append(draw.initial_seed()))
-    run(tmp_path, *SHORT, "method=3dgs", "test=false", "max_steps=3", "seed=5", "trainer.limit_val_batches=0")
+    monkeypatch.setattr(Budget, "refine", lambda self, cloud, step, extent, draw: seeds.append(draw.initial_seed()))
+    short = ("density=budget", "method=3dgs", "test=false", "max_steps=3", "seed=5", "trainer.limit_val_batches=0")
+    run(tmp_path, *SHORT, *short)
     assert seeds == [generator_for(5, step, "density").initial_seed() for step in range(3)] and len(set(seeds)) == 3
 
 
 def test_no_validation_measures_opacities_that_were_just_reset(tmp_path):
     """Opacities fall after step 30 and need 10 refinements, of which there is one each step."""
-    resets = ("density.start=0", "density.every=1", "density.stop=50", "density.reset_every=30")
+    resets = ("density=adaptive", "density.start=0", "density.every=1", "density.stop=50", "density.reset_every=30")
     _, trainer = run(
         tmp_path, *SHORT, *resets, "method=3dgs", "test=false", "trainer.val_check_interval=16", "max_steps=80"
     )
@@ -153,7 +155,8 @@ def test_a_run_whose_end_moved_ends_there_and_resumes_bit_for_bit(tmp_path, monk
         after_step(self, *rest)
 
     monkeypatch.setattr(SplatTraining, "on_train_batch_end", moving)
-    overrides = (*SHORT, "method=3dgs", "test=false", "callbacks.checkpoint.every_n_train_steps=24")
+    checkpoints = "callbacks.checkpoint.every_n_train_steps=24"
+    overrides = (*SHORT, "method=3dgs", "optim.length_power=0", "test=false", checkpoints)
     whole, trainer = run(tmp_path / "whole", *overrides)
     half = tmp_path / "whole" / "checkpoints" / "step_000024.ckpt"
     resumed, again = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
