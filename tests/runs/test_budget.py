@@ -225,8 +225,8 @@ def test_methods_without_curves_choose_among_all_that_was_measured():
 def test_every_choice_of_the_repository_is_open_to_methods_without_curves(method):
     points = [point for point in read_points(CURVES_FILE) if point.method != method]
     assert set(Outlook(points).choices) == {point.choice for point in points}
-    for asked in (10.0, 30.0):  # 3.7 to 6 dB for etgs
-        assert plan(points, method, PACE, asked, cap_max=100_000).decay == 0.25
+    for asked in (10.0, 30.0):  # to stay with the Gaussians of the start would cost 3 to 5 dB
+        assert plan(points, method, PACE, asked, cap_max=100_000).growth > 1.0
 
 
 def test_settings_are_chosen_where_they_are_worth_their_price():
