@@ -47,14 +47,14 @@ class DensityControl:
         return 0
 
     def pixel_maps(self, error: Tensor, step: int) -> Tensor:
-        """The maps [H, W, S], S = ``maps_at(step)``; ``observe`` finds their sums in ``output.weighted.sums``.
+        """The maps [H, W, S], S = ``maps_at(step)``, here 0; ``observe`` finds their sums in ``output.weighted.sums``.
 
         Args:
             error: [H, W] absolute error of each pixel in image units, mean over channels, 0 where a pixel does not count; on
                 the grid on which training renders.
             step: training step.
         """
-        raise NotImplementedError(f"{type(self).__name__} asks for maps and makes none")
+        return error.new_zeros(*error.shape, 0)
 
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         """Takes what it needs from a rendered view after the backward pass. Changes ``state`` in place."""

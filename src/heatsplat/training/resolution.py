@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
@@ -51,7 +52,7 @@ def rendered(camera: Camera, finer: float) -> Camera:
     return camera.resized(*(max(1, round(finer * side)) for side in (camera.width, camera.height)))
 
 
-class Growing(Resolution):
+class Growing(Resolution, ABC):
     """Coarse images at first, full size from ``until`` on; the ratio never rises.
 
     Wanted ratios are taken down to the next of ``RATIOS`` at which a render is a whole multiple of the training images, or
@@ -98,9 +99,9 @@ class Growing(Resolution):
         wanted = self.wanted(progress / self.until)
         return self._steps[max(bisect_right(self._steps, wanted * (1 + 1e-9)) - 1, 0)]
 
+    @abstractmethod
     def wanted(self, share: float) -> float:
         """The ratio that is asked for when this share of the growth is done, in [0, 1); it never rises."""
-        raise NotImplementedError
 
     @torch.no_grad()
     def reduced(self, view: View, ratio: float) -> View:
