@@ -19,7 +19,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
-from heatsplat.kernels import binning, compositing, projection, relaxation, ssim
+from heatsplat.kernels import adam, binning, compositing, projection, relaxation, ssim
 
 VIEWS = 60  # enough moments for 24 harmonics
 TURN = 0.002  # radians between neighbouring views, so that no view is the one before
@@ -33,7 +33,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "backward": [(compositing, "composite_backward")],
     "gradients": [(projection, "project_backward")],
     "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
-    "optimiser": [(torch, "_fused_adam_")],
+    "optimiser": [(adam, "step")],
 }
 # What the module does in a step, its kernels included; the rest of a step is Lightning's.
 MODULE = ("training_step", "backward", "on_after_backward")

@@ -2,16 +2,83 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
+from heatsplat.kernels import adam as kernel
 from heatsplat.splats import Splats
 from heatsplat.training.decoupled import DecoupledDecay
 
 PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
 FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does worse than at four (docs/presets.md)
+
+
+class OnePassAdam(torch.optim.Adam):
+    """torch's Adam, whose step on a processor is one kernel over all float32 tensors (heatsplat.kernels.adam).
+
+    State and options are torch's own. torch steps tensor by tensor, which for small scenes takes longer than the arithmetic.
+    """
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forgets all gradients; ``set_to_none`` False is not known here, for nothing adds to a gradient of zeros."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """One step of all parameters that have a gradient; what ``closure`` returns, which is called first."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        stepped = [(group, x) for group in self.param_groups for x in group["params"] if x.grad is not None]
+        if not all(_fits_kernel(x) for _, x in stepped):
+            super().step()
+            return loss
+        if not stepped:
+            return loss
+        states = [self._state_of(parameter) for _, parameter in stepped]
+        torch._foreach_add_([state["step"] for state in states], 1)
+        tensors, rates = np.empty((len(stepped), 6), np.int64), np.empty((len(stepped), 6), np.float32)
+        tasks, kept = 0, []
+        for row, ((group, parameter), state) in enumerate(zip(stepped, states, strict=True)):
+            gradient = parameter.grad.contiguous()
+            kept.append(gradient)  # its memory, until the kernel has read it
+            places = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
+            tensors[row] = *(tensor.data_ptr() for tensor in places), parameter.numel(), tasks
+            tasks += -(-parameter.numel() // kernel.SHARE)
+            beta1, beta2 = group["betas"]
+            done = state["step"].item()
+            inverse_root = 1 / math.sqrt(1 - beta2**done)
+            rates[row] = (
+                group["lr"] / (1 - beta1**done),
+                group["weight_decay"],
+                beta1,
+                beta2,
+                inverse_root,
+                group["eps"],
+            )
+        kernel.step(tensors, rates, tasks)
+        return loss
+
+    def _state_of(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Moments and number of steps of a parameter, made at its first step."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state
+
+
+def _fits_kernel(parameter: torch.Tensor) -> bool:
+    """Whether a parameter and its gradient are what the kernel steps."""
+    kinds = parameter.dtype == parameter.grad.dtype == torch.float32
+    return kinds and parameter.device.type == "cpu" and parameter.is_contiguous()
 
 
 class Optimisation:
@@ -87,7 +154,7 @@ class Optimisation:
                 step, log-linear in between.
             progress: function of a step to the share of the decay that is done (``Schedule.round_progress``).
         """
-        optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
+        optimizer = OnePassAdam(groups, betas=self.betas, eps=self.eps, fused=True)
         ends = [group.get("lr_end", 1.0) ** self.decay for group in optimizer.param_groups]
         factors = [lambda step, end=end: end ** progress(step) for end in ends]
         return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)
