@@ -1,6 +1,7 @@
 """Adam in one pass against torch's in float64, and the same bits on any number of threads."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -70,6 +71,37 @@ def test_threads_change_no_bit(threads):
     finally:
         use_threads(before)
     assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float32, 5e-6), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("shape", [(700, 2, 24), (3, 5), (9000, 1), (2, 16)])
+def test_the_penalty_of_groups_is_that_of_their_norms(shape, dtype, close):
+    generator, weight = generator_for(0, 0, "groups"), 0.3
+    start, pulls = torch.randn(2, *shape, generator=generator, dtype=torch.float64)
+    start[..., 0] = 0  # a group that is nothing pulls nowhere
+    inside, outside = (torch.nn.Parameter(start.to(kind)) for kind in (dtype, torch.float64))
+    mine = OnePassAdam([{"params": [inside], "lr": 0.01, "weight_decay": 0.1, "group_penalty": weight}])
+    theirs = torch.optim.Adam([outside], lr=0.01, weight_decay=0.1)
+    for step in range(4):
+        inside.grad = (pulls * (step + 1)).to(dtype)
+        theirs.zero_grad()
+        norms = torch.linalg.vector_norm(outside.flatten(0, -2), dim=0)
+        (weight * norms.sum() + (outside * pulls).sum() * (step + 1)).backward()
+        mine.step()
+        theirs.step()
+    torch.testing.assert_close(inside.detach().double(), outside.detach(), rtol=0, atol=close)
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf])
+def test_it_tells_whether_what_it_wrote_is_finite(broken):
+    optimizer = OnePassAdam(groups(torch.float32))
+    assert optimizer.finite() is None
+    trained(optimizer, range(1))
+    assert optimizer.finite()
+    with torch.no_grad():
+        optimizer.param_groups[3]["params"][0][-1, -1, -1] = broken
+    trained(optimizer, range(1, 2))
+    assert not optimizer.finite()
 
 
 def test_what_the_kernel_cannot_take_is_stepped_by_torch():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -181,8 +182,10 @@ class NewtonHarmonic(ThermalModel):
                 self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
         tensors, harmonics = self._bodies(initial), self.omega.numel()
         if harmonics > 0:
-            gains, ridge = initial.new_zeros(len(initial), 2, harmonics), 0.0 if self.grouped else self.source_penalty
-            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            gains = initial.new_zeros(len(initial), 2, harmonics)
+            ridge, group = (0.0, self.source_penalty) if self.grouped else (self.source_penalty, 0.0)
+            declared = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            tensors["source_gains"] = replace(declared, group=group)
         return tensors
 
     def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
@@ -199,14 +202,6 @@ class NewtonHarmonic(ThermalModel):
 
     def _lr_gains(self, harmonics: int) -> float:
         return self.lr_source / harmonics
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        """ "source_groups", the penalty of the groups; the other one is in the optimiser."""
-        if not self.grouped or self.source_penalty == 0 or self.omega.numel() == 0:
-            return {}
-        strengths = torch.linalg.vector_norm(splats["source_gains"], dim=(0, 1)).sum()
-        reduced = strengths / math.sqrt(len(splats)) if self.over_mean else strengths
-        return {"source_groups": self.source_penalty * reduced}
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         state = self._state(splats, query.time_s, query.ids)

@@ -24,7 +24,7 @@ from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -167,8 +167,8 @@ class SplatTraining(pl.LightningModule):
                 "name": name,
                 "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
-                "weight_decay": self._penalty(item),
             }
+            | penalties(item, len(self.splats))
             for name, item in self._declared.items()
         ]
         for name, parameter in self.thermal.named_parameters():
@@ -333,15 +333,11 @@ class SplatTraining(pl.LightningModule):
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
-                    group["weight_decay"] = self._penalty(self._declared[group["name"]])
+                    group |= penalties(self._declared[group["name"]], len(self.splats))
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
         return Cloud(self.splats, optimizer, self._density_state, self.smoothing.kept_opacity)
-
-    def _penalty(self, item: PerGaussian) -> float:
-        """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
-        return 2 * item.l2 / (len(self.splats) if item.l2_mean else 1)
 
     # Evaluation --------------------------------------------------------------------------------------
 
