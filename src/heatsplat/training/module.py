@@ -16,6 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
@@ -290,7 +291,8 @@ class SplatTraining(pl.LightningModule):
         self._rendered = (output, camera)
         loss = sum(terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            target = resampled(inputs.target, camera.height, camera.width, "area")
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
