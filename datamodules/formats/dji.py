@@ -11,6 +11,7 @@ import numpy as np
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.jpeg import segments
+from heatsplat.physics.radiometry import LIMITS
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 # DJI writes its sensor array without a header; these are the sizes its thermal cameras have.
@@ -54,13 +55,13 @@ def parameters_in(data: bytes) -> dict[str, float]:
             if payload[start + 32 : start + 36] == _PARAMETERS_MARK:
                 air, distance, emissivity, humidity, reflected = struct.unpack_from("<5f", payload, start)
                 stated = {
-                    "air_k": (air + KELVIN_AT_0_C, 150.0, 400.0),
-                    "distance_m": (distance, 0.0, 1e5),
-                    "emissivity": (emissivity, 1e-3, 1.0),
-                    "humidity": (humidity, 0.0, 1.0),
-                    "reflected_k": (reflected + KELVIN_AT_0_C, 1.0, 5000.0),
+                    "air_k": air + KELVIN_AT_0_C,
+                    "distance_m": distance,
+                    "emissivity": emissivity,
+                    "humidity": humidity,
+                    "reflected_k": reflected + KELVIN_AT_0_C,
                 }
-                return {name: value for name, (value, low, high) in stated.items() if low <= value <= high}
+                return {name: x for name, x in stated.items() if LIMITS[name][0] <= x <= LIMITS[name][1]}
     return {}
 
 

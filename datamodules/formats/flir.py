@@ -19,22 +19,11 @@ import numpy as np
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.jpeg import segments
-from heatsplat.physics.radiometry import Atmosphere, Conditions, PlanckResponse
+from heatsplat.physics.radiometry import LIMITS, Atmosphere, Conditions, PlanckResponse
 
 RAW_IMAGE, EMBEDDED_PICTURE, CAMERA, GPS = 1, 14, 32, 43  # kinds of records
 MOST_RECORDS = 4096
 MOST_PIXELS = 1 << 26
-
-# Records whose numbers are no measurements stop here: what a thermographer can mean.
-PLAUSIBLE = {
-    "emissivity": (1e-3, 1.0),
-    "distance_m": (0.0, 1e5),
-    "reflected_k": (1.0, 5000.0),
-    "air_k": (150.0, 400.0),
-    "window_k": (1.0, 2000.0),
-    "window_transmission": (1e-3, 1.0),
-    "humidity": (0.0, 1.0),
-}
 
 
 @dataclass(frozen=True)
@@ -205,7 +194,7 @@ def _conditions(record: bytes, order: str) -> tuple[Conditions, tuple[str, ...]]
         "window_transmission": through,
         "humidity": humidity / 100 if humidity > 2 else humidity,  # some cameras write per cent
     }
-    kept = {name: value for name, value in stated.items() if PLAUSIBLE[name][0] <= value <= PLAUSIBLE[name][1]}
+    kept = {name: value for name, value in stated.items() if LIMITS[name][0] <= value <= LIMITS[name][1]}
     air_constants = struct.unpack_from(f"{order}5f", record, 0x70)
     atmosphere = Atmosphere()
     if all(math.isfinite(value) and abs(value) < 10 for value in air_constants) and air_constants[4] > 0:

@@ -10,8 +10,8 @@ from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import write_model
-from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.formats.flir import Record
+from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.formats.radiometric import Calibration, has_temperatures, read_celsius, surface_celsius
 from heatsplat.physics.radiometry import PlanckResponse
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -126,7 +126,17 @@ class Conditions:
         return transmittance(self.distance_m, self.air_k, self.humidity, self.atmosphere)
 
 
-PARAMETERS = tuple(f.name for f in fields(Conditions) if f.name != "atmosphere")
+# What a thermographer can mean; what lies outside was not meant, or was damaged.
+LIMITS = {
+    "emissivity": (1e-3, 1.0),
+    "reflected_k": (1.0, 5000.0),
+    "distance_m": (0.0, 1e5),
+    "air_k": (150.0, 400.0),
+    "humidity": (0.0, 1.0),
+    "window_transmission": (1e-3, 1.0),
+    "window_k": (1.0, 2000.0),
+}
+PARAMETERS = tuple(LIMITS)
 
 
 def _double(value: Quantity) -> Tensor:
