@@ -36,7 +36,9 @@ RADIUS = 5  # of the window, in pixels
 TAPS = 2 * RADIUS + 1
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)  # stabilisers for images in [0, 1]
 BLOCK = 8  # rows per parallel task
-SHARE = 65536  # numbers per task of a pass that does little with each: waking a thread for fewer takes longer than they do
+SHARE = (
+    65536  # numbers per task of a pass that does little with each: waking a thread for fewer takes longer than they do
+)
 
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
