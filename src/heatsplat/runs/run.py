@@ -101,7 +101,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
 
 def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
     """The training module that a configuration describes, which takes it into its checkpoints."""
-    module = build(config["module"], output_dir=str(output_dir))
+    module = without_idle_hooks(build(config["module"], output_dir=str(output_dir)))
     module.config = config  # set, not passed: Hydra would build every part in it once more
     return module
 

@@ -117,6 +117,13 @@ class SplatTraining(pl.LightningModule):
         self._pixels = 0  # of the last image
         self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     # Set-up ------------------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
