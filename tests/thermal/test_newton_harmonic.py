@@ -355,6 +355,20 @@ def test_groups_are_penalised_by_the_norm_of_each_frequency_over_all_gaussians(r
     torch.testing.assert_close(splats["source_gains"].grad[:, :, 3], weak)
 
 
+def test_in_si_units_sources_are_counted_in_degrees_per_second():
+    """50 °C within 400 s: a gain of 1 image unit per span is 1/8 °C per second."""
+    (_, splats), (ridge, _) = (
+        ready(penalty="ridge", source_penalty=1e-5, penalty_units=unit) for unit in ("scene", "si")
+    )
+    assert ridge.per_gaussian(seeds())["source_gains"].l2 == pytest.approx(1e-5 / 64)
+    stir(splats)
+    own, si = (ready(penalty_units=unit)[0].regularisers(splats)["source_groups"].item() for unit in ("scene", "si"))
+    assert si == pytest.approx(own / 8)
+    with pytest.raises(SceneError, match="penalty_units=scene"):
+        ready(scene_data=scene(thermal_range=None), penalty_units="si")
+    ready(scene_data=scene(thermal_range=None), penalty_units="si", source_penalty=0.0)
+
+
 def test_groups_that_start_at_nothing_have_no_pull():
     model, splats = ready(source_penalty=0.1)
     model.regularisers(splats)["source_groups"].backward()
@@ -436,6 +450,7 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
         ({"clip": "soft"}, "clip must be one of"),
         ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
         ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
+        ({"penalty_units": "kelvin"}, "penalty_units must be one of scene, si"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )
