@@ -134,7 +134,7 @@ class MultiviewGate(Adaptive):
         return event if event <= self.late_stop else None
 
     @torch.no_grad()
-    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+    def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         self._mean_error = float(error.mean())  # for ``observe``, which follows in the same step
         return self.wrong(error)[..., None].to(error)
 

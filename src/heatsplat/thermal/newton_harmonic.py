@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -135,7 +136,7 @@ class NewtonHarmonic(ThermalModel):
             self.omega = grid * self.clock.span_s
         else:
             log.warning("scene '%s' shows one moment only: the model has no heat source", scene.name)
-        if scene.thermal_range is None and self.in_si and self.source_penalty > 0:
+        if scene.thermal_range is None and self.in_si:
             raise SceneError(
                 f"thermal.penalty_units=si counts heat sources in °C per second, but scene '{scene.name}' has no temperature "
                 "range; use thermal.penalty_units=scene"
@@ -192,8 +193,10 @@ class NewtonHarmonic(ThermalModel):
         tensors, harmonics = self._bodies(initial), self.omega.numel()
         if harmonics > 0:
             gains = initial.new_zeros(len(initial), 2, harmonics)
-            ridge = 0.0 if self.grouped else self.source_penalty * self._penalty_unit() ** 2
-            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            weight, unit = self.source_penalty, self._penalty_unit()
+            ridge, group = (0.0, weight * unit) if self.grouped else (weight * unit**2, 0.0)
+            declared = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            tensors["source_gains"] = replace(declared, group=group)
         return tensors
 
     def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
@@ -214,14 +217,6 @@ class NewtonHarmonic(ThermalModel):
 
     def _lr_gains(self, harmonics: int) -> float:
         return self.lr_source / harmonics
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        """ "source_groups", the penalty of the groups; the other one is in the optimiser."""
-        if not self.grouped or self.source_penalty == 0 or self.omega.numel() == 0:
-            return {}
-        strengths = torch.linalg.vector_norm(splats["source_gains"], dim=(0, 1)).sum()
-        reduced = strengths / math.sqrt(len(splats)) if self.over_mean else strengths
-        return {"source_groups": self.source_penalty * self._penalty_unit() * reduced}
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         state = self._state(splats, query.time_s, query.ids)
