@@ -31,7 +31,7 @@ class Adaptive(DensityControl):
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
         reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
         reset_opacity: opacities are lowered to at most this, as rendered.
-        cap_max: never more Gaussians than this; the strongest gradients grow first.
+        cap_max: never more Gaussians than this, infinity for no limit; the strongest gradients grow first.
         multiple: nor more than so many times the Gaussians of the start; None: ``cap_max`` alone.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
     """
@@ -47,7 +47,7 @@ class Adaptive(DensityControl):
         prune_scale: float = 0.1,
         reset_every: int | None = 3000,
         reset_opacity: float = 0.01,
-        cap_max: int = 100_000,
+        cap_max: float = 100_000,
         multiple: float | None = None,
         absgrad: bool = False,
     ) -> None:

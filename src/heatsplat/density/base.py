@@ -32,7 +32,7 @@ class DensityControl:
     """
 
     absgrad: bool = False
-    cap_max: int | None = None
+    cap_max: float | None = None
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """Per-Gaussian statistics before the first step, each [count, ...]."""
