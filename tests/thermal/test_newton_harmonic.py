@@ -350,6 +350,18 @@ def test_groups_are_penalised_in_the_optimiser_as_norms_of_sums_or_of_means(redu
     assert penalties(declared, 6) == {"weight_decay": 0.0, "group_penalty": pytest.approx(0.1 / root)}
 
 
+def test_in_si_units_sources_are_counted_in_degrees_per_second():
+    """50 °C within 400 s: a gain of 1 image unit per span is 1/8 °C per second."""
+
+    def gains(penalty, **options):
+        return ready(penalty=penalty, source_penalty=1e-5, **options)[0].per_gaussian(seeds())["source_gains"]
+
+    assert gains("ridge", penalty_units="si").l2 == pytest.approx(1e-5 / 64)
+    assert gains("group", penalty_units="si").group == pytest.approx(1e-5 / 8)
+    with pytest.raises(SceneError, match="penalty_units=scene"):
+        gains("group", penalty_units="si", scene_data=scene(thermal_range=None))
+
+
 @pytest.mark.parametrize("off", [{"source_penalty": 0.0}, {"frequencies": 0}])
 def test_a_penalty_that_is_off_is_absent(off):
     model, splats = ready(**off)
@@ -421,6 +433,7 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
         ({"clip": "soft"}, "clip must be one of"),
         ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
         ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
+        ({"penalty_units": "kelvin"}, "penalty_units must be one of scene, si"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )

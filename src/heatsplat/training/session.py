@@ -116,6 +116,7 @@ def fit(
 ) -> RunResults:
     """Trains, then tests; what was measured. After Ctrl-C the process ends with code 130 and says how to go on."""
     stop = next(callback for callback in trainer.callbacks if isinstance(callback, StopOnInterrupt))
+    data.restarts = module.schedule.restarts
     with stop.listening():
         trainer.fit(module, datamodule=data, ckpt_path=ckpt)
     if stop.interrupted:
