@@ -157,6 +157,13 @@ class Scene:
         rise = of_point[..., 0] * start + of_point[..., 1] * surface.flux_w_m2
         return self.preset.ambient_c + rise.T
 
+    def apparent(self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float) -> Tensor:
+        """What a camera takes for the temperature [n] of ``celsius`` [n] at points [n, 3] that it sees along ``sight`` [n, 3]."""
+        gloss, ambient = self.preset.gloss, self.preset.ambient_c
+        if gloss is None:
+            return celsius
+        return ambient + gloss.apparent(celsius - ambient, -sight, self.normals(points, which))
+
     def how_solved(self) -> str:
         """A sentence about the truth, for reports."""
         return (
