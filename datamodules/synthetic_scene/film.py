@@ -269,18 +269,14 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         time_s: seconds from the start of the record.
     """
     when = torch.tensor([time_s], dtype=torch.float64)
-    haze, gloss = scene.preset.haze, scene.preset.gloss
+    haze = scene.preset.haze
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
         color = scene.visible(points, which, directions @ viewmat[:3, :3])
         celsius = scene.celsius(scene.heat_at(points, which), when)[:, 0]
-        if scene.mirrors:
-            celsius = scene.apparent(celsius, points, which, directions @ viewmat[:3, :3], when)
-        if gloss:
-            outwards = -torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
-            ambient = scene.preset.ambient_c
-            celsius = ambient + gloss.apparent(celsius - ambient, outwards, scene.normals(points, which))
+        sight = torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
+        celsius = scene.apparent(celsius, points, which, sight, time_s)
         if haze:
             distance = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
             ambient = scene.preset.ambient_c
