@@ -81,6 +81,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         SceneError: the folder holds none, several kinds of them, or a file that cannot be read or understood.
     """
     reading = reading or Reading()
+    if reading.zone is not None:
+        zone_of(reading.zone)
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
