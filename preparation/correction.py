@@ -23,7 +23,7 @@ from heatsplat.contracts import Camera, SceneData, SceneError, View
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.formats.colmap import write_model
-from heatsplat.geometry.surfaces import cosines, distances
+from heatsplat.geometry.sight_lines import cosines, distances
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
 from heatsplat.io.results import write_atomically

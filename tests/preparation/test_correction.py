@@ -11,7 +11,7 @@ from recordings import write_flir
 
 from heatsplat.contracts import Camera, Frame, SceneError, ThermalRange, View
 from heatsplat.datamodules.colmap import Colmap
-from heatsplat.geometry.surfaces import cosines, distances, rays
+from heatsplat.geometry.sight_lines import cosines, distances, rays
 from heatsplat.io.tiff import read_temperature
 from heatsplat.physics.radiometry import (
     BandResponse,

@@ -1,51 +1,56 @@
-"""What a depth map says of the surface in each pixel: how far it is, and at which angle it is seen."""
+"""Which way surfaces lie: planes through neighbouring points, and what a depth map says of its surface. Pure functions."""
 
 from __future__ import annotations
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import Camera
-
-REACH = 2  # pixels to either side over which a slope is taken: depth maps of Gaussians are rough from one to the next
-BREAK = 0.1  # of the depth: a larger step between the two sides is an edge and no slope
+from heatsplat.geometry.coverage import surface_depth
 
 
-def rays(camera: Camera) -> Tensor:
-    """Points [H, W, 3] of camera z 1 on the lines of sight through the middles of pixels, in the camera's frame, float64."""
-    rows, columns = torch.meshgrid(
-        torch.arange(camera.height, dtype=torch.float64), torch.arange(camera.width, dtype=torch.float64), indexing="ij"
-    )
-    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=-1)
-    return pixels @ torch.linalg.inv(camera.K.double()).T
+def plane_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
+    """Planes through the points [P, 3] nearest to each of ``at`` [n, 3], by principal axes.
 
-
-def distances(camera: Camera, depth: Tensor) -> Tensor:
-    """Distances [H, W] from the camera's centre of what has a camera z [H, W]; infinite where there is no surface."""
-    return depth.double() * rays(camera).norm(dim=-1)
-
-
-def cosines(camera: Camera, depth: Tensor) -> Tensor:
-    """Cosine [H, W] of the angle between the line of sight and the surface's normal, in [0, 1]; NaN where it is not known.
-
-    The normal is that of the plane through the points ``REACH`` pixels to the left and right and above and below.
+    Returns:
+        Rotations [n, 3, 3] float64 whose columns are the axes, widest first, so that the last is the normal, of either
+        sign; and the distances [n] to the neighbours, root mean square.
 
     Args:
-        depth: [H, W] camera z, infinite where there is no surface.
+        neighbours: points of a plane, at most all there are; fewer than three make no plane.
     """
-    sight = rays(camera)
-    points = sight * depth.double()[..., None]
-    found = torch.full(depth.shape, torch.nan, dtype=torch.float64)
-    if min(depth.shape) <= 2 * REACH:
-        return found
-    inner, r = slice(REACH, -REACH), REACH
-    right = points[inner, 2 * r :] - points[inner, : -2 * r]
-    down = points[2 * r :, inner] - points[: -2 * r, inner]
-    normal = torch.linalg.cross(right, down)
-    view = torch.nn.functional.normalize(sight[inner, inner], dim=-1)
-    cosine = (torch.nn.functional.normalize(normal, dim=-1) * view).sum(-1).abs()
-    middle = depth[inner, inner].double()
-    steps = torch.maximum(right[..., 2].abs(), down[..., 2].abs())
-    known = middle.isfinite() & normal.isfinite().all(-1) & (steps < BREAK * middle)
-    found[inner, inner] = torch.where(known, cosine.clamp(0.0, 1.0), torch.nan)
-    return found
+    distances, near = cKDTree(points.double().numpy()).query(at.double().numpy(), k=min(neighbours, len(points)))
+    around = points.double()[torch.from_numpy(near).reshape(len(at), -1)]
+    around = around - around.mean(1, keepdim=True)
+    _, axes = torch.linalg.eigh(around.mT @ around)
+    axes = axes.flip(-1)
+    turn = torch.ones(len(at), 3, dtype=torch.float64)
+    turn[:, 2] = torch.linalg.det(axes).sign()
+    far = torch.from_numpy(distances).reshape(len(at), -1).square().mean(1).sqrt()
+    return axes * turn[:, None], far
+
+
+def on_the_side_of(normals: Tensor, directions: Tensor) -> Tensor:
+    """Normals [..., 3], turned round where they point away from ``directions`` [..., 3] (of any length)."""
+    return torch.where((normals * directions).sum(-1, keepdim=True) < 0, -normals, normals)
+
+
+def depth_normals(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    """Unit normals [H, W, 3] in the world, towards the camera, of the surface that a renderer shows; 0 where it is open.
+
+    They are those of the planes through the neighbours on either side, in rows and in columns.
+
+    Args:
+        depth: [H, W] accumulated camera z.
+        alpha: [H, W] accumulated opacity.
+    """
+    z = surface_depth(depth, alpha)
+    rows, columns = torch.meshgrid(
+        torch.arange(camera.height).to(z) + 0.5, torch.arange(camera.width).to(z) + 0.5, indexing="ij"
+    )
+    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1) @ torch.linalg.inv(camera.K).to(z).T
+    places = rays * z[..., None]
+    down, across = torch.gradient(places, dim=(0, 1))
+    normals = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    return (on_the_side_of(normals, -rays) @ camera.viewmat[:3, :3].to(z)).nan_to_num(0.0)
