@@ -32,9 +32,9 @@ CAMERA = Camera(
     32,
 )
 # A floor 10 units below that is seen at a slant, and a free sky above the horizon.
-DOWN = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
+DOWN = torch.tensor([0.0, 0.95, 0.31], dtype=torch.float64)
 ALONG = rays(CAMERA) @ DOWN
-DEPTH = torch.where(ALONG > 0.2, 10.0 / ALONG.clamp(min=1e-9), torch.inf)
+DEPTH = torch.where(ALONG > 0.1, 10.0 / ALONG.clamp(min=1e-9), torch.inf)
 TRUE_K = 300.0 + 20.0 * torch.sin(torch.arange(40, dtype=torch.float64) / 5).expand(32, 40)
 METRES = 4.0  # a unit
 AIR = Conditions(emissivity=0.94, reflected_k=265.0, distance_m=60.0, air_k=285.0, humidity=0.8)
