@@ -91,7 +91,7 @@ def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
     module = Colmap(root=str(tmp_path / "new"))
     module.setup()
     frames = [*module.scene.train.frames, *module.scene.test.frames]
-    assert sorted(frame.time_s for frame in frames) == [0.0, 2.0, 4.0]
+    assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
     torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
 
 

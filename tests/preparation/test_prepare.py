@@ -39,10 +39,10 @@ def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_a
     module = Colmap(root=str(target))
     module.setup()
     views = [*module.scene.train, *module.scene.test]
-    assert sorted(view.time_s for view in views) == [2.0 * i for i in range(9)]
+    assert sorted(view.time_s for view in views) == [2.0 * i for i in range(-1, 8)]  # 0 is the first training frame
     assert module.scene.notes["time_source"] == "frames.csv"
     frame = next(f for f in read_frames(source) if f.time.second == 2)
-    view = next(view for view in views if view.time_s == 2.0)
+    view = next(view for view in views if view.frame.name == f"{frame.name}.tiff")
     shown = module.scene.thermal_range.to_celsius(view.thermal[..., 0])
     np.testing.assert_allclose(shown, frame.temperature(), atol=2e-3)
 

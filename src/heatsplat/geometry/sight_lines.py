@@ -8,7 +8,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera
 
 REACH = 2  # pixels to either side over which a slope is taken: depth maps of Gaussians are rough from one to the next
-BREAK = 0.1  # of the depth: a larger step between the two sides is an edge and no slope
+BREAK = 0.05  # of 1 / depth, which is linear over the image of a plane: what bends more over the reach is an edge
 
 
 def rays(camera: Camera) -> Tensor:
@@ -44,8 +44,10 @@ def cosines(camera: Camera, depth: Tensor) -> Tensor:
     normal = torch.linalg.cross(right, down)
     view = torch.nn.functional.normalize(sight[inner, inner], dim=-1)
     cosine = (torch.nn.functional.normalize(normal, dim=-1) * view).sum(-1).abs()
-    middle = depth[inner, inner].double()
-    steps = torch.maximum(right[..., 2].abs(), down[..., 2].abs())
-    known = middle.isfinite() & normal.isfinite().all(-1) & (steps < BREAK * middle)
+    inverse = 1.0 / depth.double()
+    middle = inverse[inner, inner]
+    bend_x = inverse[inner, 2 * r :] + inverse[inner, : -2 * r] - 2 * middle
+    bend_y = inverse[2 * r :, inner] + inverse[: -2 * r, inner] - 2 * middle
+    known = normal.isfinite().all(-1) & (torch.maximum(bend_x.abs(), bend_y.abs()) < BREAK * middle)
     found[inner, inner] = torch.where(known, cosine.clamp(0.0, 1.0), torch.nan)
     return found
