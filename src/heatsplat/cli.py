@@ -326,9 +326,11 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
 @_command
 @_job
 def prepare(config: dict[str, Any], output_dir: Path) -> None:
-    """Makes a scene that trains of a camera's files."""
+    """Makes a scene that trains of a camera's files, or corrects a trained scene pixel by pixel (correct=scene)."""
     from heatsplat.contracts import SceneError
+    from heatsplat.training.session import prepare_machine
 
-    if config["source"] is None or config["target"] is None:
+    if config["target"] is None or (config["source"] is None and config["correct"] is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
-    build(config["preparation"], target=output_dir)
+    prepare_machine(config["threads"])
+    build(config["correct"] or config["preparation"], target=output_dir)
