@@ -15,6 +15,7 @@ from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.rooms import ROOM, number_of, room
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
 
@@ -23,7 +24,8 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, or the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, cooling, ...
+        scene: outdoor, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, cooling, ..., or
+            room_0, room_1 and so on, rooms furnished at random.
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
@@ -51,8 +53,8 @@ class Synthetic(SceneDataModule):
     ) -> None:
         own_split = "json" if scene in OUTDOOR else "every_8th"
         super().__init__(root=root, scene=scene, split=split or own_split, **options)
-        if scene not in PRESETS and scene not in OUTDOOR:
-            known = ", ".join((*PRESETS, *OUTDOOR))
+        if scene not in PRESETS and scene not in OUTDOOR and number_of(scene) is None:
+            known = ", ".join((*PRESETS, *OUTDOOR, f"{ROOM}0, {ROOM}1 and so on"))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
         if weather is not None and scene not in OUTDOOR:
             raise SceneError(f"data.weather={weather}: scene '{scene}' lies in a room without weather; leave it null")
@@ -74,7 +76,9 @@ class Synthetic(SceneDataModule):
         """The recording as a scene; its truth and probes come from the solver."""
         outdoors = self.scene_name in OUTDOOR
         world = OutdoorScene(in_weather(OUTDOOR[self.scene_name], self.weather)) if outdoors else None
-        recording = film(world or Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
+        number = number_of(self.scene_name)
+        indoors = None if outdoors else Scene(PRESETS[self.scene_name] if number is None else room(number))
+        recording = film(world or indoors, self.size, self.scene_seed, self.noise_k)
         preset, count = recording.scene.preset, len(recording.times_s)
         names = [surface.name for surface in preset.surfaces]
         if self.only is not None and self.only not in names:
@@ -111,6 +115,7 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
             **(_of_the_yard(world, recording) if outdoors else {}),
+            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
 

@@ -262,7 +262,7 @@ CASES = {
     "solar": Case(
         ("relaxation", "convection", "frame_offset"),
         lambda: ByHand(air(wind=True), chain={"frame_offset": FrameOffset()}),
-        ("raw_sun", "outside"),
+        ("raw_sun", "normals"),
     ),
     "radiation": Case(
         ("relaxation", "solar", "reflection"),

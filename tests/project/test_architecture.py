@@ -27,7 +27,7 @@ ALLOWED = {
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "composition": {"training", "heatsplat"},
     "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
-    "studies": {"contracts", "metrics", "io", "training"},
+    "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
         "geometry",

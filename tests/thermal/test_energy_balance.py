@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import NORMALS, Query, Seeds
 from heatsplat.thermal.energy_balance import EnergyBalance
 
 HOUR = 3600.0
@@ -55,10 +55,11 @@ def splats_of(model: EnergyBalance, count: int = 6) -> Splats:
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     quats[count // 2 :] = torch.tensor([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
     means = torch.zeros(count, 3)
-    means[count // 2 :, 0] = -5.0  # so that the camera is on their eastern side
     flat = torch.tensor([0.0, 0.0, -4.0]).repeat(count, 1)
+    seen = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).repeat_interleave(count // 2, dim=0)
     tensors = {"means": means, "log_scales": flat, "quats": quats, "opacity_logits": torch.zeros(count, 1)}
-    return Splats(tensors | {name: item.initial for name, item in model.per_gaussian(start).items()})
+    declared = {name: item.initial for name, item in model.per_gaussian(start).items()}
+    return Splats(tensors | declared | ({NORMALS: seen} if NORMALS in declared else {}))
 
 
 def ready(data: SceneData | None = None, **options) -> tuple[EnergyBalance, Splats]:
@@ -210,7 +211,7 @@ def test_a_night_only_record_works_without_sun():
     [
         ({"solution": "best"}, "solution must be one of linear, corrected, got 'best'"),
         ({"sky": "blue"}, "sky must be one of auto, brutsaert"),
-        ({"normals": "up"}, "normals must be one of splats, level, got 'up'"),
+        ({"normals": "up"}, "normals must be one of seen, level, got 'up'"),
         ({"clip": "soft"}, "clip must be one of"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],

@@ -11,20 +11,19 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
-from heatsplat.geometry.rotations import shortest_axes
 from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
 
 log = logging.getLogger(__name__)
 
 SOLUTIONS = ("linear", "corrected")
-NORMALS = ("splats", "level")
+SURFACES = ("seen", "level")
 SKIES = ("auto", *sky.LAWS)
 SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
 SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
@@ -63,8 +62,8 @@ class EnergyBalance(ThermalModel):
             humidity and the last without), or None: nothing radiates.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
-        normals: "splats" meets the sun with the shortest axis of each Gaussian, on the side of the training cameras;
-            "level" has every surface lie level, under the global irradiance.
+        normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
+            all surfaces lie level, under the global irradiance.
         emissivity: assumed for ``attributes``, in (0, 1].
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
         lr_initial, lr_rate, lr_sun, lr_share, lr_wind: learning rates.
@@ -84,7 +83,7 @@ class EnergyBalance(ThermalModel):
         sky: str | None = "auto",
         wind: bool = True,
         sun: bool = True,
-        normals: str = "splats",
+        normals: str = "seen",
         emissivity: float = 0.95,
         clip: str = "straight_through",
         lr_initial: float = 2.5e-3,
@@ -97,7 +96,7 @@ class EnergyBalance(ThermalModel):
         super().__init__()
         for name, value, known in (
             ("solution", solution, SOLUTIONS),
-            ("normals", normals, NORMALS),
+            ("normals", normals, SURFACES),
             ("clip", clip, CLIPS),
             ("sky", sky, (*SKIES, None)),
         ):
@@ -115,8 +114,6 @@ class EnergyBalance(ThermalModel):
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
         if wind:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
-        if sun:  # beside which normals face
-            self.register_buffer("outside", torch.zeros(3))
         self._weather: Weather | None = None
         self.register_load_state_dict_post_hook(_live_on)
 
@@ -131,9 +128,6 @@ class EnergyBalance(ThermalModel):
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self._wind and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
-            if self._sun:
-                centers = torch.stack([frame.camera.center for frame in scene.train.frames])
-                self.outside.copy_(centers.mean(0))
         self.under(weather)
         for part in (scene.train, scene.val, scene.test):
             for frame in part.frames:
@@ -164,7 +158,7 @@ class EnergyBalance(ThermalModel):
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
         if drivers.wind_anomaly is not None:
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
-        return tensors
+        return tensors if drivers.up is None else tensors | surface_normals(seeds)
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         if query.time_s is None:
@@ -234,18 +228,8 @@ class EnergyBalance(ThermalModel):
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
             share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
             wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
-            normals=self._normals(splats, query) if drivers.up is not None else None,
+            normals=query.normals(splats) if drivers.up is not None else None,
         )
-
-    @torch.no_grad()
-    def _normals(self, splats: Splats, query: Query) -> Tensor:
-        """Shortest axes of the Gaussians, on the side of the middle of the training cameras, [n, 3].
-
-        Images and not heat decide how a Gaussian lies, so that no gradient passes.
-        """
-        normals = shortest_axes(query.rows(splats.quats), query.rows(splats["log_scales"]))
-        outwards = ((self.outside - query.rows(splats.means)) * normals).sum(1, keepdim=True)
-        return torch.where(outwards < 0, -normals, normals)
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -293,8 +277,8 @@ class EnergyBalance(ThermalModel):
         if not self._sun:
             return None, None, None
         directed = None not in (weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
-        if directed and self.normals == "splats":
-            effects["solar"] = {"surfaces": "shortest axes", "sky": "isotropic"}
+        if directed and self.normals == "seen":
+            effects["solar"] = {"surfaces": "as seen", "sky": "isotropic"}
             beams = weather.direct_w_m2[:, None] * weather.sun / 1000.0
             return weather.up.to(torch.float64), weather.diffuse_w_m2 / 1000.0, beams
         if weather.irradiance_w_m2 is None:
@@ -302,7 +286,7 @@ class EnergyBalance(ThermalModel):
             log.warning("the weather has no irradiance: nothing is heated by the sun")
             return None, None, None
         effects["solar"] = {"surfaces": "level"}
-        if self.normals == "splats":
+        if self.normals == "seen":
             effects["solar"]["left_out"] = "the direction of the sun, which the weather lacks"
         return None, weather.irradiance_w_m2 / 1000.0, None
 
