@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -13,13 +13,13 @@ from typing import Any
 import cv2  # before pycolmap: formats/colmap.py says why
 import numpy as np
 import pycolmap
-from rich.progress import Progress
+from rich.progress import Progress, track
 
 from heatsplat.contracts import SceneError, check_option
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.preparation.features import Features
-from heatsplat.preparation.frames import Frame
+from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.stretch import Stretch
 
@@ -45,6 +45,7 @@ class FindPoses:
         features: what finds and matches features.
         camera_model: of COLMAP, for each camera: SIMPLE_RADIAL, RADIAL, OPENCV, ...
         focal_px: focal length of the thermal camera in pixels; None for what the files say, or a guess that is refined.
+        pixel_um: pitch of the detector's pixels in µm, for files that say a focal length in mm.
         refine_focal: "auto" where the files say nothing, True or False. Flat ground from straight above does not tell it.
         video: frames follow each other: only neighbours in time (and in space, by GPS) are matched. None: where there are
             more than ``all_pairs``.
@@ -58,8 +59,9 @@ class FindPoses:
 
     features: Features
     on: str = "thermal"
-    camera_model: str = "RADIAL"
+    camera_model: str = "SIMPLE_RADIAL"
     focal_px: float | None = None
+    pixel_um: float = 12.0
     refine_focal: str | bool = "auto"
     video: bool | None = None
     all_pairs: int = 120
@@ -111,9 +113,9 @@ class Search:
         images = self.work / "images"
         todo = [name for name in self.frames if not (images / self.copy_of[name]).is_file()]
         if todo:
-            stretch = Stretch([frame.temperature for frame in self.frames.values()], self.options.clip)
+            stretch = Stretch([frame.pixels for frame in self.frames.values()], self.options.clip)
             for name in _progress(todo, "stretching"):
-                _write_png(images / self.copy_of[name], stretch(self.frames[name].temperature()))
+                _write_png(images / self.copy_of[name], stretch(self.frames[name].pixels()))
         if self.options.on == "rgb":
             for name in _progress(list(self.frames), "copying photos"):
                 copy = images / self._photo(name)
@@ -210,13 +212,7 @@ class Search:
             raise SceneError(self._nothing())
         written = thermal_only(model, self.name_of)
         folder = self.target / "sparse" / "0"
-        fresh = self.work / "sparse"
-        shutil.rmtree(fresh, ignore_errors=True)
-        fresh.mkdir(parents=True)
-        written.write_binary(str(fresh))
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
-        fresh.rename(folder)
+        write_whole(written, folder, self.work)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(model, kept)
         camera = next(iter(kept.values())).camera
@@ -266,8 +262,9 @@ class Search:
         first = next(iter(self.frames.values()))
         angle = first.camera.field_of_view_deg
         if not angle:
-            return None
-        return 0.5 * first.temperature().shape[1] / float(np.tan(np.radians(0.5 * angle)))
+            millimetres = first.camera.focal_mm
+            return None if millimetres is None else 1000.0 * millimetres / self.options.pixel_um
+        return 0.5 * first.pixels().shape[1] / float(np.tan(np.radians(0.5 * angle)))
 
     def _camera_of(self, copy: str) -> int:
         """Number of the camera that copies of the same folder and size have already; -1 for none."""
@@ -413,6 +410,17 @@ def thermal_only(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> pyc
     return own
 
 
+def write_whole(model: pycolmap.Reconstruction, folder: Path, work: Path) -> None:
+    """Writes a model so that ``folder`` is never half of one."""
+    fresh = work / "sparse"
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    model.write_binary(str(fresh))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    fresh.rename(folder)
+
+
 def _fix(frame: Frame) -> tuple[float, float, float] | None:
     """Latitude, longitude and altitude of a frame; where take-off is the better zero, above it."""
     at = frame.position
@@ -442,9 +450,5 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
-    from rich.progress import track
-
     return iter(track(items, what, transient=True)) if items else iter(())
 
-
-Loads = Callable[[], np.ndarray]

@@ -23,7 +23,7 @@ from heatsplat.training.rng import generator_for
 
 # Counts of 1/100 K, as Lepton and Boson cameras write them.
 COUNTS_PER_KELVIN = 100.0
-DETECTOR_MM = 7.68  # width of the detector: 640 pixels of 12 µm
+PIXEL_MM = 0.012  # pitch of the detector
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def write_camera(recording: Recording, folder: Path, field: Field = Field(), see
     stuck = dead_pixels(height, width, field.dead_pixels, seed)
     celsius[:, stuck[:, 0], stuck[:, 1]] = celsius.max() + 3.0
     positions = _gps(recording, field, seed)
-    focal_mm = recording.lens.fx / width * DETECTOR_MM
+    focal_mm = recording.lens.fx * PIXEL_MM
     for frame, time_s in enumerate(recording.times_s):
         counts = np.rint((celsius[frame] + KELVIN_AT_0_C) * COUNTS_PER_KELVIN).astype(np.uint16)
         when = field.start + timedelta(seconds=float(time_s))
@@ -80,7 +80,7 @@ def write_camera(recording: Recording, folder: Path, field: Field = Field(), see
         for frame, time_s in enumerate(recording.times_s):
             _, color = expose(recording.scene, lens, rays, rig @ torch.from_numpy(recording.viewmats[frame]), float(time_s))
             when = field.start + timedelta(seconds=float(time_s) + field.rgb_clock_s)
-            about = _exif(when, "Visible", lens.fx / lens.width * DETECTOR_MM, None if positions is None else positions[frame])
+            about = _exif(when, "Visible", lens.fx * PIXEL_MM, None if positions is None else positions[frame])
             pixels = (color.clamp(0, 1) * 255.0).round().to(torch.uint8).numpy()
             _saved(Image.fromarray(pixels), folder / "rgb" / f"V{frame:04d}.jpg", exif=about, quality=95)
 
@@ -155,7 +155,6 @@ def _exif(when: datetime, model: str, focal_mm: float, position: np.ndarray | No
     about[ExifTags.Base.SubsecTimeOriginal] = f"{when.microsecond // 1000:03d}"
     about[ExifTags.Base.OffsetTimeOriginal] = "+00:00"
     about[ExifTags.Base.FocalLength] = focal_mm
-    about[ExifTags.Base.FocalLengthIn35mmFilm] = round(focal_mm / DETECTOR_MM * 36.0)
     if position is not None:
         gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
         latitude, longitude, altitude = map(float, position)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -54,6 +54,7 @@ class Material:
         points: [P, 3] of the scene, or None.
         bounds_c: temperatures of image values 0 and 1, or None.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
+        views: the views of ``images``, for tracks; empty without cameras.
     """
 
     names: Sequence[str]
@@ -68,7 +69,7 @@ class Material:
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
     clipped: float | None = None
-    views: Sequence[View] = field(default=(), repr=False)
+    views: Sequence[View] = ()
 
     @cached_property
     def noise(self) -> float:

@@ -20,6 +20,8 @@ from heatsplat.io.results import write_atomically
 
 log = logging.getLogger("heatsplat")
 
+FINDINGS_FILE = "doctor.json"
+
 CHECKS: tuple[Check, ...] = tuple(
     import_module(f"{checks.__name__}.{name}").CHECK for name in sorted(module.name for module in iter_modules(checks.__path__))
 )
@@ -37,7 +39,7 @@ def warn_of(scene: SceneData) -> list[Finding]:
     """Warns of what is wrong with a scene that is about to be trained; says nothing where nothing is."""
     found = examine(material_of(scene))
     for finding in found:
-        log.warning("%s: %s %s", finding.check, finding.what, finding.remedy)
+        log.warning("doctor, %s: %s %s", finding.check, finding.what, finding.remedy)
     return found
 
 
@@ -52,6 +54,6 @@ def show(found: Sequence[Finding], title: str) -> None:
     Console().print(table)
 
 
-def write(found: Sequence[Finding], path: Path) -> None:
+def write_findings(found: Sequence[Finding], path: Path) -> None:
     """Writes findings as JSON, the most costly first."""
     write_atomically(path, json.dumps([asdict(finding) for finding in found], indent=1))
