@@ -330,6 +330,10 @@ def prepare(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.contracts import SceneError
     from heatsplat.training.session import prepare_machine
 
+    if config["check"] is not None:
+        prepare_machine(config["threads"])
+        build(config["examination"], target=None if config["target"] is None else output_dir)
+        return
     if config["target"] is None or (config["source"] is None and config["correct"] is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
     prepare_machine(config["threads"])

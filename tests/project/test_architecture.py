@@ -26,7 +26,8 @@ ALLOWED = {
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
     "composition": {"training", "heatsplat"},
-    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
+    "doctor": {"contracts", "effects", "io", "physics"},
+    "runs": {"contracts", "composition", "doctor", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
     "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
@@ -43,7 +44,7 @@ ALLOWED = {
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
-    "preparation": {"contracts", "datamodules", "geometry", "io", "physics", "runs"},
+    "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
 }
 BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name what is in them
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
