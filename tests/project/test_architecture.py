@@ -24,7 +24,9 @@ ALLOWED = {
     "density": {"contracts", "geometry", "physics", "splats"},
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
-    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
+    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat", "viewer"},
+    "export": {"contracts", "physics", "renderers", "shots"},
+    "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},
     "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
     "studies": {"contracts", "metrics", "io", "training"},
@@ -41,7 +43,7 @@ ALLOWED = {
         "kernels",
     },  # fmt: skip
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
+    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies", "viewer"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
 }
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know

@@ -376,6 +376,11 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
 
     @torch.no_grad()
+    def shapes(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, scales and opacities [M, N] of all Gaussians as they are rendered in a frame."""
+        return self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+
+    @torch.no_grad()
     def emissions(self, splats: Splats, frame: Frame) -> Tensor:
         """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
         return self.thermal.features(splats, _query(frame))
@@ -404,7 +409,7 @@ class SplatTraining(pl.LightningModule):
         told = self.attributes(frame)
         if not told:
             return {}
-        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+        *shape, opacities = self.shapes(frame)
         values = torch.stack(list(told.values()), dim=1)
         output = self.renderer(*shape, opacities[:1], values, frame.camera, None, (len(told),))
         alpha = output.alpha[0, ..., None]
