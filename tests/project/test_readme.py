@@ -114,6 +114,8 @@ def test_python_commands_run(command, trained, data, tmp_path):
         assert (tmp_path / "done" / "frontier.html").exists()
     elif "simplify.py" in command:
         assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+    elif "view.py" in command:
+        assert (tmp_path / "done" / "viewer.html").exists()
     else:
         assert (tmp_path / "views" / "video.mp4").exists()
 

@@ -13,12 +13,15 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
 def open_browser(width: int = 1100, height: int = 720):
-    """A driver of Chromium. Skips the test where browser, driver or selenium is missing."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (pip install -e '.[dev]')")
+    """A driver of Chromium. Skips the test where browser or driver is missing."""
+    from selenium import webdriver
+
     program = os.environ.get("CHROME") or next(filter(None, map(shutil.which, NAMES)), None)
     driver = shutil.which("chromedriver")
     if program is None or driver is None:
-        pytest.skip("no browser: install chromium and chromium-driver (Debian: apt-get install chromium chromium-driver)")
+        pytest.skip(
+            "no browser: install chromium and chromium-driver (Debian: apt-get install chromium chromium-driver)"
+        )
     options = webdriver.ChromeOptions()
     options.binary_location = program
     size = f"--window-size={width},{height}"

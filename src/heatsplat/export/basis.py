@@ -119,7 +119,9 @@ def time_basis(
 
 def _factors(residual: Tensor, tolerance: float, most: int) -> tuple[Tensor, Tensor, float]:
     """Coefficients [N, r], curves [r, T] and the largest residual; ``residual`` [N, T] is used up."""
-    gram = (residual.T.double() @ residual.double()) if len(residual) else torch.zeros(residual.shape[1]).diag().double()
+    gram = (
+        (residual.T.double() @ residual.double()) if len(residual) else torch.zeros(residual.shape[1]).diag().double()
+    )
     vectors = torch.linalg.eigh(gram).eigenvectors.flip(1).T.float()
     worst = residual.abs().max().item() if residual.numel() else 0.0
     coefficients, curves = [], []

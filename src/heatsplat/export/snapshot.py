@@ -134,9 +134,9 @@ def snapshot(module: Any) -> Snapshot:
     surface = _surface(module, blended, kept) if span is not None else None
     clipped = surface is not None and _alike(lambda time: surface(time).clamp(0, 1), camera, span, tolerance / slope)
     sent = surface if clipped else camera
-    layers = [replace(_layer("camera", "as the camera sees it", sent, span, tolerance, slope), clipped=clipped)]
+    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope), clipped=clipped)]
     if surface is not None and not clipped and not _alike(surface, camera, span, tolerance / slope):
-        layers.append(_layer("surface", "of the surface itself", surface, span, tolerance, slope))
+        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
         layers.append(_layer("truth", "truth", truth, span, tolerance, slope, TRUTH_TIMES))
@@ -263,7 +263,9 @@ def _colours(module: Any, emitted: Tensor, opacities: Tensor) -> tuple[Tensor | 
     return None, None
 
 
-def _displacement(module: Any, seen_at: Callable, first: Frame, span: tuple[float, float] | None, kept: Tensor) -> float:
+def _displacement(
+    module: Any, seen_at: Callable, first: Frame, span: tuple[float, float] | None, kept: Tensor
+) -> float:
     """How far a Gaussian moves over the span at most, in extents of the scene."""
     if span is None:
         return 0.0

@@ -91,7 +91,7 @@ float decoded(sampler2D entries, float share) {
 vec4 paint(sampler2D colours, float value, vec2 ends, float alpha) {
   float share = clamp((value - ends.x) / max(ends.y - ends.x, 1e-9), 0.0, 1.0);
   vec3 colour = texture(colours, vec2((share * 255.0 + 0.5) / 256.0, 0.5)).rgb;
-  return vec4(mix(paper, colour, smoothstep(0.02, 0.35, alpha)), 1.0);
+  return vec4(mix(paper, colour, smoothstep(0.005, 0.05, alpha)), 1.0);
 }
 
 void main() {
@@ -101,7 +101,7 @@ void main() {
   float behind = 1.0 - a.a;
   if (kind == 2) {
     vec4 seen = texelFetch(visible, at, 0);
-    shown = vec4(mix(paper, seen.rgb / max(seen.a, 1e-6), smoothstep(0.02, 0.35, seen.a)), 1.0);
+    shown = vec4(mix(paper, seen.rgb / max(seen.a, 1e-6), smoothstep(0.005, 0.05, seen.a)), 1.0);
     return;
   }
   if (kind == 1) {
@@ -129,7 +129,7 @@ void main() {
     beside = other == SENSOR ? clamp(value + stored.r, limits.x, limits.y) : stored.r;
   } else if (other == VISIBLE && corner.x > split) {
     vec4 seen = texelFetch(visible, at, 0);
-    shown = vec4(mix(paper, seen.rgb / max(seen.a, 1e-6), smoothstep(0.02, 0.35, seen.a)), 1.0);
+    shown = vec4(mix(paper, seen.rgb / max(seen.a, 1e-6), smoothstep(0.005, 0.05, seen.a)), 1.0);
     return;
   }
   if (!known && (difference || corner.x > split)) {

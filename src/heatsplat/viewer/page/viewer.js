@@ -77,15 +77,19 @@ class Viewer {
 
   build() {
     const option = (select, value, text) => select.append(new Option(text, value));
-    for (const layer of this.splats.layers) option($("quantity"), layer.name, this.told.unit ? `temperature ${layer.label}` : `image ${layer.label}`);
+    const noun = this.told.unit ? "temperature" : "image value";
+    for (const layer of this.splats.layers) {
+      const alone = layer.name === "camera" && !this.splats.layer("surface");
+      option($("quantity"), layer.name, alone ? noun : layer.name === "truth" ? `true ${noun}` : `${noun} ${layer.label}`);
+    }
     for (const one of this.splats.attributes) option($("quantity"), `learned ${one.name}`, `learned: ${one.label}`);
     if (this.splats.colours) option($("quantity"), "visible", "visible light");
     option($("other"), "nothing", "nothing");
     if (this.told.span) option($("other"), "time", "another time");
     for (const layer of this.splats.layers) option($("other"), layer.name, layer.label);
     if (this.splats.colours) option($("other"), "visible", "visible light");
-    option($("other"), "recorded", "the image that was recorded");
-    if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "with what the camera adds");
+    option($("other"), "recorded", "recorded image");
+    if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "with the camera's own part");
     for (const name of Object.keys(this.maps)) if (name !== DIFFERENCES) option($("map"), name, name);
     $("timeBar").hidden = !this.told.span;
     if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
@@ -348,7 +352,7 @@ class Viewer {
   // Value that a pixel of the canvas shows, from what was blended [value, second, -, alpha]; null where next to nothing is.
   valueOf(blended, j) {
     const alpha = blended[j + 3], { splats, told } = this;
-    if (alpha < 0.05) return null;
+    if (alpha < 0.02) return null;
     if (this.attribute) {
       const { low, high, log } = this.attribute, value = low + blended[j] / alpha * (high - low);
       return log ? 10 ** value : value;
@@ -356,7 +360,7 @@ class Viewer {
     const layer = this.layer;
     if (!layer) return null;
     const [low, high] = told.tableEnds;
-    const value = (share, of) => splats.shown(low + share * (high - low) + (1 - alpha) * told.background, of);
+    const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
     const first = value(blended[j], layer);
     const beside = this.state.other === "time" ? layer : splats.layer(this.state.other);
     return this.differing && beside ? first - value(blended[j + 1], beside) : first;
@@ -375,7 +379,7 @@ class Viewer {
       if (!second) found.push(this.attribute?.log ? Math.log10(value) : value);
       else if (second[j + 3] > 0.05) {
         const { told, scene } = this.run, [low, high] = told.tableEnds;
-        found.push(value - scene.splats.decoded(low + second[j] * (high - low) + (1 - second[j + 3]) * told.background));
+        found.push(value - scene.splats.decoded(second[j + 3] * low + second[j] * (high - low) + (1 - second[j + 3]) * told.background));
       }
     }
     return found;
@@ -591,9 +595,9 @@ class Viewer {
     Object.assign(this.state, changes);
     this.stale.values = true;
     if (this.state.other === "run" && !this.run) this.state.other = "nothing";
-    if ((this.state.other === "recorded" || this.state.other === "sensor") && this.state.at === null) {
-      this.goTo(this.lastCamera || 0, true);
-      this.say("This is known where a training camera stood: N and P go to the next.");
+    if ("other" in changes && (this.state.other === "recorded" || this.state.other === "sensor")) {
+      this.goTo(this.state.at ?? this.lastCamera ?? 0, true);
+      this.say("Known where a training camera stood, at its time: N and P go to the next.");
     }
     if (this.layer && this.chartTimes) this.probes.forEach((probe) => this.measure(probe));
     if (!this.state.ranges[this.rangeName]) {
