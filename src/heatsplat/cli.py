@@ -79,6 +79,7 @@ EXAMPLES = {
     "evaluate": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
     "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
+    "view": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "study": ("study=frontier study.runs=outputs",),
     "prepare": ("source=/data/flight target=/data/my_scene",),
 }
@@ -297,6 +298,22 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
     merging = build(config["merge"])
     written = write_levels(trained, merging, config["levels_c"], output_dir, config["ply"], config["time"])
     log.info("%d files in %s", len(written), output_dir)
+
+
+@_command
+@_job
+def view(config: dict[str, Any], output_dir: Path) -> None:
+    """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
+    from heatsplat.runs.run import load
+    from heatsplat.training.session import prepare_machine
+    from heatsplat.viewer.page import FILE, write_viewer
+
+    prepare_machine(config["threads"])
+    trained = load(
+        config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
+    )
+    path = write_viewer(trained.module, output_dir / FILE)
+    log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
 
 
 @_command

@@ -24,7 +24,9 @@ ALLOWED = {
     "density": {"contracts", "geometry", "physics", "splats"},
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
-    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
+    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat", "viewer"},
+    "export": {"contracts", "physics", "renderers", "shots"},
+    "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},
     "doctor": {"contracts", "effects", "io", "physics"},
     "runs": {"contracts", "composition", "doctor", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
@@ -42,7 +44,7 @@ ALLOWED = {
         "kernels",
     },  # fmt: skip
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
+    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies", "viewer"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
     "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
 }

@@ -122,6 +122,8 @@ def test_python_commands_run(command, trained, data, tmp_path):
         assert (tmp_path / "prepared" / "report.md").exists()
     elif "simplify.py" in command:
         assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+    elif "view.py" in command:
+        assert (tmp_path / "done" / "viewer.html").exists()
     else:
         assert (tmp_path / "views" / "video.mp4").exists()
 
@@ -150,7 +152,7 @@ def test_make_targets_exist():
     assert [target for target in re.findall(r"`?make (\w+)`?", TEXT) if f"make {target} " not in known] == []
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "study"])
+@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "study"])
 def test_console_commands_are_installed(name):
     programs = [one for one in entry_points(group="console_scripts") if one.name == f"heatsplat-{name}"]
     if not programs:
