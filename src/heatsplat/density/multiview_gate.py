@@ -102,8 +102,8 @@ class MultiviewGate(Adaptive):
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """ "gradient", "absolute" and "seen" [N], over all views; "wrong", "blame" and "blaming" [N], over the V views."""
-        names = ("gradient", "absolute", "seen", "wrong", "blaming", "blame")
-        return {name: torch.zeros(count, device=device) for name in names}
+        names = ("absolute", "wrong", "blaming", "blame")
+        return super().initial_state(count, device) | {name: torch.zeros(count, device=device) for name in names}
 
     def maps_at(self, step: int) -> int:
         used = self.gate_pixels if self._grows(step) else self.late_blame

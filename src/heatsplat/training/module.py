@@ -23,8 +23,9 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
+from heatsplat.training.normals import Normals
 from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
@@ -58,6 +59,7 @@ class SplatTraining(pl.LightningModule):
         merging: what is done to Gaussians after training, before the test; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
+        normals: where normals come from, of models that read them; None: as before training, throughout.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -84,6 +86,7 @@ class SplatTraining(pl.LightningModule):
         merging: Merging | None = None,
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
+        normals: Normals | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -100,6 +103,7 @@ class SplatTraining(pl.LightningModule):
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
+        self.normals = normals or Normals()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -116,6 +120,13 @@ class SplatTraining(pl.LightningModule):
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
         self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -136,6 +147,8 @@ class SplatTraining(pl.LightningModule):
         self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
+        if NORMALS in self.splats:
+            self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -332,10 +345,17 @@ class SplatTraining(pl.LightningModule):
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
+        if NORMALS in self.splats and step + 1 in self.normals.refresh:
+            self._face(self.splats[NORMALS].detach())
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
+
+    @torch.no_grad()
+    def _face(self, normals: Tensor) -> None:
+        """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
+        self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
@@ -374,6 +394,11 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
 
     @torch.no_grad()
+    def shapes(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, scales and opacities [M, N] of all Gaussians as they are rendered in a frame."""
+        return self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+
+    @torch.no_grad()
     def emissions(self, splats: Splats, frame: Frame) -> Tensor:
         """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
         return self.thermal.features(splats, _query(frame))
@@ -402,12 +427,17 @@ class SplatTraining(pl.LightningModule):
         told = self.attributes(frame)
         if not told:
             return {}
-        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
-        values = torch.stack(list(told.values()), dim=1)
-        output = self.renderer(*shape, opacities[:1], values, frame.camera, None, (len(told),))
+        output = self.composited(frame, torch.stack(list(told.values()), dim=1))
         alpha = output.alpha[0, ..., None]
         maps = torch.where(alpha > 0, output.features / alpha, torch.nan)
         return dict(zip(told, maps.unbind(-1), strict=True))
+
+    def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
+        """What the camera of ``frame`` sees of values [N, C] of all Gaussians, before black, in the first modality."""
+        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+        return self.renderer(
+            *shape, opacities[:1], values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
+        )
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         start = time.perf_counter()

@@ -59,32 +59,27 @@ class OnePassAdam(torch.optim.Adam):
         return loss
 
     def _step_in_kernel(self, stepped: list[tuple[dict[str, Any], torch.Tensor]]) -> None:
-        states = [self._state_of(parameter) for _, parameter in stepped]
-        if states:
-            torch._foreach_add_([state["step"] for state in states], 1)
-        tensors, rates = np.empty((len(stepped), 8), np.int64), np.empty((len(stepped), 5), np.float32)
-        tasks, decayed, decays, kept = 0, 0, [], []
-        for row, ((group, parameter), state) in enumerate(zip(stepped, states, strict=True)):
-            gradient = parameter.grad.contiguous()
+        tensors, rates, kept, tasks = [], [], [], 0
+        decays = [np.array([group["weight_decay"] for group, _ in stepped], np.float32).repeat(LANES)]
+        decayed = decays[0].size
+        for row, (group, parameter) in enumerate(stepped):
+            state, gradient, count = self._state_of(parameter), parameter.grad.contiguous(), parameter.numel()
             kept.append(gradient)  # its memory, until the kernel has read it
+            decay, period = row * LANES, LANES
+            if group.get("group_penalty") and count > 0:
+                decays.append(_group_decay(group, parameter))
+                decay, period = decayed, decays[-1].size
+                decayed += period
             places = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
-            decays.append(_decay(group, parameter))
-            tensors[row] = (
-                *(tensor.data_ptr() for tensor in places),
-                parameter.numel(),
-                tasks,
-                decayed,
-                len(decays[-1]),
-            )
-            tasks += -(-parameter.numel() // kernel.SHARE)
-            decayed += len(decays[-1])
+            tensors.append((*(tensor.data_ptr() for tensor in places), count, tasks, decay, period))
+            tasks += -(-count // kernel.SHARE)
+            state["step"] += 1
             beta1, beta2 = group["betas"]
             done = state["step"].item()
-            inverse_root = 1 / math.sqrt(1 - beta2**done)
-            rates[row] = group["lr"] / (1 - beta1**done), beta1, beta2, inverse_root, group["eps"]
+            rates.append((group["lr"] / (1 - beta1**done), beta1, beta2, 1 / math.sqrt(1 - beta2**done), group["eps"]))
         self._sums = np.zeros(tasks, np.float32)
         if tasks > 0:
-            kernel.step(tensors, rates, np.concatenate(decays), self._sums)
+            kernel.step(np.array(tensors), np.array(rates, np.float32), np.concatenate(decays), self._sums)
 
     def _state_of(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
         """Moments and number of steps of a parameter, made at its first step."""
@@ -101,17 +96,15 @@ def _fits_kernel(parameter: torch.Tensor) -> bool:
     return kinds and parameter.device.type == "cpu" and parameter.is_contiguous()
 
 
-def _decay(group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
-    """What the kernel adds to a gradient, in numbers of the parameter, until it repeats."""
-    decay = np.float32(group["weight_decay"])
-    if not group.get("group_penalty") or parameter.numel() == 0:
-        return np.full(LANES, decay)
+def _group_decay(group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
+    """Decay of the columns of a parameter with a penalty of groups, as often as it takes to be whole vectors."""
     columns = parameter.shape[-1]
     rows = max(1, kernel.SHARE // columns)
     sums = np.empty((-(-parameter.numel() // (rows * columns)), columns), np.float32)
     kernel.square_columns(parameter.detach().view(-1).numpy(), columns, rows, sums)
     norms = torch.from_numpy(sums.sum(axis=0, dtype=np.float64).astype(np.float32)).sqrt()
-    return decay + np.tile(np.float32(group["group_penalty"]) * _reciprocals(norms).numpy(), LANES)
+    decay = np.float32(group["weight_decay"]) + np.float32(group["group_penalty"]) * _reciprocals(norms).numpy()
+    return np.tile(decay, LANES)
 
 
 def _reciprocals(norms: torch.Tensor) -> torch.Tensor:

@@ -68,12 +68,13 @@ STEP_HOOKS = (
 )
 
 
-def without_idle_hooks(callback: pl.Callback) -> pl.Callback:
-    """The callback, of which Lightning calls no hook of a step that it leaves empty: a hundred calls a step otherwise."""
+def without_idle_hooks(part: pl.Callback | pl.LightningModule) -> pl.Callback | pl.LightningModule:
+    """A callback or module, of which Lightning calls no hook of a step that it leaves empty: a hundred calls a step otherwise."""
+    kind = pl.Callback if isinstance(part, pl.Callback) else pl.LightningModule
     for name in STEP_HOOKS:
-        if getattr(type(callback), name) is getattr(pl.Callback, name):
-            setattr(callback, name, None)
-    return callback
+        if getattr(type(part), name) is getattr(kind, name):
+            setattr(part, name, None)
+    return part
 
 
 class StopOnInterrupt(pl.Callback):
