@@ -16,6 +16,7 @@ from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, o
 from heatsplat.datamodules.synthetic_scene.outdoor import SKIES, OutdoorScene, in_weather, training_frames
 from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, YARDS
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.rooms import ROOM, number_of, room
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics.units import DAY_S
@@ -25,7 +26,8 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, outdoor_true, or the name of a preset (``datamodules.synthetic_scene.presets``): static, cooling, ...
+        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, ...,
+            or room_0, room_1 and so on, rooms furnished at random.
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
@@ -55,8 +57,8 @@ class Synthetic(SceneDataModule):
     ) -> None:
         own_split = "json" if scene in YARDS else "every_8th"
         super().__init__(root=root, scene=scene, split=split or own_split, **options)
-        if scene not in PRESETS and scene not in YARDS:
-            known = ", ".join((*PRESETS, *YARDS))
+        if scene not in PRESETS and scene not in YARDS and number_of(scene) is None:
+            known = ", ".join((*PRESETS, *YARDS, f"{ROOM}0, {ROOM}1 and so on"))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
         if days is not None and (scene != "outdoor_true" or not 2 <= days <= MOST_DAYS):
             raise SceneError(
@@ -85,7 +87,9 @@ class Synthetic(SceneDataModule):
             solved, known = YARDS[self.scene_name]
             known = in_weather(known, self.weather)
             world = solved(known if self.days is None else replace(known, duration_s=self.days * DAY_S))
-        recording = film(world or Scene(PRESETS[self.scene_name]), self.size, self.scene_seed, self.noise_k)
+        number = number_of(self.scene_name)
+        indoors = None if outdoors else Scene(PRESETS[self.scene_name] if number is None else room(number))
+        recording = film(world or indoors, self.size, self.scene_seed, self.noise_k)
         preset, count = recording.scene.preset, len(recording.times_s)
         names = [surface.name for surface in preset.surfaces]
         if self.only is not None and self.only not in names:
@@ -122,6 +126,7 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
             **(_of_the_yard(world, recording) if outdoors else {}),
+            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
 

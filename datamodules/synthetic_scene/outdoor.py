@@ -162,6 +162,7 @@ class OutdoorPreset(Preset):
     surfaces: tuple[OutdoorSurface, ...] = YARD
     duration_s: float = DURATION_S
     ambient_c: float = 18.0
+    point_noise_m: float = 0.02
     effects: frozenset[str] = frozenset({"relaxation", "solar", "radiation", "convection"})
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
@@ -280,7 +281,6 @@ class OutdoorHeat:
 class OutdoorScene(Scene):
     """A yard whose heat has been solved under a weather; see ``Scene``. Times are seconds from the start of the record."""
 
-    point_noise_m = 0.02
     probe_reach_m = 0.25
 
     def __init__(self, preset: OutdoorPreset) -> None:
@@ -289,6 +289,9 @@ class OutdoorScene(Scene):
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
         self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
+        self.emissivity = torch.ones(
+            len(preset.surfaces) + 1, dtype=torch.float64
+        )  # to the camera, as after correction
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
         self.weather = outdoor_weather(preset.weather)

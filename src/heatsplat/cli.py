@@ -80,6 +80,7 @@ EXAMPLES = {
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
     "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
     "study": ("study=frontier study.runs=outputs",),
+    "prepare": ("source=/data/flight target=/data/my_scene",),
 }
 
 
@@ -320,3 +321,14 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
     prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)
+
+
+@_command
+@_job
+def prepare(config: dict[str, Any], output_dir: Path) -> None:
+    """Makes a scene that trains of a camera's files."""
+    from heatsplat.contracts import SceneError
+
+    if config["source"] is None or config["target"] is None:
+        raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
+    build(config["preparation"], target=output_dir)

@@ -10,15 +10,17 @@ from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.formats.flir import Record
 from heatsplat.datamodules.formats.images import read_image
-from heatsplat.datamodules.formats.radiometric import Planck, has_temperatures, read_celsius, read_fff
+from heatsplat.datamodules.formats.radiometric import Calibration, has_temperatures, read_celsius, surface_celsius
+from heatsplat.physics.radiometry import PlanckResponse
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 FLIR, M3T = DATA / "flir", DATA / "m3t_heath"
 needs_flir = pytest.mark.skipif(not FLIR.is_dir(), reason="real FLIR data is not at ../shared/data/flir")
 needs_m3t = pytest.mark.skipif(not M3T.is_dir(), reason="real DJI data is not at ../shared/data/m3t_heath")
 
-PLANCK = Planck(r1=16000.0, b=1430.0, f=1.0, o=-7000, r2=0.012)
+PLANCK = PlanckResponse(r1=16000.0, b=1430.0, f=1.0, o=-7000, r2=0.012)
 
 
 def fff(raw, order="<", png=False, pixels=None):
@@ -93,7 +95,7 @@ def test_fff_files_are_read_like_jpegs(tmp_path):
 
 
 def test_values_outside_the_calibration_are_gaps():
-    assert np.isnan(PLANCK.celsius(np.array([0, 7000], np.uint16))).all()
+    assert np.isnan(surface_celsius(np.array([0, 7000], np.uint16), Calibration(PLANCK))).all()
 
 
 def test_dji_arrays_of_sixteenths_of_a_kelvin_are_temperatures(tmp_path):
@@ -107,7 +109,7 @@ def test_dji_arrays_of_sixteenths_of_a_kelvin_are_temperatures(tmp_path):
 def test_dji_arrays_of_counts_are_refused(tmp_path, raw):
     path = tmp_path / "a.jpg"
     path.write_bytes(dji_jpeg(np.reshape(raw, (512, 640))))
-    with pytest.raises(SceneError, match="a.jpg: .*only DJI's Thermal SDK converts; .*data.radiometric=never"):
+    with pytest.raises(SceneError, match="a.jpg: .*only DJI's Thermal SDK converts: .*data.radiometric=never"):
         read_celsius(path)
 
 
@@ -127,7 +129,7 @@ def test_damaged_flir_data_is_named(tmp_path):
     with pytest.raises(SceneError, match="head.fff: the FLIR data is damaged"):
         read_celsius(tmp_path / "head.fff")
     (tmp_path / "ls.fff").write_bytes(fff(raw_for(temperatures()), pixels=b"\xff\xd8\xff\xf7"))
-    with pytest.raises(SceneError, match="ls.fff: the raw image is compressed as JPEG-LS"):
+    with pytest.raises(SceneError, match="ls.fff: its JPEG-LS image cannot be decoded"):
         read_celsius(tmp_path / "ls.fff")
 
 
@@ -165,7 +167,8 @@ def test_a_scene_of_radiometric_jpegs_is_in_celsius(tmp_path):
 @needs_flir
 def test_a_real_flir_frame_agrees_with_its_printed_metadata():
     path = FLIR / "frame_000000.fff"
-    raw, planck = read_fff(path.read_bytes(), path)
+    record = Record(path.read_bytes(), str(path))
+    raw, planck = record.counts(), record.measured().response
     assert raw.shape == (512, 640)
     assert (planck.r1, planck.b, planck.f, planck.o, planck.r2) == (364058.0, 1428.0, 1.0, -228, 1.0)
     assert int(raw.max()) - int(raw.min()) == 116  # "Raw Value Range"

@@ -47,8 +47,10 @@ from heatsplat.kernels.layout import (
     channels,
     feature_column,
     has_absgrad,
+    map_count,
     modalities,
     modality_of,
+    pixel_rows,
     slot_columns,
 )
 from heatsplat.kernels.scheduling import parallel_for, take
@@ -247,8 +249,8 @@ def composite(
 
 
 @inline
-def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker):
-    """Copies the gradients of a tile's pixels into blocks; those of pixels outside of the image are zero."""
+def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, maps, v_pixels, worker):
+    """Copies the gradients of a tile's pixels, and maps, into blocks; those of pixels outside of the image are zero."""
     height, width, colours = v_features.shape
     left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
     if left + TILE > width or top + TILE > height:
@@ -264,12 +266,15 @@ def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixel
                 v_pixels[block, colours, lane] = v_depth[top + y, left + x]
             for modality in range(modalities(layout)):
                 v_pixels[block, channels(layout) + modality, lane] = v_alpha[modality, top + y, left + x]
+            for number in range(map_count(layout)):
+                row = channels(layout) + modalities(layout) + number
+                v_pixels[block, row, lane] = maps[top + y, left + x, number]
 
 
 @inline
 def _start(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
     """Sets a worker's pixels to what they are before the first Gaussian; adds to the background's gradient."""
-    size = channels(layout) + modalities(layout)
+    size = pixel_rows(layout)
     for block in range(BLOCKS):
         final, here = tile * BLOCKS + block, worker * BLOCKS + block
         for modality in range(modalities(layout)):
@@ -306,8 +311,8 @@ def _clear_slot(slots, slot):
 def _composite_tile_backward(
     layout, tile, tiles_x, records, instances, begin, end, centres, v_pixels, worker, state, slots
 ):  # fmt: skip
-    """Fills the gradient slots of instances ``begin`` to ``end`` of a tile."""
-    size = channels(layout) + modalities(layout)
+    """Fills the gradient slots of instances ``begin`` to ``end`` of a tile; rows of a pixel and columns have one order."""
+    size = pixel_rows(layout)
     sums = registers(slot_columns(layout))
     weights, along = registers(modalities(layout)), registers(modalities(layout))
     for instance in range(begin, end):
@@ -363,13 +368,18 @@ def _composite_tile_backward(
                 column = OPACITY_GRADIENTS + modalities(layout) + channel
                 v_pixel = load_vector(v_pixels, here * size + channel)
                 sums[column] = sums[column] + weights[modality_of(layout, channel)] * v_pixel
+            for number in range(map_count(layout)):
+                row = channels(layout) + modalities(layout) + number
+                sums[OPACITY_GRADIENTS + row] = sums[OPACITY_GRADIENTS + row] + weights[0] * load_vector(
+                    v_pixels, here * size + row
+                )
         _write_slot(layout, slots, slot, sums)
 
 
 @inline
 def _composite_tiles_backward(
     worker, layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+    v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background,
 ):  # fmt: skip
     """``composite_backward`` in tiles, as long as there are any."""
     tiles_x = (v_features.shape[1] + TILE - 1) // TILE
@@ -377,7 +387,7 @@ def _composite_tiles_backward(
     while tile < tile_ends.shape[0]:
         for channel in range(v_features.shape[2]):
             v_background[tile, channel] = 0.0
-        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
+        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, maps, v_pixels, worker)
         _start(layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background)
         _composite_tile_backward(
             layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
@@ -391,19 +401,20 @@ def _composite_tiles_backward(
 @kernel
 def composite_backward(
     layout, workers, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+    v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background,
 ):  # fmt: skip
     """Fills the gradient slots of all instances.
 
     Args:
         records ... image: as ``composite`` left them.
         v_features, v_alpha, v_depth: [H, W, C], [M, H, W], and [H, W] where the last channel is depth, else [0, 0].
-        v_pixels, state: scratch [workers * BLOCKS, channels + modalities, LANES] and [.., 2 * modalities, LANES].
+        maps: [H, W, S], S that of the layout.
+        v_pixels, state: scratch [workers * BLOCKS, channels + modalities + S, LANES] and [.., 2 * modalities, LANES].
         slots: out [instances, slot_size], columns as in ``constants``.
         v_background: out [tiles, C], the gradient of the background tile by tile.
     """
     parallel_for(
         _composite_tiles_backward, workers,
         (layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-         v_features, v_alpha, v_depth, v_pixels, state, slots, v_background),
+         v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background),
     )  # fmt: skip

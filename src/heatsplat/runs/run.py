@@ -30,7 +30,7 @@ from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.module import SplatTraining
-from heatsplat.training.session import fit, prepare_machine, restore
+from heatsplat.training.session import fit, prepare_machine, restore, without_idle_hooks
 
 log = logging.getLogger("heatsplat")
 
@@ -101,7 +101,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
 
 def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
     """The training module that a configuration describes, which takes it into its checkpoints."""
-    module = build(config["module"], output_dir=str(output_dir))
+    module = without_idle_hooks(build(config["module"], output_dir=str(output_dir)))
     module.config = config  # set, not passed: Hydra would build every part in it once more
     return module
 
@@ -120,7 +120,7 @@ def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]
     for settings in on.values():
         if "dirpath" in settings:
             settings["dirpath"] = str(output_dir / settings["dirpath"])
-    return list(build(on).values())
+    return [without_idle_hooks(callback) for callback in build(on).values()]
 
 
 @dataclass(frozen=True)

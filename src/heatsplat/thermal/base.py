@@ -83,7 +83,9 @@ class PerGaussian:
         lr: learning rate.
         l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled
             weight decay of 2 * l2 is exactly its gradient).
-        l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them.
+        l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them; and ``group`` by its
+            root, which makes that one a root mean square.
+        group: weight of the penalty Σ_k √(Σ_i x_ik²) over the columns k of the last dimension; inside the optimiser, too.
         lr_end: factor on lr at the last step of the run, log-linear in between.
         paced: whether it learns faster in shorter runs (``Optimisation.length_power``). Not what many numbers make up
             together, such as the gains of a series or the input of a network: their steps add up.
@@ -95,6 +97,7 @@ class PerGaussian:
     l2_mean: bool = False
     lr_end: float = 1.0
     paced: bool = True
+    group: float = 0.0
 
 
 def surface_normals(seeds: Seeds) -> dict[str, PerGaussian]:

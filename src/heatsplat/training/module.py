@@ -16,6 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
@@ -25,7 +26,7 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
 from heatsplat.training.normals import Normals
-from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -120,6 +121,13 @@ class SplatTraining(pl.LightningModule):
         self._pixels = 0  # of the last image
         self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     # Set-up ------------------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
@@ -173,8 +181,8 @@ class SplatTraining(pl.LightningModule):
                 "name": name,
                 "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
-                "weight_decay": self._penalty(item),
             }
+            | penalties(item, len(self.splats))
             for name, item in self._declared.items()
         ]
         for name, parameter in self.thermal.named_parameters():
@@ -296,7 +304,8 @@ class SplatTraining(pl.LightningModule):
         self._rendered = (output, camera)
         loss = sum(terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            target = resampled(inputs.target, camera.height, camera.width, "area")
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
@@ -341,7 +350,7 @@ class SplatTraining(pl.LightningModule):
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
-                    group["weight_decay"] = self._penalty(self._declared[group["name"]])
+                    group |= penalties(self._declared[group["name"]], len(self.splats))
 
     @torch.no_grad()
     def _face(self, normals: Tensor) -> None:
@@ -351,10 +360,6 @@ class SplatTraining(pl.LightningModule):
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
         return Cloud(self.splats, optimizer, self._density_state, self.smoothing.kept_opacity)
-
-    def _penalty(self, item: PerGaussian) -> float:
-        """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
-        return 2 * item.l2 / (len(self.splats) if item.l2_mean else 1)
 
     # Evaluation --------------------------------------------------------------------------------------
 
