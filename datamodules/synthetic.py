@@ -125,8 +125,8 @@ class Synthetic(SceneDataModule):
             },
             probes=probes,
             truth=recording.scene.truth,
-            **(_of_the_yard(world, recording) if outdoors else {}),
-            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {}),
+            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {})
+            | (_of_the_yard(world, recording) if outdoors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
 
