@@ -105,7 +105,7 @@ def snapshot(module: Any) -> Snapshot:
 
     def blended(values: Tensor) -> Tensor:
         """Blended values [N] of image values [N, C]."""
-        return module.composite.encode(values, channels)[:, :channels].mean(1)
+        return module.composite.encode(values, channels)[:, :channels].mean(1).nan_to_num()
 
     cameras = [scene.train.frames[i] for i in evenly_spread(len(scene.train), VIEWS)]
     looks = torch.stack([emitted(seen_at(frame, middle)) for frame in cameras])
@@ -132,10 +132,10 @@ def snapshot(module: Any) -> Snapshot:
 
     slope = _slope(blended, to_unit, channels)
     surface = _surface(module, blended, kept) if span is not None else None
-    clipped = surface is not None and _alike(lambda time: surface(time).clamp(0, 1), camera, span, tolerance / slope)
+    clipped = surface is not None and _alike(_inside(surface), camera, span, tolerance / slope)
     sent = surface if clipped else camera
     layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope), clipped=clipped)]
-    if surface is not None and not clipped and not _alike(surface, camera, span, tolerance / slope):
+    if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
         layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
@@ -143,7 +143,7 @@ def snapshot(module: Any) -> Snapshot:
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
     colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
-    attributes = {} if middle is None else module.attributes(seen_at(first, middle))
+    attributes = module.attributes(seen_at(first, middle))
     return Snapshot(
         means[kept].float().cpu(),
         torch.nn.functional.normalize(quats[kept].float(), dim=1).cpu(),
@@ -184,6 +184,11 @@ def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -
     values = torch.linspace(0, 1, TABLE, dtype=torch.float64)
     steps = blended(values[:, None].expand(-1, channels)).diff()
     return to_unit / (TABLE - 1) / steps.min().item()
+
+
+def _inside(values_at: Callable) -> Callable:
+    """A quantity where the image can show it."""
+    return lambda time: values_at(time).clamp(0, 1)
 
 
 def _alike(one: Callable, other: Callable, span: tuple[float, float], tolerance: float) -> bool:
