@@ -1,8 +1,13 @@
-"""Which folders are which packages: src/, and the top-level conf/ and datamodules/ under heatsplat's own name."""
+"""Which folders are which packages: src/, and the top-level conf/, datamodules/ and preparation/ under heatsplat's own name."""
 
 from setuptools import find_namespace_packages, setup
 
-FOLDERS = {"": "src", "heatsplat.conf": "conf", "heatsplat.datamodules": "datamodules"}
+FOLDERS = {
+    "": "src",
+    "heatsplat.conf": "conf",
+    "heatsplat.datamodules": "datamodules",
+    "heatsplat.preparation": "preparation",
+}
 
 
 def packages_of(package: str, folder: str) -> list[str]:

@@ -48,7 +48,12 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         mask_keep: "white" when white pixels count (COLMAP), "black" when they are left out.
         alpha_mask: True to leave out transparent pixels.
         degrade, upsample: how training images lose resolution, and are enlarged again (``heatsplat.datamodules.lowres``).
+
+    Attributes:
+        restarts: first steps of the rounds of a run but the first; the run sets them.
     """
+
+    restarts: Sequence[int] = ()
 
     def __init__(
         self,
@@ -104,8 +109,9 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         _ = self.scene
 
     def train_dataloader(self) -> DataLoader:
-        """One view per step, from the current step of the trainer on, without end."""
-        sampler = StepSampler(len(self.scene.train), self.seed, self.trainer.global_step if self.trainer else 0)
+        """One view per step, from the current step of the trainer on, without end; each round of a run begins a new pass."""
+        step = self.trainer.global_step if self.trainer else 0
+        sampler = StepSampler(len(self.scene.train), self.seed, step, self.restarts)
         return DataLoader(self.scene.train, sampler=sampler, batch_size=None, num_workers=0)
 
     def val_dataloader(self) -> DataLoader:

@@ -17,13 +17,15 @@ from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
+FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
+
 
 class Colmap(SceneDataModule):
     """Images, a sparse model, and as much about temperature and time as there is.
 
     Temperatures come from the first of: 16-bit counts in ``raw``; radiometric JPEGs (FLIR, DJI) among the images;
-    bounds that say what black and white stand for; none. Times come from the first of: a table, a pattern, DJI file
-    names; none.
+    bounds that say what black and white stand for; none. Times come from the first of: a table, a pattern, the frames.csv
+    of a prepared folder, DJI file names; none.
 
     Args:
         images: folder of the thermal images; None for photos alone, those of ``rgb``.
@@ -169,6 +171,10 @@ class Colmap(SceneDataModule):
         if self.time_regex:
             times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
             return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
+        if (path := folder / FRAMES_FILE).is_file():
+            table = times_from_csv(path, "file", "time_s")
+            if all(stem_of(name) in table for name in names):
+                return {name: table[stem_of(name)] for name in names}, path.name
         times = {name: dji_time(name) for name in names}
         if all(t is not None for t in times.values()):
             return times, "DJI file names (whole seconds, the camera's clock)"  # type: ignore[return-value]

@@ -10,7 +10,9 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 TOP = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 SOURCES = ROOT / "build" / "reference"  # as a wheel has them
-PACKAGES = {"heatsplat": ROOT / "src" / "heatsplat", "heatsplat.datamodules": ROOT / "datamodules"}
+PACKAGES = {"heatsplat": ROOT / "src" / "heatsplat"} | {
+    f"heatsplat.{name}": ROOT / name for name in ("datamodules", "preparation")
+}
 
 
 def on_startup(**_: object) -> None:

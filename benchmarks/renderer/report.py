@@ -59,14 +59,14 @@ def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str
             cells = [[_any(row.get(key)) for key in columns] for row in rows]
             lines += [f"## {title}", "", *markdown_table(columns, cells), ""]
     if tables.get("training"):
-        lines += ["## A training step, part by part", "", *_training_table(tables["training"]), ""]
+        lines += ["## A training step, part by part", "", *training_table(tables["training"]), ""]
     return "\n".join(lines)
 
 
-def _training_table(rows: list[Row]) -> list[str]:
+def training_table(rows: list[Row]) -> list[str]:
     """Parts down, runs across; floors in brackets."""
     parts = [key.removesuffix("_ms") for key in rows[0] if key.endswith("_ms") and not key.startswith("floor_")]
-    columns = ["part", *(f"{row['case']}, {row['method']}" for row in rows)]
+    columns = ["part", *(f"{row['case']}, {row['method']}, {row['threads']} thr." for row in rows)]
     body = []
     for part in parts:
         floors = [row[f"floor_{part}_ms"] for row in rows]
@@ -76,6 +76,8 @@ def _training_table(rows: list[Row]) -> list[str]:
         ]
         body.append([part, *cells])
     body.append(["ratio", *(f"{row['ratio']:.2f}" for row in rows)])
+    body.append(["processor, all threads", *(_ms(row["processor"]) for row in rows)])
+    body.append(["ratio of those", *(f"{row['processor_ratio']:.2f}" for row in rows)])
     body.append(["load", *(f"{row['load']:.1f}" for row in rows)])
     return markdown_table(columns, body)
 

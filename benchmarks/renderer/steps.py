@@ -1,25 +1,35 @@
 """Where the time of a training step goes, from the data loader to the optimiser, and how little it could take.
 
-The steps are those of a run: Lightning's loop, the training module, its guards. The scene holds still, because learning
-rates of zero change no time, so every step costs the same. Parts are timed by standing a clock before the kernels
-that they call.
+The steps are those of a run: Lightning's loop, the training module, the callbacks. The scene holds still, because learning
+rates of zero change no time, so every step costs the same but for those in which density control looks at pixels. Parts are
+timed by standing a clock before the kernels that they call.
 """
 
 from __future__ import annotations
 
-import copy
+import logging
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from torch.utils.data import DataLoader
 
+from benchmarks.renderer.clocks import set_threads
+from benchmarks.renderer.floors import Machine, Work, step_floors
+from benchmarks.renderer.peers import backend
+from benchmarks.renderer.scenes import Case, build
+from heatsplat.composition import compose
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
-from heatsplat.kernels import binning, compositing, projection, relaxation, ssim
+from heatsplat.kernels import adam, binning, compositing, projection, relaxation, ssim
+from heatsplat.runs.run import build_module, build_trainer
+
+log = logging.getLogger("heatsplat")
 
 VIEWS = 60  # enough moments for 24 harmonics
 TURN = 0.002  # radians between neighbouring views, so that no view is the one before
@@ -33,10 +43,16 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "backward": [(compositing, "composite_backward")],
     "gradients": [(projection, "project_backward")],
     "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
-    "optimiser": [(torch, "_fused_adam_")],
+    "optimiser": [(adam, "square_columns"), (adam, "step")],
 }
 # What the module does in a step, its kernels included; the rest of a step is Lightning's.
 MODULE = ("training_step", "backward", "on_after_backward")
+# Of every run: rates of zero, as many Gaussians as there are, nothing beside training.
+STILL = (
+    "optim.means=0", "optim.log_scales=0", "optim.quats=0", "optim.opacity_logits=0", "density.multiple=1",
+    "density.remove_at=[]", "density.prune_opacity=0", "test=false", "logger=none", "trainer.limit_val_batches=0",
+    "callbacks.checkpoint=null", "callbacks.checkpoint_end=null", "callbacks.report=null", "callbacks.progress.enabled=false",
+)  # fmt: skip
 WARM_UP = 5  # steps in which kernels are compiled and memory is found
 
 
@@ -93,7 +109,7 @@ class StepClock:
         def timed(*arguments: Any, **options: Any) -> Any:
             start = time.perf_counter()
             if part == "module.training_step":
-                self.steps.append({"start": start})
+                self.steps.append({"start": start, "processor": time.process_time()})
             try:
                 return function(*arguments, **options)
             finally:
@@ -120,35 +136,102 @@ class StepClock:
         quick = steps[: max(1, len(steps) // 4)]
         return {name: 1e3 * sum(parts[name] for parts in quick) / len(quick) for name in quick[0]}
 
+    def processor(self) -> float:
+        """Milliseconds that all threads together took of the processor for a step, mean over the quickest quarter."""
+        starts = [step["processor"] for step in self.steps[WARM_UP:]]
+        took = sorted(after - before for before, after in zip(starts, starts[1:], strict=False))
+        quick = took[: max(1, len(took) // 4)]
+        return 1e3 * sum(quick) / len(quick)
+
 
 @dataclass(frozen=True)
 class Steps:
-    """What training steps took (``StepClock.milliseconds``), and what they had to do besides rendering."""
+    """What training steps took (``StepClock``), and what they had to do besides rendering."""
 
     milliseconds: dict[str, float]
+    processor: float
     frequencies: int
     parameters: int
 
 
-def time_steps(module: Callable[[], Any], trainer: Callable[..., Any], scene: dict[str, Any], steps: int) -> Steps:
+def time_steps(overrides: Sequence[str], scene: dict[str, Any], steps: int, output_dir: Path) -> Steps:
     """What a training step takes, and its parts.
 
     Args:
-        module: makes the training module, with learning rates of zero.
-        trainer: makes the trainer; takes ``max_steps``.
+        overrides: of a run, whose training module, trainer and callbacks are those of the command line.
         scene: Gaussians and camera, as ``scenes.build`` gives them.
         steps: how many are timed, besides those that warm up.
+        output_dir: folder for what a run writes.
     """
-    module = copy.deepcopy(module)()  # its parts would otherwise be shared with the next one
-    views = still_scene(scene)
+    config = compose([*STILL, f"max_steps={steps + WARM_UP + 1}", *overrides])
+    module, views = build_module(config, output_dir), still_scene(scene)
     module.attach(views)
     with torch.no_grad():
         module.splats["means"].copy_(scene["means"])
         module.splats["log_scales"].copy_(scene["scales"].log())
         module.splats["quats"].copy_(scene["quats"])
         module.splats["opacity_logits"].copy_(scene["opacities"].reshape(-1, len(scene["means"])).T.logit())
+    trainer = build_trainer(config["trainer"], config, output_dir)
     with StepClock(module) as clock:
-        loader = DataLoader(views.train, batch_size=None, num_workers=0)
-        trainer(max_steps=steps + WARM_UP + 1).fit(module, train_dataloaders=loader)
+        trainer.fit(module, train_dataloaders=DataLoader(views.train, batch_size=None, num_workers=0))
     frequencies = module.splats["source_gains"].shape[2] if "source_gains" in module.splats else 0
-    return Steps(clock.milliseconds(), frequencies, sum(parameter.numel() for parameter in module.parameters()))
+    return Steps(
+        clock.milliseconds(),
+        clock.processor(),
+        frequencies,
+        sum(parameter.numel() for parameter in module.parameters()),
+    )
+
+
+def work_of(case: Case) -> Work:
+    """What rendering a case takes."""
+    scene, _ = build(case)
+    scene["means"].requires_grad_()
+    names = ("means", "quats", "scales", "opacities", "features")
+    return Work.of(backend("cpu")(**{name: scene[name] for name in names}, **scene["camera"]))
+
+
+def training_rows(
+    machine: Machine,
+    threads: int,
+    cases: Sequence[Sequence[int]],
+    steps: int,
+    rounds: int,
+    methods: dict[str, Sequence[str]],
+    output_dir: Path,
+) -> list[dict[str, Any]]:
+    """Whole training steps through Lightning, part by part; methods take turns.
+
+    Args:
+        machine: rates of ``threads`` threads.
+        threads: of kernels and of torch.
+        cases: [N, width, height].
+        steps: how many are timed in each round.
+        rounds: how often methods take turns; the quickest round counts.
+        methods: name -> overrides of a run; the first is what others are compared with.
+        output_dir: folder for what runs write.
+    """
+    set_threads(threads)
+    rows = []
+    for n, w, h in cases:
+        case = Case(n, w, h, threads=threads)
+        scene, _ = build(case)
+        runs: dict[str, list[Steps]] = {name: [] for name in methods}
+        for _ in range(rounds):
+            for name, overrides in methods.items():
+                runs[name].append(time_steps([*overrides, f"cap_max={n}"], scene, steps, output_dir))
+        work, baseline = work_of(case), {}
+        for name, results in runs.items():
+            best = min(results, key=lambda result: result.milliseconds["step"])
+            found = {"wall": best.milliseconds["step"], "processor": min(result.processor for result in results)}
+            baseline = baseline or found
+            floors = step_floors(work, machine, best.frequencies, best.parameters)
+            row = {"case": case.name, "method": name, "threads": threads}
+            row |= {"ratio": found["wall"] / baseline["wall"], "processor": found["processor"]}
+            row |= {"processor_ratio": found["processor"] / baseline["processor"]}
+            row |= {f"{part}_ms": value for part, value in best.milliseconds.items()}
+            row |= {f"floor_{part}_ms": floors.get(part) for part in best.milliseconds}
+            row["floor_step_ms"] = sum(floors.values())
+            rows.append(row | {"load": os.getloadavg()[0]})
+            log.info("%s, %s, %d thread(s): %.1f ms a step", case.name, name, threads, row["step_ms"])
+    return rows

@@ -15,17 +15,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from benchmarks.renderer import peers as other
-from benchmarks.renderer.floors import Machine, Work, step_floors
+from benchmarks.renderer.clocks import interleaved, set_threads
+from benchmarks.renderer.floors import Machine
 from benchmarks.renderer.memory import megabytes_above_parameters
 from benchmarks.renderer.report import write
 from benchmarks.renderer.scenes import Case, build
-from benchmarks.renderer.steps import time_steps
+from benchmarks.renderer.steps import training_rows, work_of
 from heatsplat.kernels.peak import memory_rate, vector_rate
-from heatsplat.kernels.scheduling import use_threads
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.photometric import Photometric
 
@@ -61,7 +60,7 @@ def run(
             returning the image, such as a binding to a built peer. gsplat joins by itself where there is a GPU.
         peer_cases: where ``peers`` run, with C = 3.
         garden: file of real points (npz with means3d, viewmats, Ks, width, height), or None; left out where it is not.
-        training: what ``_training`` takes, or None to leave training steps out.
+        training: what ``steps.training_rows`` takes beside machine, threads and folder, or None to leave training steps out.
         memory: [N, width, height] at which memory is measured in a process of its own, or None.
     """
     output_dir = Path(output_dir)
@@ -83,7 +82,7 @@ def run(
         case = Case(*memory, threads=most)
         tables["memory"] = [{"case": case.name, "megabytes": megabytes_above_parameters(case)}]
     if training is not None:
-        tables["training"] = _training(machines[most], threads=most, **training)
+        tables["training"] = training_rows(machines[most], most, **training, output_dir=output_dir)
     write(tables, output_dir, machines)
     log.info("the study took %.0f s", time.perf_counter() - begin)
     return tables
@@ -97,20 +96,6 @@ def _middle(counts: Sequence[int], sizes: Sequence[Sequence[int]], threads: int)
 # ---- clocks ----
 
 
-def _set_threads(count: int) -> None:
-    use_threads(count)
-    torch.set_num_threads(count)
-
-
-def _interleaved(runs: dict[str, Callable[[], Sequence[float]]], rounds: int) -> dict[str, np.ndarray]:
-    """Milliseconds [rounds, ...] of each run, taken in turns; a first round, which compiles, does not count."""
-    times: dict[str, list] = {name: [] for name in runs}
-    for _ in range(rounds + 1):
-        for name, timed in runs.items():
-            times[name].append(timed())
-    return {name: 1e3 * np.array(values[1:]) for name, values in times.items()}
-
-
 def _best_of(times: int, timed: Callable[[], tuple[float, float]]) -> Callable[[], tuple[float, float]]:
     """A function that runs another some times and returns the quickest: short runs are disturbed as a whole."""
     return lambda: min((timed() for _ in range(times)), key=sum)
@@ -121,7 +106,7 @@ def _pass(renderer: other.Renderer, case: Case) -> Callable[[], tuple[float, flo
     scene, weights = build(case)
 
     def timed() -> tuple[float, float]:
-        _set_threads(case.threads)
+        set_threads(case.threads)
         names = ("means", "quats", "scales", "opacities", "features")
         leaves = {name: scene[name].clone().requires_grad_() for name in names}
         start = time.perf_counter()
@@ -137,19 +122,12 @@ def _pass(renderer: other.Renderer, case: Case) -> Callable[[], tuple[float, flo
     return timed
 
 
-def _work(case: Case) -> Work:
-    scene, _ = build(case)
-    scene["means"].requires_grad_()
-    names = ("means", "quats", "scales", "opacities", "features")
-    return Work.of(other.backend("cpu")(**{name: scene[name] for name in names}, **scene["camera"]))
-
-
 # ---- tables ----
 
 
 def _renderer_row(case: Case, rounds: int, machines: dict[int, Machine]) -> Row:
-    forward, backward = _interleaved({"": _pass(other.backend("cpu"), case)}, rounds)[""].min(0)
-    work = _work(case)
+    forward, backward = interleaved({"": _pass(other.backend("cpu"), case)}, rounds)[""].min(0)
+    work = work_of(case)
     floors = work.floors(machines[case.threads])
     floor_forward = floors["projection"] + floors["binning"] + floors["forward"]
     floor_backward = floors["backward"] + floors["gradients"]
@@ -176,7 +154,7 @@ def _modality_rows(middle: Case, modalities: Sequence[int], rounds: int, machine
     rows = []
     for count in (m for m in modalities if m > 1):
         cases = {f"M={m}": replace(middle, channels=count, modalities=m) for m in (1, count)}
-        times = _interleaved({name: _pass(other.backend("cpu"), case) for name, case in cases.items()}, rounds)
+        times = interleaved({name: _pass(other.backend("cpu"), case) for name, case in cases.items()}, rounds)
         one, several = (values.sum(1) for values in times.values())
         rows.append(
             {
@@ -209,7 +187,7 @@ def _peer_rows(
             runs = {name: _pass(renderer, case)}
             for t in sorted(threads):
                 runs[f"{t} thread(s)"] = _best_of(5, _pass(other.backend("cpu"), replace(case, threads=t)))
-            times = {key: values.sum(1) for key, values in _interleaved(runs, rounds).items()}
+            times = {key: values.sum(1) for key, values in interleaved(runs, rounds).items()}
             peer = times.pop(name)
             row = {"case": case.name, "peer": name, "peer_ms": peer.min()}
             for key, own in times.items():
@@ -230,7 +208,7 @@ def _loss_row(width: int, height: int, channels: int, threads: int, rounds: int)
 
     def timed(loss: Callable) -> Callable[[], tuple[float]]:
         def once() -> tuple[float]:
-            _set_threads(threads)
+            set_threads(threads)
             image = prediction.clone().requires_grad_()
             start = time.perf_counter()
             loss(image, target).backward()
@@ -239,50 +217,8 @@ def _loss_row(width: int, height: int, channels: int, threads: int, rounds: int)
         return once
 
     losses = {"fused": fused, "full window": other.full_window_loss, "separable": other.separable_loss}
-    times = _interleaved({name: timed(loss) for name, loss in losses.items()}, rounds)
+    times = interleaved({name: timed(loss) for name, loss in losses.items()}, rounds)
     row = {"case": f"{width}x{height}, C={channels}", "fused_ms": times["fused"].min()}
     for name in ("full window", "separable"):
         row |= {f"{name}, ms": times[name].min(), f"{name}, ratio": times[name].min() / times["fused"].min()}
     return row | {"load": os.getloadavg()[0]}
-
-
-def _training(
-    machine: Machine,
-    threads: int,
-    cases: Sequence[Sequence[int]],
-    steps: int,
-    rounds: int,
-    trainer: Callable[..., Any],
-    methods: dict[str, Callable[[], Any]],
-) -> list[Row]:
-    """Whole training steps through Lightning, part by part; methods take turns.
-
-    Args:
-        cases: [N, width, height].
-        steps: how many are timed in each round.
-        rounds: how often methods take turns; the quickest round counts.
-        trainer, methods: make the trainer, and the training module of each method; the first is what others are
-            compared with.
-    """
-    rows = []
-    for n, w, h in cases:
-        _set_threads(threads)
-        case = Case(n, w, h, threads=threads)
-        scene, _ = build(case)
-        runs: dict[str, list] = {name: [] for name in methods}
-        for _ in range(rounds):
-            for name, method in methods.items():
-                runs[name].append(time_steps(method, trainer, scene, steps))
-        work = _work(case)
-        baseline = None
-        for name, results in runs.items():
-            best = min(results, key=lambda result: result.milliseconds["step"])
-            baseline = baseline or best.milliseconds["step"]
-            floors = step_floors(work, machine, best.frequencies, best.parameters)
-            row = {"case": case.name, "method": name, "ratio": best.milliseconds["step"] / baseline}
-            row |= {f"{part}_ms": value for part, value in best.milliseconds.items()}
-            row |= {f"floor_{part}_ms": floors.get(part) for part in best.milliseconds}
-            row["floor_step_ms"] = sum(floors.values())
-            rows.append(row | {"load": os.getloadavg()[0]})
-            log.info("%s, %s: %.1f ms a step", case.name, name, row["step_ms"])
-    return rows

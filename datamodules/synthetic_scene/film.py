@@ -15,6 +15,7 @@ from torch import Tensor
 
 from heatsplat.contracts import ThermalRange
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.synthetic_scene.presets import Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.training.rng import generator_for
 
@@ -78,7 +79,7 @@ class Recording:
     def shows(self, frame: int, surface: str) -> np.ndarray:
         """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
         number = [one.name for one in self.scene.preset.surfaces].index(surface)
-        rays = pixel_rays(self.lens, _pixel_centres(self.lens))
+        rays = pixel_rays(self.lens, pixel_centres(self.lens))
         _, which = hits(self.scene, torch.from_numpy(self.viewmats[frame]), rays)
         return (which == number).reshape(self.lens.height, self.lens.width).numpy()
 
@@ -108,8 +109,8 @@ def film(
         pixel_aspect: fy / fx.
     """
     lens = _lens(size, distortion, pixel_aspect)
-    times, viewmats = (scene.route or partial(_by_hand, scene.preset.duration_s))(size.frames, seed)
-    rays = pixel_rays(lens, _pixel_centres(lens))
+    times, viewmats = (scene.route or partial(_by_hand, scene.preset))(size.frames, seed)
+    rays = pixel_rays(lens, pixel_centres(lens))
     celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
     lows, highs = np.empty(size.frames), np.empty(size.frames)
@@ -181,9 +182,9 @@ def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
     )
 
 
-def _by_hand(duration_s: float, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-    times = frame_times(frames, duration_s, seed)
-    return times, camera_path(times, duration_s, seed)
+def _by_hand(preset: Preset, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
+    times = frame_times(frames, preset.duration_s, seed)
+    return times, camera_path(times, preset.duration_s, seed, preset.approach_m)
 
 
 def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
@@ -194,7 +195,7 @@ def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
     return np.round(_FIRST_FRAME_S + moments**_HASTE * (duration_s - _FIRST_FRAME_S), 3)
 
 
-def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
+def camera_path(times_s: np.ndarray, duration_s: float, seed: int, approach_m: float = 0.15) -> Tensor:
     """World-to-camera matrices [F, 4, 4] of a hand that sweeps to and fro before the objects.
 
     Every direction is visited several times during the record, so that a view does not tell the time.
@@ -208,7 +209,7 @@ def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
 
     azimuth = torch.deg2rad(33.0 * sway(5.3) + 2.0 * sway(23.0))
     elevation = torch.deg2rad(26.0 + 9.0 * sway(3.4) + 1.5 * sway(19.0))
-    radius = 2.2 + 0.15 * sway(2.3)
+    radius = 2.2 + approach_m * sway(2.3)
     roll = torch.deg2rad(2.0 * sway(11.0))
     aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.05 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
     flat = radius * torch.cos(elevation)
@@ -228,7 +229,7 @@ def camera_path(times_s: np.ndarray, duration_s: float, seed: int) -> Tensor:
     return viewmats
 
 
-def _pixel_centres(lens: Lens) -> Tensor:
+def pixel_centres(lens: Lens) -> Tensor:
     """Pixel positions [H * W, 2] (x, y), row by row."""
     y, x = torch.meshgrid(
         torch.arange(lens.height, dtype=torch.float64), torch.arange(lens.width, dtype=torch.float64), indexing="ij"
@@ -268,16 +269,14 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         time_s: seconds from the start of the record.
     """
     when = torch.tensor([time_s], dtype=torch.float64)
-    haze, gloss = scene.preset.haze, scene.preset.gloss
+    haze = scene.preset.haze
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
         color = scene.visible(points, which, directions @ viewmat[:3, :3])
         celsius = scene.celsius(scene.heat_at(points, which), when)[:, 0]
-        if gloss:
-            outwards = -torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
-            ambient = scene.preset.ambient_c
-            celsius = ambient + gloss.apparent(celsius - ambient, outwards, scene.normals(points, which))
+        sight = torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
+        celsius = scene.apparent(celsius, points, which, sight, time_s)
         if haze:
             distance = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
             ambient = scene.preset.ambient_c
@@ -291,7 +290,7 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
     edges = (((image - around).abs() > _EDGE_K).reshape(-1) | clear).nonzero()[:, 0]  # behind glass, heat has none
     third = torch.tensor([-1 / 3, 0.0, 1 / 3], dtype=torch.float64)
     within = torch.cartesian_prod(third, third)
-    fine_celsius, fine_color, _ = look(pixel_rays(lens, (_pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
+    fine_celsius, fine_color, _ = look(pixel_rays(lens, (pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
     celsius[edges] = fine_celsius.reshape(-1, len(within)).mean(1)
     color[edges] = fine_color.reshape(-1, len(within), 3).mean(1)
     return celsius.reshape(lens.height, lens.width), color.reshape(lens.height, lens.width, 3)
@@ -304,7 +303,7 @@ def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Ten
 
 
 def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, millimetres off their surface.
+    """Points [P, 3] and colours [P, 3] such as structure from motion finds: seen in frames, a little off their surface.
 
     Where light passes a surface, every other point is one that thermal images show and the next lies behind it.
     """
@@ -320,7 +319,8 @@ def sparse_points(scene: Scene, lens: Lens, viewmats: Tensor, count: int, seed: 
         passing = here & (scene.transmits[which] > 0) & odd
         if passing.any():
             points[passing], which[passing] = scene.beyond(points[passing], rays[passing] @ viewmats[frame][:3, :3])
-    found = which >= 0
+    bare = [i for i, one in enumerate(scene.preset.surfaces) if one.name in scene.preset.bare]
+    found = (which >= 0) & ~torch.isin(which, torch.tensor(bare, dtype=which.dtype))
     colors = scene.color(points, which)[found]
-    noise = scene.point_noise_m * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    noise = scene.preset.point_noise_m * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     return (points + noise)[found], colors

@@ -73,11 +73,13 @@ class Gloss:
 
 @dataclass(frozen=True)
 class CameraFlaws:
-    """Flaws of an uncooled camera: y = C(s_f [P(x) (1 + G) + B] exp(a2 r² + a4 r⁴) + o_f) of image values x.
+    """Flaws of an uncooled camera: y = C(A_f(s_f [P(x) (1 + G) + B] exp(a2 r² + a4 r⁴) + o_f)) of image values x.
 
     P is a Gaussian blur. G and B are smooth fields (a grid of random nodes, enlarged bicubically) plus a column pattern, r
-    is 0 in the middle and 1 in the corners. s_f, the gain, steps where the camera's shutter closes; o_f, the offset, walks
-    at random in between and starts anew there. C(y) = y + c y (1 - y) is the tone curve.
+    is 0 in the middle and 1 in the corners. s_f, the gain, steps where the camera's shutter closes; gain and offset o_f
+    walk at random in between and start anew there. A_f(y) = sigmoid(e^{a_f} logit(y) + b_f) of y within [0, 1] is automatic
+    gain control, which stretches the contrast of every frame otherwise; a_f and b_f sway evenly over the frames.
+    C(y) = y + c y (1 - y) is the tone curve.
 
     Args:
         gain, bias: standard deviation of the nodes of G and of B (image units).
@@ -86,6 +88,8 @@ class CameraFlaws:
         falloff: a2, a4.
         step: standard deviation of s_f - 1 from shutter to shutter.
         frames_per_step: frames between two shutters.
+        gain_drift: standard deviation of what s_f changes by from frame to frame.
+        stretch, shift: largest |a_f| and |b_f|.
         drift: standard deviation of what o_f changes by from frame to frame (image units).
         blur_px: standard deviation of the blur.
         bend: c.
@@ -98,6 +102,9 @@ class CameraFlaws:
     falloff: tuple[float, float] = (-0.12, -0.08)
     step: float = 0.0
     frames_per_step: int = 12
+    gain_drift: float = 0.0
+    stretch: float = 0.0
+    shift: float = 0.0
     drift: float = 0.0
     blur_px: float = 0.0
     bend: float = 0.0
@@ -118,13 +125,25 @@ class CameraFlaws:
         """s_f of every frame, [F] float64."""
         shutters = -(-frames // self.frames_per_step)
         drawn = torch.randn(shutters, generator=generator_for(seed, 1, "camera flaws"), dtype=torch.float64)
-        return 1.0 + self.step * drawn.repeat_interleave(self.frames_per_step)[:frames]
+        steps = 1.0 + self.step * drawn.repeat_interleave(self.frames_per_step)[:frames]
+        return steps + self._walk(self.gain_drift, frames, seed, 3) if self.gain_drift else steps
 
     def offsets(self, frames: int, seed: int) -> Tensor:
         """o_f of every frame, [F] float64; their mean is 0, because a level that all share is nobody's flaw."""
-        drawn = torch.randn(frames, generator=generator_for(seed, 2, "camera flaws"), dtype=torch.float64)
-        walks = torch.cat([part.cumsum(0) for part in (self.drift * drawn).split(self.frames_per_step)])
+        return self._walk(self.drift, frames, seed, 2)
+
+    def _walk(self, change: float, frames: int, seed: int, draw: int) -> Tensor:
+        drawn = torch.randn(frames, generator=generator_for(seed, draw, "camera flaws"), dtype=torch.float64)
+        walks = torch.cat([part.cumsum(0) for part in (change * drawn).split(self.frames_per_step)])
         return walks - walks.mean()
+
+    def stretches(self, frames: int, seed: int) -> Tensor:
+        """a_f and b_f of every frame, [F, 2] float64: sines of 2.3 and 3.7 cycles over the frames."""
+        phases = torch.rand(2, generator=generator_for(seed, 4, "camera flaws"), dtype=torch.float64)
+        share = torch.arange(frames, dtype=torch.float64)[:, None] / frames
+        cycles = torch.tensor([2.3, 3.7], dtype=torch.float64)
+        most = torch.tensor([self.stretch, self.shift], dtype=torch.float64)
+        return most * torch.sin(2.0 * math.pi * (cycles * share + phases))
 
     def blurred(self, images: Tensor) -> Tensor:
         """Images [F, H, W] through the point spread; beyond the border they go on as they end."""
@@ -145,4 +164,7 @@ class CameraFlaws:
         grey = self.steps(len(unit), seed)[:, None, None] * seen
         if self.drift:
             grey = grey + self.offsets(len(unit), seed)[:, None, None]
+        if self.stretch or self.shift:
+            log_stretch, shift = self.stretches(len(unit), seed)[:, :, None, None].unbind(1)
+            grey = torch.sigmoid(log_stretch.exp() * torch.logit(grey.clamp(0.0, 1.0)) + shift)
         return grey + self.bend * grey * (1.0 - grey) if self.bend else grey

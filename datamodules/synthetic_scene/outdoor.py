@@ -162,6 +162,7 @@ class OutdoorPreset(Preset):
     surfaces: tuple[OutdoorSurface, ...] = YARD
     duration_s: float = DURATION_S
     ambient_c: float = 18.0
+    point_noise_m: float = 0.02
     effects: frozenset[str] = frozenset({"relaxation", "solar", "radiation", "convection"})
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
@@ -280,7 +281,6 @@ class OutdoorHeat:
 class OutdoorScene(Scene):
     """A yard whose heat has been solved under a weather; see ``Scene``. Times are seconds from the start of the record."""
 
-    point_noise_m = 0.02
     probe_reach_m = 0.25
 
     def __init__(self, preset: OutdoorPreset) -> None:
@@ -289,6 +289,9 @@ class OutdoorScene(Scene):
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
         self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
+        self.emissivity = torch.ones(
+            len(preset.surfaces) + 1, dtype=torch.float64
+        )  # to the camera, as after correction
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
         self.weather = outdoor_weather(preset.weather)
@@ -366,14 +369,15 @@ class OutdoorScene(Scene):
         return torch.tensor([self.preset.labels.index(surface.label) for surface in self.preset.surfaces])[which]
 
     def route(self, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-        """Times [F] and world-to-camera matrices [F, 4, 4] of a drone: two thirds of the frames on the first day.
+        """Times [F] and world-to-camera matrices [F, 4, 4] of a drone: a third of the frames on the last day.
 
         Successive frames look from directions 137.5° apart, so that every part of a day sees every side.
         """
         first = training_frames(frames)
         jitter = torch.rand(frames, generator=generator_for(seed, 0, "flight times"), dtype=torch.float64).numpy()
-        slot = np.concatenate([np.arange(first) / first, 1.0 + np.arange(frames - first) / (frames - first)])
-        width = np.where(np.arange(frames) < first, 1.0 / first, 1.0 / (frames - first))
+        days = self.preset.duration_s / DAY_S - 1.0  # before the last
+        slot = np.concatenate([days * np.arange(first) / first, days + np.arange(frames - first) / (frames - first)])
+        width = np.where(np.arange(frames) < first, days / first, 1.0 / (frames - first))
         times = np.round(DAY_S * (slot + width * (0.2 + 0.6 * jitter)), 3)
 
         wobble = torch.rand(frames, 4, generator=generator_for(seed, 0, "flight path"), dtype=torch.float64)
@@ -395,7 +399,7 @@ class OutdoorScene(Scene):
 
 
 def training_frames(frames: int) -> int:
-    """How many of a record's frames are taken on the first day: two thirds, and at least one on the second."""
+    """How many of a record's frames are taken before its last day: two thirds, and at least one on that day."""
     return min(frames - frames // 3, frames - 1)
 
 

@@ -76,6 +76,7 @@ class Surface:
         absorbs: absorbed share of the lamp's flux over the surface, in [0, 1]; dark paint in the colour image too.
         color: its colour where it absorbs nothing, in [0, 1].
         transmits: share of visible light that passes straight through, in [0, 1]; heat does not.
+        emissivity: ε in the thermal band, in (0, 1]; below 1 the surface mirrors the rest (``Scene.apparent``).
     """
 
     name: str
@@ -84,6 +85,7 @@ class Surface:
     absorbs: Pattern = Pattern(0.6)
     color: Point = (0.8, 0.8, 0.8)
     transmits: float = 0.0
+    emissivity: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,9 @@ class Preset:
         diffusivity: of heat along the surfaces, in m²/s; exact on flat ones, as if they had no end. 0 for none.
         effects: names of the effects that it shows (``heatsplat.effects.catalogue``), which is what ought to be found.
         sparseness: by what factor its sparse model has fewer points than that of other presets.
+        point_noise_m: how far a sparse point lies off its surface, standard deviation of each coordinate.
+        bare: names of surfaces with too little texture for structure from motion to find a point on.
+        approach_m: how far the camera comes nearer and goes away, from the middle of its path.
     """
 
     start_k: Mapping[str, Pattern] = field(default_factory=dict)
@@ -132,6 +137,9 @@ class Preset:
     haze: Haze | None = None
     flaws: CameraFlaws | None = None
     sparseness: float = 1.0
+    point_noise_m: float = 0.003
+    bare: frozenset[str] = frozenset()
+    approach_m: float = 0.15
     gloss: Gloss | None = None
     diffusivity: float = 0.0
     effects: frozenset[str] = frozenset()
@@ -142,6 +150,8 @@ class Preset:
             raise ValueError(f"preset has two surfaces of one name: {sorted(names)}")
         if unknown := set(self.start_k) - set(names):
             raise ValueError(f"preset starts surfaces that it does not have: {sorted(unknown)}; it has {sorted(names)}")
+        if unknown := self.bare - set(names):
+            raise ValueError(f"preset has no points on surfaces that it does not have: {sorted(unknown)}")
         if self.held and self.lamp is not None:
             raise ValueError("a preset is either held steady or heated by a lamp, not both")
 
@@ -231,6 +241,36 @@ _SHEETS = tuple(
 )
 _SMOOTH = {one.name: Pattern(24.0 + i, 9.0, 0.8 + 0.1 * i) for i, one in enumerate(_SHEETS)}
 
+# Few features: smooth walls and objects, on the objects' tiles of which alone structure from motion finds anything.
+_SMOOTH_WALLS = {name: replace(_WARM[name], step=0.0) for name in ("floor", "wall", "left_wall", "right_wall")}
+
+# Textures finer than the pixels of images of low resolution: tiles of 6 to 10 cm, where a pixel of the demo size at a
+# quarter of its resolution is 5 cm wide.
+_TILED = {
+    name: replace(_WARM[name], step=3.0, tile_m=tile)
+    for name, tile in {"floor": 0.1, "wall": 0.09, "crate": 0.07, "tower": 0.06, "vase": 0.06, "can": 0.06}.items()
+}
+
+# Metals that show other things than themselves, a pane that mirrors a little, and a radiator on the floor before them, below
+# what the camera sees directly. Emissivities as in tables of thermographers: glass 0.85, oxidised steel 0.6, rough
+# aluminium 0.3, polished tin 0.1.
+_EMISSIVITIES = {"tower": 0.3, "can": 0.6, "carton": 0.1}
+_BODIES = (
+    *(replace(one, emissivity=_EMISSIVITIES.get(one.name, 1.0)) for one in TABLE_TOP),
+    replace(PANE, shape=Box((-0.4, -0.75, 0.3), (0.6, 0.012, 0.6)), emissivity=0.85),
+    Surface("radiator", Box((0.1, -1.55, 0.15), (1.4, 0.3, 0.3)), STEEL, Pattern(0.3), (0.95, 0.95, 0.95)),
+)
+
+
+def droplets(grams_per_m3: float) -> float:
+    """Extinction in 1/m of a fog that holds so much liquid water.
+
+    In the middle of the long-wave window, at 11 µm, the efficiency of droplets grows as 0.3 times their size parameter
+    whatever their sizes (Chýlek 1978, J. Atmos. Sci. 35, 296), which gives 3π · 0.3 / (2 · 11 µm) per density of water.
+    """
+    return 3.0 * math.pi * 0.3 / (2.0 * 11e-6 * 1e6) * grams_per_m3
+
+
 # A camera without any flaw, to which presets add theirs.
 _GOOD = CameraFlaws(gain=0.0, bias=0.0, falloff=(0.0, 0.0))
 _DRIFTING = replace(_GOOD, drift=0.008)
@@ -309,6 +349,51 @@ PRESETS: dict[str, Preset] = {
     ),
     "dull": Preset(
         start_k=_WARM, held=True, surfaces=TABLE_TOP, gloss=Gloss(fade=0.4), effects=_shows("view_dependence")
+    ),
+    "weak_texture": Preset(
+        start_k=_WARM | _SMOOTH_WALLS,
+        held=True,
+        surfaces=TABLE_TOP,
+        sparseness=20.0,
+        point_noise_m=0.05,
+        bare=frozenset(_SMOOTH_WALLS),
+    ),
+    "soft_edges": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        haze=Haze(droplets(2.0)),
+        flaws=replace(_GOOD, blur_px=1.2),
+        effects=_shows("attenuation", "point_spread"),
+    ),
+    "fog": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        haze=Haze(droplets(2.0)),
+        approach_m=0.6,
+        effects=_shows("attenuation"),
+    ),
+    "fading": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        flaws=replace(_GOOD, gain_drift=0.02, frames_per_step=1000),
+        effects=_shows("agc"),
+    ),
+    "metals": Preset(
+        start_k=_WARM | {"pane": Pattern(4.0, 2.0, 0.5), "radiator": Pattern(40.0)},
+        held=True,
+        surfaces=_BODIES,
+        effects=_shows("reflection", "thermal_opacity"),
+    ),
+    "fine_texture": Preset(start_k=_WARM | _TILED, held=True, surfaces=TABLE_TOP),
+    "auto_gain": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        flaws=CameraFlaws(stretch=0.3, shift=0.3),
+        effects=_shows("agc", "fixed_pattern", "vignetting"),
     ),
     "sheets": Preset(start_k=_SMOOTH, surfaces=_SHEETS, diffusivity=1.2e-4, effects=_shows("relaxation", "conduction")),
 }

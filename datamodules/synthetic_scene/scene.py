@@ -14,6 +14,8 @@ from heatsplat.contracts import ThermalRange, Weather
 from heatsplat.datamodules.synthetic_scene import heat
 from heatsplat.datamodules.synthetic_scene.presets import Preset, Surface
 from heatsplat.datamodules.synthetic_scene.shapes import dot, nearest_surface, trace
+from heatsplat.physics.planck import Band
+from heatsplat.physics.units import KELVIN_AT_0_C, kelvin
 
 # Where the visible light comes from (unit length), and its share that comes from everywhere.
 _SUN = (-0.398, -0.597, 0.697)
@@ -22,6 +24,8 @@ _SKYLIGHT = 0.4
 _DARKEST = 0.3
 # Rays that leave a surface start this far off it, in metres: above rounding at any size, far below any pixel.
 _OFF_SURFACE_M = 1e-6
+# In which the camera sees: the long-wave window of uncooled detectors.
+_BAND = Band(7.5, 14.0, nodes=12)
 
 
 @dataclass(frozen=True)
@@ -57,14 +61,12 @@ class Scene:
         route: how the camera moves: (frames, seed) -> (times [F], viewmats [F, 4, 4]); None for a hand that sweeps.
         weather: what drives the heat, on the clock of the record, or None indoors; such a scene has ``labels`` too.
         thermal_range: bounds of the camera's images; None for those that its frames need.
-        point_noise_m: how far a sparse point lies off its surface, standard deviation of each coordinate.
         probe_reach_m: how far about a probe its surface should be of one temperature.
     """
 
     route: Callable[[int, int], tuple[np.ndarray, Tensor]] | None = None
     weather: Weather | None = None
     thermal_range: ThermalRange | None = None
-    point_noise_m: float = 0.003
     probe_reach_m: float = 0.04
 
     def __init__(self, preset: Preset) -> None:
@@ -72,6 +74,7 @@ class Scene:
         self.shapes = [surface.shape for surface in preset.surfaces]
         # By number of surface; the last entry is that of -1, no surface.
         self.transmits = torch.tensor([*(surface.transmits for surface in preset.surfaces), 0.0], dtype=torch.float64)
+        self.emissivity = torch.tensor([*(surface.emissivity for surface in preset.surfaces), 1.0], dtype=torch.float64)
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         waveform = preset.lamp.waveform if preset.lamp else heat.CONSTANT
         self.responses = heat.solve(self.materials, waveform, preset.duration_s)
@@ -156,6 +159,49 @@ class Scene:
             start = start + (levelled * surface.waves_k).sum(-1)
         rise = of_point[..., 0] * start + of_point[..., 1] * surface.flux_w_m2
         return self.preset.ambient_c + rise.T
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether a surface is no black body."""
+        return bool((self.emissivity < 1.0).any())
+
+    def apparent(self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float) -> Tensor:
+        """What a camera takes for the temperature [n] of ``celsius`` [n] at points [n, 3] that it sees along ``sight`` [n, 3].
+
+        Args:
+            which: [n] surfaces of the points; where there is none (-1), T is what is seen.
+            sight: [n, 3] unit vectors from the camera, in the world.
+            time_s: seconds from the start of the record.
+        """
+        bright = (self.emissivity[which] < 1.0).nonzero()[:, 0]
+        if len(bright):
+            celsius = celsius.index_put((bright,), self._mirroring(celsius, points, which, sight, time_s, bright))
+        gloss, ambient = self.preset.gloss, self.preset.ambient_c
+        if gloss is None:
+            return celsius
+        return ambient + gloss.apparent(celsius - ambient, -sight, self.normals(points, which))
+
+    def _mirroring(
+        self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float, bright: Tensor
+    ) -> Tensor:
+        """How warm a camera takes the points ``bright`` [m] for, in °C [m]: opaque grey bodies that mirror what they face.
+
+        B(apparent) = ε B(T) + (1 - ε) B(T_m), with the radiance B of black bodies in the camera's band (Planck) and the
+        temperature T_m of what the mirrored ray meets first: a black body there (one mirror is seen, not a mirror in a
+        mirror), or the surroundings at ambient temperature.
+        """
+        on, surface, when = points[bright], which[bright], torch.tensor([time_s], dtype=torch.float64)
+        normals = self.normals(on, surface)
+        mirrored = sight[bright] - 2.0 * dot(sight[bright], normals)[:, None] * normals
+        met, met_surface = self.first_hits(on + _OFF_SURFACE_M * normals, mirrored)
+        facing = self.celsius(self.heat_at(met, met_surface), when)[:, 0]
+        own, others = (_BAND.radiance(kelvin(t)) for t in (celsius[bright], facing))
+        return _BAND.temperature(torch.lerp(others, own, self.emissivity[surface])) - KELVIN_AT_0_C
+
+    def grey_bodies(self, points: Tensor) -> dict[str, Tensor]:
+        """Emissivity and reflectance [n] of the surface nearest to each of ``points`` [n, 3]."""
+        emissivity = self.emissivity[self.nearest(points)[1]]
+        return {"emissivity": emissivity, "reflectance": 1.0 - emissivity}
 
     def how_solved(self) -> str:
         """A sentence about the truth, for reports."""

@@ -81,6 +81,7 @@ EXAMPLES = {
     "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
     "view": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "study": ("study=frontier study.runs=outputs",),
+    "prepare": ("source=/data/flight target=/data/my_scene",),
 }
 
 
@@ -337,3 +338,20 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
     prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)
+
+
+@_command
+@_job
+def prepare(config: dict[str, Any], output_dir: Path) -> None:
+    """Makes a scene that trains of a camera's files, or corrects a trained scene pixel by pixel (correct=scene)."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.training.session import prepare_machine
+
+    if config["check"] is not None:
+        prepare_machine(config["threads"])
+        build(config["examination"], target=None if config["target"] is None else output_dir)
+        return
+    if config["target"] is None or (config["source"] is None and config["correct"] is None):
+        raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
+    prepare_machine(config["threads"])
+    build(config["correct"] or config["preparation"], target=output_dir)

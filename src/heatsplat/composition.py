@@ -34,7 +34,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
 
     Args:
         overrides: as the command line has them.
-        name: of the command: train | evaluate | render | simplify | view | study.
+        name: of the command: train | evaluate | render | simplify | view | study | prepare.
     """
     return plain(composed(overrides, name), overrides)
 
@@ -79,6 +79,11 @@ def run_of(ckpt: str | None) -> str:
     return str(folder.parent if folder.name == "checkpoints" else folder)
 
 
+def prepared_folder(target: str | None) -> str:
+    """Folder of a preparation: its target, or a place for the log of one that has none."""
+    return str(ROOT / "outputs" / "unprepared" if target is None else Path(target).expanduser())
+
+
 def scene_name(data: str, root: str | None, scene: str | None) -> str:
     """Name of the scene in the run's folder: data.scene, else the last folder of data.root, else the data set."""
     name = scene or (Path(root).name if root else None) or data
@@ -108,6 +113,7 @@ def _cores_by(jobs: int) -> int | None:
 OmegaConf.register_new_resolver("checkout", lambda path: CHECKOUT and str(CHECKOUT / path), replace=True)
 OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)
+OmegaConf.register_new_resolver("prepared", prepared_folder, replace=True)
 OmegaConf.register_new_resolver("rate", _rate, replace=True)
 OmegaConf.register_new_resolver("root", lambda path: str(ROOT / path), replace=True)
 OmegaConf.register_new_resolver("run_of", run_of, replace=True)

@@ -8,7 +8,7 @@ import torch
 from omegaconf import OmegaConf
 from running import compose_run
 
-from benchmarks.renderer import peers
+from benchmarks.renderer import fused, peers
 from benchmarks.renderer.floors import Machine, Work
 from benchmarks.renderer.scenes import Case, build
 from heatsplat import cli
@@ -55,6 +55,23 @@ def test_work_counts_what_was_rendered():
     floors = work.floors(Machine(1e9, 1e10))
     assert set(floors) == {"projection", "binning", "forward", "backward", "gradients"}
     assert work.floors(Machine(2e9, 2e10))["forward"] == pytest.approx(floors["forward"] / 2)
+
+
+def test_pairs_of_what_is_fused_run():
+    case = Case(200, 32, 24)
+    for pair in (fused.adam_pair, fused.group_pair, fused.maps_pair):
+        times = {name: timed()[0] for name, timed in pair(case).items()}
+        assert len(times) == 2 and min(times.values()) > 0
+
+
+@pytest.mark.slow
+def test_the_study_of_steps_tells_ratios(tmp_path):
+    overrides = ["study=steps", "study.cases=[[500,64,48]]", "study.steps=8", "study.rounds=1", "study.threads=[1]"]
+    config = compose_run(tmp_path, *overrides, config_name="study")
+    tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
+    assert [row["method"] for row in tables["training"]] == ["3dgs", "etgs"] and tables["training"][0]["ratio"] == 1
+    assert [row["ratio"] > 0 for row in tables["fused"]] == [True] * 3
+    assert "etgs" in (tmp_path / "steps.md").read_text()
 
 
 @pytest.mark.slow

@@ -58,9 +58,11 @@ def tiny(preset: str) -> Synthetic:
     return Synthetic(scene=preset, size="tiny")
 
 
-# Presets whose images show surfaces as warm as they are; the others are in test_flaws.py.
+# Presets whose images show surfaces as warm as they are; the others are in test_flaws.py and test_phenomena.py.
 SEEN_AS_THEY_ARE = [
-    name for name, preset in PRESETS.items() if not preset.haze and not preset.flaws and not preset.gloss
+    name
+    for name, preset in PRESETS.items()
+    if not (preset.haze or preset.flaws or preset.gloss or any(one.emissivity < 1 for one in preset.surfaces))
 ]
 
 

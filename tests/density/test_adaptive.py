@@ -54,8 +54,9 @@ def test_transparent_are_pruned_and_too_large_after_the_first_reset():
     assert len(cloud) == 1
 
 
-def test_the_cap_holds_and_the_strongest_grow_first():
-    policy = Adaptive(start=0, stop=100, every=10, cap_max=5)
+@pytest.mark.parametrize("limit", [{"cap_max": 5}, {"multiple": 1.25}, {"cap_max": 5, "multiple": 3}])
+def test_the_cap_holds_and_the_strongest_grow_first(limit):
+    policy = Adaptive(start=0, stop=100, every=10, **limit)
     cloud = make_cloud(policy, [0.001] * 4, [0.5] * 4)
     pull(cloud, [1e-3, 5e-3, 2e-3, 3e-3])
     refine(policy, cloud, 9)
@@ -96,6 +97,8 @@ def test_without_resets_opacities_and_large_gaussians_stay():
     assert len(cloud) == 2 and cloud.splats.opacities[0].tolist() == pytest.approx([0.9, 0.9])
     with pytest.raises(ValueError, match="reset_every and cap_max must be at least 1"):
         Adaptive(reset_every=0)
+    with pytest.raises(ValueError, match="density.multiple must be above 0"):
+        Adaptive(multiple=0)
 
 
 def test_nothing_before_start_between_refinements_or_after_stop():

@@ -142,7 +142,7 @@ def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_ev
     policy.prepare(noisy_scene(0.0, 1), "thermal")
     assert [policy.maps_at(step) for step in range(11)] == [0] * 7 + [3] * 3 + [0]
     assert policy.maps_at(100) == 0
-    maps = policy.pixel_maps(torch.tensor([[0.2, 0.5]]), 7)
+    maps = policy.pixel_maps(torch.tensor([[0.2, 0.5]]), torch.zeros(1, 2, 1), 7)
     torch.testing.assert_close(maps, torch.tensor([[[1.0, 0.0, 0.0], [1.0, 1.0, 0.2]]]))
     cloud = make_cloud(policy, 2)
     for step in (7, 8):
@@ -158,6 +158,18 @@ def test_gaussians_wrong_on_few_pixels_are_not_split():
     blame(cloud, [1.0, 1.0, 1.0])
     cloud.state["wrong"] = torch.tensor([2.9, 4.9, 5.1])  # of 200 pixels each: 3 + 1 %
     assert refine(policy, cloud, 9).added == 1
+
+
+def test_edge_scores_by_what_training_images_show_and_not_by_errors():
+    policy = budget(start=0, stop=100, every=10, views=3, score="edge", noise=0.1, remove_at=())
+    columns = torch.arange(40.0)
+    step_at_20, error = (columns >= 20).double().expand(30, 40), torch.zeros(30, 40)
+    weight, wrong, edge = policy.pixel_maps(error, step_at_20[..., None].expand(-1, -1, 3), 9).unbind(-1)
+    # of a step blurred by s: the slope is a Gaussian, and its own slope at a distance x is -x / s^2 of it
+    x = (columns - 19.5).double()
+    expected = (x / 1.5**2 * torch.exp(-(x**2) / (2 * 1.5**2)) / (1.5 * (2 * torch.pi) ** 0.5)).abs()
+    torch.testing.assert_close(edge.double(), expected.expand(30, 40), atol=0.005, rtol=0)
+    assert weight.all() and not wrong.any() and edge.dtype == error.dtype
 
 
 def test_absgrad_scores_by_the_pull_on_screen_positions():
@@ -201,7 +213,7 @@ def selected(policy: Budget, noise: float) -> float:
             backend="cpu", depth=False, maps=3,
         )  # fmt: skip
         error = (noise * torch.randn(height, width, generator=generator)).abs()
-        (output.weighted.image * policy.pixel_maps(error, step)).sum().backward()
+        (output.weighted.image * policy.pixel_maps(error, error[..., None], step)).sum().backward()
         policy.observe(cloud.state, output, CAMERA, step)
     return refine(policy, cloud, policy.every - 1).added / count
 
@@ -307,7 +319,9 @@ def share_of_new_on_the_right(policy, steps: int, noise: float) -> float:
         error = (output.features - target).abs()
         loss = error.mean()
         if output.weighted is not None:
-            loss = loss + (output.weighted.image * policy.pixel_maps(error.detach()[..., 0], step)).sum()
+            loss = (
+                loss + (output.weighted.image * policy.pixel_maps(error.detach()[..., 0], error.detach(), step)).sum()
+            )
         optimizer.zero_grad()
         loss.backward()
         policy.observe(cloud.state, output, camera, step)

@@ -48,7 +48,7 @@ def look(policy: MultiviewGate, cloud: Cloud, target: torch.Tensor, step: int, p
     error = (output.features[..., 0] - target).abs()
     loss = error.sum()
     if maps:
-        loss = loss + (output.weighted.image * policy.pixel_maps(error.detach(), step)).sum()
+        loss = loss + (output.weighted.image * policy.pixel_maps(error.detach(), target[..., None], step)).sum()
     loss.backward()
     policy.observe(cloud.state, output, CAMERA, step)
 

@@ -78,6 +78,21 @@ def test_a_run_that_sums_gradients_of_views_moves_at_every_second_step_and_resum
     assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
 
 
+def test_a_whole_pass_of_the_views_is_judged_in_every_round(tmp_path, monkeypatch):
+    judged = []
+    step_of = SplatTraining.training_step
+
+    def training_step(self, view, batch_idx):
+        if self.global_step >= 7 and self.density.maps_at(self.schedule.round_step(self.global_step)) == 1:
+            judged.append(view.frame.name)
+        return step_of(self, view, batch_idx)
+
+    monkeypatch.setattr(SplatTraining, "training_step", training_step)
+    given = overrides("budget", "method=etgs", "stages=fine_tuning", "+first_steps=7", "density.remove_at=[1]")
+    module, _ = run(tmp_path, *given, "density.start=30", "max_steps=42")
+    assert len(judged) == len(set(judged)) == len(module.scene.train)
+
+
 PAIRS = [  # every method under one of the rules; under the others where there is time
     pytest.param(rule, method, marks=() if i % len(RULES) == j else pytest.mark.slow)
     for i, method in enumerate(ALL_METHODS)

@@ -23,7 +23,7 @@ ROOM = LANES * SUMS + 2 * LANES  # sums of sixteen Gaussians and room for a slot
 
 
 @kernel
-def all_summed(count, seen, with_depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, absgrad):
+def all_summed(count, seen, with_depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, maps, absgrad):
     row = 0
     for block in range(seen.shape[0]):
         first, lanes = block * LANES, np.int64(seen[block])
@@ -31,22 +31,22 @@ def all_summed(count, seen, with_depth, ranks, spans, slots, opacities, sums, v_
         clear_invisible(first, min(LANES, count - first), lanes, ranks, v_opacities, v_features, absgrad)
         row = sum_slots(
             first, lanes, row, spans, slots, opacities, with_depth, ranks, sums, block * ROOM,
-            v_opacities, v_features, absgrad,
+            v_opacities, v_features, maps, absgrad,
         )  # fmt: skip
     return row
 
 
 @pytest.mark.parametrize("ranks", [False, True], ids=["features of all", "features of the visible"])
 @pytest.mark.parametrize(
-    ("modalities", "colours", "depth", "absolute"),
+    ("modalities", "colours", "depth", "mapped", "absolute"),
     [
-        (1, 1, False, False),
-        (1, 1, True, True),
-        (2, 4, False, True),
-        (2, 9, True, True),
+        (1, 1, False, 0, False),
+        (1, 1, True, 3, True),
+        (2, 4, False, 1, True),
+        (2, 9, True, 0, True),
     ],  # 7 columns to 19: past one vector
 )
-def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, depth, absolute, ranks):
+def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, depth, mapped, absolute, ranks):
     generator = np.random.default_rng(colours)
     visible = np.setdiff1d(np.arange(COUNT), INVISIBLE)
     lengths = generator.integers(1, 9, COUNT)
@@ -55,7 +55,7 @@ def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, dep
     for gaussian in generator.permutation(COUNT):  # slots lie in the order of depth
         spans[gaussian] = end, end + lengths[gaussian]
         end += lengths[gaussian]
-    columns = OPACITY_GRADIENTS + modalities + colours + depth + 2 * absolute
+    columns = OPACITY_GRADIENTS + modalities + colours + depth + mapped + 2 * absolute
     slots = np.full((end + LANES, columns), np.nan, np.float32)  # nothing behind the last slot counts
     slots[:end] = generator.standard_normal((end, columns)) * 10.0 ** generator.integers(-3, 4, (end, 1))
     opacities = generator.uniform(0.1, 0.9, (modalities, COUNT)).astype(np.float32)
@@ -64,17 +64,18 @@ def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, dep
     sums = np.full(len(bits) * ROOM, np.nan, np.float32)
     v_opacities = np.full((modalities, COUNT), np.nan, np.float32)
     v_features = np.full((len(visible) if ranks else COUNT, colours), np.nan, np.float32)
+    maps = np.full((len(visible), mapped), np.nan, np.float32)
     absgrad = np.full((COUNT, 2) if absolute else (0, 0), np.nan, np.float32)
 
     seen = np.array(bits, np.uint16)
-    rows = all_summed(COUNT, seen, depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, absgrad)
+    rows = all_summed(COUNT, seen, depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, maps, absgrad)
 
     wanted = np.zeros((COUNT, columns), np.float32)
     for gaussian in visible:
         for slot in range(*spans[gaussian]):
             wanted[gaussian] += slots[slot]
-    moments, logs, features, depths, absolutes = np.split(
-        wanted, np.cumsum([OPACITY_GRADIENTS, modalities, colours, depth]), axis=1
+    moments, logs, features, depths, mapped_sums, absolutes = np.split(
+        wanted, np.cumsum([OPACITY_GRADIENTS, modalities, colours, depth, mapped]), axis=1
     )
     assert rows == len(visible)
     places = visible // LANES * ROOM + visible % LANES * SUMS
@@ -82,6 +83,7 @@ def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, dep
     np.testing.assert_array_equal(sums[places + DEPTH_GRADIENT], depths[visible, 0] if depth else 0)
     np.testing.assert_array_equal(sums[places + LOG_OPACITY_GRADIENT], logs[visible].sum(1))
     np.testing.assert_array_equal(v_features, features[visible] if ranks else features)
+    np.testing.assert_array_equal(maps, mapped_sums[visible])
     np.testing.assert_allclose(v_opacities, np.where(opacities.T >= ALPHA_MIN, logs / opacities.T, 0).T, rtol=1e-6)
     np.testing.assert_allclose(absgrad, absolutes * TWO_LN_2 if absolute else absgrad, rtol=1e-6)
     assert not v_opacities[:, INVISIBLE].any() and not v_opacities[-1, FAINT].any()

@@ -28,8 +28,9 @@ ALLOWED = {
     "export": {"contracts", "physics", "renderers", "shots"},
     "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},
-    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
-    "studies": {"contracts", "metrics", "io", "training"},
+    "doctor": {"contracts", "effects", "io", "physics"},
+    "runs": {"contracts", "composition", "doctor", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
+    "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
         "geometry",
@@ -45,29 +46,29 @@ ALLOWED = {
     "shots": {"contracts", "geometry", "io"},
     "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies", "viewer"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
+    "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
 }
+BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name what is in them
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
 # Third-party package -> places that may import it.
 DOORS = {
     "hydra": {"cli", "composition"},
     "omegaconf": {"cli", "composition"},
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
-    "pycolmap": {"datamodules/formats"},
+    "pycolmap": {"datamodules/formats", "preparation"},
     "pvlib": {"datamodules"},
-    "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io"},
+    "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io", "preparation"},
     "numba": {"kernels"},
     "gsplat": {"renderers"},
 }
 
 
 def sources() -> list[Path]:
-    return sorted([*PACKAGE.rglob("*.py"), *(ROOT / "datamodules").rglob("*.py")])
+    return sorted([*PACKAGE.rglob("*.py"), *(path for name in BESIDE for path in (ROOT / name).rglob("*.py"))])
 
 
 def package_of(path: Path) -> str:
-    if PACKAGE not in path.parents:
-        return "datamodules"
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT).parts[0].removesuffix(".py")
 
 
 def place_of(path: Path) -> str:
@@ -94,12 +95,13 @@ def test_packages_import_only_what_they_may(path):
     assert package in ALLOWED, f"{path} is in no known package; give it one in docs/architecture.md and here"
     for name in imports_of(path):
         parts = name.split(".")
-        if parts[:2] == ["heatsplat", "datamodules"]:
-            assert package == "datamodules", f"{path} imports {name}: only configurations name data modules"
+        if parts[0] == "heatsplat" and parts[1:2] and parts[1] in BESIDE:
+            assert package in BESIDE, f"{path} imports {name}: only configurations name what lies beside src/"
         assert parts[0] != "benchmarks", f"{path} imports {name}: the package never imports what stands beside it"
         if parts[0] != "heatsplat" or len(parts) == 1 or package == parts[1]:
             continue
-        other = parts[1] if (PACKAGE / parts[1]).exists() or (PACKAGE / f"{parts[1]}.py").exists() else "heatsplat"
+        there = parts[1] in BESIDE or (PACKAGE / parts[1]).exists()
+        other = parts[1] if there or (PACKAGE / f"{parts[1]}.py").exists() else "heatsplat"
         assert other in ALLOWED[package], f"{path} imports {name}: {package} may import {sorted(ALLOWED[package])}"
         if package == "training" and other in BASES_ONLY:
             assert parts[2] in BASES_ONLY[other], f"{path} imports {name}: training knows no variant by name"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"datamodules": ROOT / "datamodules"} | {
+PACKAGES = {name: ROOT / name for name in ("datamodules", "preparation")} | {
     path.name: path for path in (ROOT / "src" / "heatsplat").iterdir() if (path / "__init__.py").exists()
 }
 # Test file -> modules that it tests and that have no file of their own. This list only shrinks: a new module brings a test file.

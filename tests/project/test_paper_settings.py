@@ -1,24 +1,25 @@
-"""The papers' hyperparameters, held against the configuration as composed with ``preset=full``: that of the
-papers, where the defaults have ways of ours (``density=budget``, rates that follow the length of a run).
+"""The papers' hyperparameters, held against the configuration as composed with ``recipe=published``: that of the
+papers, where the defaults have ways of ours (``density=budget``, rates that follow the length of a run, small networks).
 
 A number here was read in the paper or in its authors' code, as the third column says, and never from conf/. Steps that conf/
 gives as shares of a run may differ by what rounding the share does. Where a method departs from its paper, both numbers
 stand in ``DEPARTURES``: whoever changes one has to say so here.
 """
 
+import math
 from functools import reduce
 from operator import or_
 
 import pytest
-from helpers import ALL_METHODS
+from helpers import ALL_METHODS, ROOT
 
-from heatsplat.composition import compose
+from heatsplat.composition import build, compose
 
 TERM = "loss.terms.photometric"
 SUPIRGS_HF = "loss.terms.high_frequency"
 
+UNLIMITED = {"max_steps": (30000, "iterations"), "density.cap_max": (math.inf, "no limit is printed")}
 GAUSSIANS = {  # 3D Gaussian Splatting, arguments/__init__.py of the authors' code unless another source is named
-    "max_steps": (30000, "iterations"),
     "optim.means": (1.6e-4, "position_lr_init"),
     "optim.means_end": (0.01, "position_lr_final / position_lr_init"),
     "optim.log_scales": (5e-3, "scaling_lr"),
@@ -45,6 +46,8 @@ GROWTH = {
 ADAPTIVE = {f"density.{key}": value for key, value in GROWTH.items()}
 COLOUR = {  # static emission
     "thermal.lr": (2.5e-3, "feature_lr"),
+    "thermal.sh_degree": (3, "sh_degree"),
+    "thermal.sh_degree_interval": (1000, "train.py: oneupSHdegree"),
     "renderer.eps2d": (0.3, "compute_cov2D: low-pass filter"),
     "renderer.antialiased": (False, "as published"),
     "renderer.far": (1e10, "no far plane"),
@@ -100,6 +103,14 @@ OWN = {
         "thermal.frequencies": (24, "App. B: K"),
         "thermal.frequency_gain": (2**-0.5, "App. B: alpha"),
         "thermal.ambient": ("measured", "constant T_env of the scene"),
+        "thermal.param": ("faithful", "Eq. 3-6: C, h, A, B"),
+        "thermal.separation": (0.0, "App. B: equal ones go"),
+        "thermal.penalty": ("ridge", "Eq. 11"),
+        "thermal.penalty_reduction": ("sum", "Eq. 11"),
+        "thermal.penalty_units": ("si", "Eq. 3: seconds and degrees"),
+        "thermal.source_penalty": (1e-5, "train.py: lambda"),
+        "thermal.gauge_l2": (0.0, "Eq. 11"),
+        "thermal.clip": ("hard", "Eq. 9"),
         "thermal.lr_initial": (2.5e-3, "3DGS: feature_lr"),
         f"{TERM}.dssim_weight": (0.2, "Eq. 36, lambda of 3DGS"),
         f"{TERM}.dssim_half": (True, "Eq. 36: (1 - SSIM) / 2"),
@@ -124,6 +135,15 @@ OWN = {
     },
     "hexplane_4dgs": {
         "first_steps": (3000, "coarse_iterations"),
+        "density.cap_max": (360000, "train.py: no growth beyond"),
+        "thermal.heads": (["means", "scales", "rotations"], "no_do, no_dshs"),
+        "thermal.resolution": (64, "resolution of dnerf_default"),
+        "thermal.time_resolution": (25, "resolution of dnerf_default"),
+        "thermal.channels": (32, "output_coordinate_dim"),
+        "thermal.lr": (1.6e-4, "deformation_lr_init"),
+        "thermal.lr_planes": (1.6e-3, "grid_lr_init"),
+        f"{TERM}.dssim_weight": (0.0, "lambda_dssim"),
+        "thermal.emission.sh_degree": (3, "sh_degree"),
         "thermal.scales": ([1, 2], "multires of dnerf_default"),
         "thermal.width": (64, "net_width"),
         "thermal.smooth_space": (1e-4, "plane_tv_weight"),
@@ -133,9 +153,10 @@ OWN = {
         "thermal.emission.lr": (2.5e-3, "feature_lr"),
     },
     "mftg": {
+        "max_steps": (60000, "30000 on colour, 30000 on thermal images"),
         "density.grad_threshold": GROWTH["grad_threshold"],
-        "density.stop": (7500, "15000 of each round's 30000, halved: both rounds are 30000 here"),
-        "first_steps": (15000, "30000 of 60000"),
+        "density.stop": (15000, "of each round's 30000"),
+        "first_steps": (30000, "of 60000"),
         "loss.terms.smoothness.term.weight": (0.6, "train.py: lambda of smoothness"),
     },
     "mip_splatting": {
@@ -154,6 +175,11 @@ OWN = {
         "loss.terms.smoothness.weight": (0.36, ".6 of .6"),
     },
     "ntr_gaussian": {
+        "max_steps": (20000, "10000 of each stage"),
+        "first_steps": (10000, "10000 of geometry"),
+        "thermal.width": (64, "T-net: 64"),
+        "thermal.feature_size": (32, "of Feature-3DGS"),
+        "thermal.variation": (1.0, "without a weight"),
         "thermal.nodes": (6, "nodes of the trapezoid rule"),
         "thermal.window_s": (3600.0, "one hour"),
         "thermal.position_frequencies": (10, "L"),
@@ -173,6 +199,13 @@ OWN = {
         "thermal.dual_opacity": (True, "section 3.1"),
         "thermal.three_parameter": (True, "section 3.2"),
         "thermal.lr_attributes": (2.5e-3, "section 4.1"),
+        "thermal.lr_rest": (2.5e-3 / 20, "3DGS: feature_lr / 20"),
+        "thermal.degrees": ({"emissivity": 3, "temperature": 3, "reflectance": 3}, "section 3.1: as the colours"),
+        "thermal.clip": ("hard", "Eq. 5"),
+        "stages.freezes.rgb.start": (3000, "section 4.1"),
+        "stages.freezes.rgb.share": (0.2, "section 4.1: 20 %"),
+        "loss.terms.physical_prior.term.reduction": ("mean", "Eq. 15"),
+        "loss.terms.physical_prior.term.of": ("coefficients", "Eq. 15"),
         "thermal.color.sh_degree": (3, "3DGS"),
         "loss.terms.gradient.weight": (0.5 * 0.05, "lambda_rgb lambda_g"),
         "loss.terms.guided_variation.weight": (0.5 * 0.02, "lambda_ir lambda_s"),
@@ -192,6 +225,9 @@ OWN = {
         "module.supersample": (4, "x4"),
         "sensor.parts.calibration.grid": (16, "Eq. 4"),
         "sensor.parts.calibration.weight": (5e-4, "lambda_cal"),
+        "sensor.parts.tone.straight": (True, "Eq. 8"),
+        "sensor.parts.tone.exact": (True, "Eq. 7: of each pixel"),
+        f"{SUPIRGS_HF}.term.inner": (3, "after Eq. 9: a difference of averages"),
         "sensor.parts.tone.width": (64, "Eq. 7: two hidden layers of 64"),
         "sensor.parts.tone.gain_max": (0.08, "Eq. 8"),
         "sensor.parts.tone.offset_max": (0.04, "Eq. 8"),
@@ -204,6 +240,16 @@ OWN = {
         f"{SUPIRGS_HF}.schedule.end": (0.95, "HF 65-95 %"),
     },
     "thermal3dgs": {
+        "thermal.width": (256, "W"),
+        "thermal.depth": (8, "D"),
+        "thermal.skip": (5, "after index 4"),
+        "thermal.positions": ("world", "xyz as it is"),
+        "thermal.time": ("index", "fid / (N - 1)"),
+        "thermal.exponent_max": (None, "no bound"),
+        "thermal.emission.sh_degree": (3, "sh_degree"),
+        "loss.terms.corner.term.weight": ("published", "train.py"),
+        "sensor.parts.conduction.width": (1, "1x1 convolutions of one channel"),
+        "sensor.parts.conduction.norm": ("columns", "F.normalize without a batch"),
         "thermal.position_frequencies": (10, "multires"),
         "thermal.time_frequencies": (10, "t_multires"),
         "thermal.lr": (8e-4, "1.6e-4 times the spatial scale 5"),
@@ -233,10 +279,24 @@ OWN = {
         "thermal.weights.ode": (0.01, "lambda_5"),
         "thermal.weights.pinn": (1.0, "lambda_6"),
         "thermal.time_frequencies": (10, "orders of the time encoding"),
+        "thermal.width": (256, "our reading"),
+        "thermal.blocks": (6, "our reading"),
+        "thermal.projected_area": ("printed", "Eq. 8"),
         "thermal.surface_area": ("printed", "Eq. 6"),
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
     "ti3dgs": {
+        "thermal.width": (256, "W"),
+        "thermal.depth": (8, "D"),
+        "thermal.skip": (5, "after index 4"),
+        "thermal.positions": ("world", "xyz as it is"),
+        "thermal.time": ("index", "fid / (N - 1)"),
+        "thermal.exponent_max": (None, "no bound"),
+        "thermal.emission.sh_degree": (3, "sh_degree"),
+        "thermal.frames_per_cycle": (None, "Eq. 9"),
+        "thermal.applies_to": ("harmonics", "Eq. 12"),
+        "thermal.gauge": (0.0, "none"),
+        "density.radiance.sh0": (0.0, "Eq. 14"),
         "thermal.position_frequencies": (10, "Eq. 9: L"),
         "thermal.time_frequencies": (10, "Eq. 9: L"),
         "thermal.exponent": ("printed", "Eq. 9-10: no constraint"),
@@ -245,37 +305,12 @@ OWN = {
         f"{TERM}.dssim_weight": (0.2, "3DGS"),
     },
 }
-PAPERS = {method: reduce(or_, (*shared, OWN.get(method, {}))) for method, shared in SHARED.items()}
+PAPERS = {method: reduce(or_, (UNLIMITED, *shared, OWN.get(method, {}))) for method, shared in SHARED.items()}
 
-DEPARTURES = {  # ours and the published number
-    "hexplane_4dgs": {
-        "thermal.resolution": (32, 64),
-        "thermal.lr": (2e-3, 1.6e-4),
-        "thermal.lr_planes": (1e-2, 1.6e-3),
-    },
-    "etgs": {
-        "thermal.separation": (0.5, 0.0),
-        "thermal.penalty": ("group", "ridge"),
-        "thermal.source_penalty": (1e-3, 1e-5),
-        "thermal.penalty_reduction": ("mean_over_gaussians", "sum"),
-        "thermal.clip": ("straight_through", "hard"),
-    },
-    "ntr_gaussian": {"thermal.width": (32, 64), "thermal.feature_size": (8, 32)},
-    "ravigs": {"loss.terms.physical_prior.term.reduction": ("sum", "mean")},
+DEPARTURES = {  # ours, also with the recipe, and the published number
     "srgs": {"teacher": ("lanczos", "SwinIR")},
     "supirgs": {"teacher": ("lanczos", "SwinIR-S"), f"{TERM}.term.boost_weight": (0.0, "undefined")},
-    "thermal3dgs": {
-        "thermal.width": (32, 256),
-        "thermal.depth": (2, 8),
-        "thermal.exponent_max": (4.0, None),
-        "loss.terms.corner.term.weight": ("corners", "published"),
-    },
-    "thermogs": {"thermal.projected_area": ("exact", "printed")},
-    "ti3dgs": {
-        "thermal.frames_per_cycle": (4.0, None),
-        "thermal.exponent_max": (4.0, None),
-        "thermal.applies_to": ("radiance", "harmonics"),
-    },
+    "thermogs": {"thermal.features": ("learned", "given: of Feature-3DGS")},
 }
 STEPS = ("start", "stop", "every", "first_steps", "sh_degree_interval", "reset_every")
 SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
@@ -288,7 +323,7 @@ def composed():
 
     def of(method):
         if method not in known:
-            known[method] = compose([f"method={method}", "preset=full"])
+            known[method] = compose([f"method={method}", "recipe=published"])
         return known[method]
 
     return of
@@ -310,6 +345,47 @@ def test_short_runs_of_ravigs_reach_as_far_with_its_attributes(steps, rate, rest
 
 def test_every_method_here_exists():
     assert set(PAPERS) <= set(ALL_METHODS) and set(DEPARTURES) <= set(PAPERS)
+
+
+def test_every_option_that_the_recipe_knows_exists():
+    """Its files are optional to Hydra: one whose name fits no option would never be read."""
+    files = list((ROOT / "conf" / "recipe").glob("*/*.yaml"))
+    groups = {path: "method" if path.parent.name == "methods" else path.parent.name for path in files}
+    unread = [path for path, group in groups.items() if not _option(group, path.stem).is_file()]
+    assert files and not unread
+
+
+def _option(group, name):
+    return ROOT / "conf" / group / f"{name.removeprefix('published_')}.yaml"
+
+
+@pytest.mark.parametrize("overrides", [["thermal=static"], ["density=adaptive"], ["loss=photometric", "sensor=none"]])
+@pytest.mark.parametrize("method", ["etgs", "ti3dgs", "thermal3dgs", "supirgs"])
+def test_parts_of_a_method_that_are_exchanged_have_their_own_published_settings(method, overrides):
+    """As rows of ablations do: no part gets what the recipe says of another."""
+    config = compose([f"method={method}", "recipe=published", *overrides])
+    if overrides == ["thermal=static"]:
+        assert build(config["thermal"]).sh_degree == 3
+    for name in ("thermal", "density", "sensor"):
+        build(config[name])
+
+
+def test_presets_and_the_command_line_shorten_the_recipe():
+    config = compose(["method=mftg", "recipe=published", "preset=fast"])
+    assert (config["max_steps"], config["density"]["cap_max"], config["optim"]["length_power"]) == (2000, 30000, 0)
+    assert compose(["method=etgs", "recipe=published", "max_steps=7"])["max_steps"] == 7
+
+
+def test_without_the_recipe_nothing_of_it_is_there():
+    ours = compose(["method=ti3dgs"])
+    assert "published" not in ours and ours["thermal"]["width"] == 32 and ours["optim"]["length_power"] == 0.5
+
+
+@pytest.mark.parametrize("table", ["etgs_1", "ravigs_1", "ti3dgs_i", "supirgs_1", "thermogs_2"])
+def test_tables_have_the_recipe_and_the_papers_lpips(table):
+    config = compose([f"experiment=table_{table}", "data.root=/nowhere", "data.scene=s", "hydra.mode=RUN"])
+    assert config["published"]["steps"] == config["max_steps"] == 30000
+    assert config["optim"]["length_power"] == 0 and config["callbacks"]["metrics"]["lpips_net"] == "vgg"
 
 
 @pytest.mark.parametrize("method", PAPERS)

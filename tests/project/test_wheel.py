@@ -14,7 +14,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = {"src/heatsplat": "heatsplat", "src/hydra_plugins": "hydra_plugins"} | {
-    name: f"heatsplat/{name}" for name in ("conf", "datamodules")
+    name: f"heatsplat/{name}" for name in ("conf", "datamodules", "preparation")
 }
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -23,7 +23,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def site(tmp_path_factory) -> Path:
     """A folder into which the wheel of a copy of the sources is unpacked."""
     copy, site = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("site")
-    for name in ("src", "conf", "datamodules", "tests"):
+    for name in ("src", "conf", "datamodules", "preparation", "tests"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
     for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)

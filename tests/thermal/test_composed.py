@@ -229,11 +229,8 @@ def test_a_mirror_shows_what_lies_in_the_mirrored_direction():
     with torch.no_grad():
         part.surroundings.copy_(torch.tensor([0.5, 0.0, 0.3, 0.0]) / spherical_harmonics.C0)
     splats = splats_of(made("static"))
-    with torch.no_grad():
-        splats.raw["quats"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-        splats.raw["log_scales"][:] = torch.tensor([0.0, 0.0, -2.0])  # panes across the z axis
-    tensors = {name: splats[name] for name in splats.names} | {"reflectance_logit": torch.full((40,), 40.0)}
-    mirrors = Splats(tensors)  # ρ = 1
+    panes = {"reflectance_logit": torch.full((40,), 40.0), "normals": torch.tensor([[0.0, 0.0, 1.0]]).repeat(40, 1)}
+    mirrors = Splats({name: splats[name] for name in splats.names} | panes)  # ρ = 1, across the z axis
     sight = spherical_harmonics.unit(mirrors.means - camera(0.3).center.float())
     mirrored = sight * torch.tensor([1.0, 1.0, -1.0])
     expected = spherical_harmonics.basis(mirrored, 1) @ part.surroundings

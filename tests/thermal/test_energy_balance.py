@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import NORMALS, Query, Seeds
 from heatsplat.thermal.energy_balance import EnergyBalance
 
 HOUR = 3600.0
@@ -55,10 +55,11 @@ def splats_of(model: EnergyBalance, count: int = 6) -> Splats:
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
     quats[count // 2 :] = torch.tensor([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
     means = torch.zeros(count, 3)
-    means[count // 2 :, 0] = -5.0  # so that the camera is on their eastern side
     flat = torch.tensor([0.0, 0.0, -4.0]).repeat(count, 1)
+    seen = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).repeat_interleave(count // 2, dim=0)
     tensors = {"means": means, "log_scales": flat, "quats": quats, "opacity_logits": torch.zeros(count, 1)}
-    return Splats(tensors | {name: item.initial for name, item in model.per_gaussian(start).items()})
+    declared = {name: item.initial for name, item in model.per_gaussian(start).items()}
+    return Splats(tensors | declared | ({NORMALS: seen} if NORMALS in declared else {}))
 
 
 def ready(data: SceneData | None = None, **options) -> tuple[EnergyBalance, Splats]:
@@ -210,8 +211,10 @@ def test_a_night_only_record_works_without_sun():
     [
         ({"solution": "best"}, "solution must be one of linear, corrected, got 'best'"),
         ({"sky": "blue"}, "sky must be one of auto, brutsaert"),
-        ({"normals": "up"}, "normals must be one of splats, level, got 'up'"),
+        ({"normals": "up"}, "normals must be one of seen, level, got 'up'"),
         ({"clip": "soft"}, "clip must be one of"),
+        ({"nodes": 3}, "nodes must be one of 1, 2, got '3'"),
+        ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )
@@ -227,3 +230,22 @@ def test_the_yaml_builds_the_defaults_of_the_class():
     for name, value in vars(plain).items():
         if isinstance(value, (int, float, str)) and not name.startswith("_"):
             assert getattr(built, name) == value, name
+
+
+def test_a_core_is_there_only_where_it_is_asked_for_and_stays_warm_after_dusk():
+    plain, without = ready()
+    model, splats = ready(nodes=2)
+    core = {"initial_core", "log_core_rate", "log_coupling"}
+    assert core <= set(splats.names) and not core & set(without.names)
+    assert "relaxation" in model.effects() and "relaxation" not in plain.effects()
+    assert model.cost == 2 * plain.cost
+    with torch.no_grad():
+        splats["log_coupling"].fill_(math.log(3.0))
+    dusk = 20 * HOUR
+    assert (model.temperature(splats, dusk) > plain.temperature(without, dusk) + 0.5).all()
+    noon = model.features(splats, Query(time_s=12 * HOUR))
+    noon.sum().backward()
+    assert all((splats[name].grad != 0).any() for name in core)
+    told = model.attributes(splats, Query(time_s=0.0))
+    torch.testing.assert_close(told["core_coupling"], torch.full((6,), 3.0))
+    torch.testing.assert_close(told["core_time_constant_h"], torch.full((6,), 6.0))

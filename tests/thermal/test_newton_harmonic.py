@@ -3,7 +3,6 @@
 import io
 import logging
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -13,8 +12,9 @@ from omegaconf import OmegaConf
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
 from heatsplat.physics.relaxation import temperature
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import PerGaussian, Query, Seeds
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
+from heatsplat.training.optimisation import OnePassAdam, penalties
 
 RANGE = ThermalRange(20.0, 70.0)
 SPAN_S = 400.0
@@ -172,8 +172,10 @@ def test_rows_out_of_view_are_not_read_and_get_no_gradient():
 
 
 def fit(model, splats, declared, observed, times_s, steps):
-    groups = [{"params": [splats[name]], "lr": item.lr, "weight_decay": 2 * item.l2} for name, item in declared.items()]
-    optimizer = torch.optim.Adam(groups, eps=1e-15)
+    groups = [
+        {"params": [splats[name]], "lr": item.lr} | penalties(item, len(splats)) for name, item in declared.items()
+    ]
+    optimizer = OnePassAdam(groups, eps=1e-15)
     for step in range(steps):
         if step == steps // 2:
             for group in optimizer.param_groups:
@@ -181,7 +183,7 @@ def fit(model, splats, declared, observed, times_s, steps):
         shown = step * 37 % len(times_s)
         error = model.features(splats, Query(time_s=times_s[shown]))[:, 0] - observed[shown]
         optimizer.zero_grad()
-        (error.square().mean() + sum(model.regularisers(splats).values())).backward()
+        error.square().mean().backward()
         optimizer.step()
 
 
@@ -340,31 +342,30 @@ def test_squares_are_penalised_in_the_optimiser_as_a_sum_or_a_mean():
     assert [model.regularisers(splats) for model, splats in (summed, meant)] == [{}, {}]
 
 
-@pytest.mark.parametrize("reduction", ["sum", "mean_over_gaussians"])
-def test_groups_are_penalised_by_the_norm_of_each_frequency_over_all_gaussians(reduction):
-    model, splats = ready(source_penalty=0.1, penalty_reduction=reduction, dtype=torch.float64)
-    stir(splats)
-    gains = splats["source_gains"].detach()
-    share = 1.0 if reduction == "sum" else 1 / len(splats)
-    expected = sum((share * gains[:, :, k].square().sum()).sqrt() for k in range(model.omega.numel()))
-    term = model.regularisers(splats)["source_groups"]
-    assert term.item() == pytest.approx(0.1 * expected.item())
-    assert model.per_gaussian(seeds())["source_gains"].l2 == 0
-    term.backward()
-    weak = 0.1 * share * gains[:, :, 3] / (share * gains[:, :, 3].square().sum()).sqrt()
-    torch.testing.assert_close(splats["source_gains"].grad[:, :, 3], weak)
+@pytest.mark.parametrize(("reduction", "root"), [("sum", 1.0), ("mean_over_gaussians", math.sqrt(6))])
+def test_groups_are_penalised_in_the_optimiser_as_norms_of_sums_or_of_means(reduction, root):
+    model, splats = ready(source_penalty=0.1, penalty_reduction=reduction)
+    declared = model.per_gaussian(seeds())["source_gains"]
+    assert model.regularisers(splats) == {}
+    assert penalties(declared, 6) == {"weight_decay": 0.0, "group_penalty": pytest.approx(0.1 / root)}
 
 
-def test_groups_that_start_at_nothing_have_no_pull():
-    model, splats = ready(source_penalty=0.1)
-    model.regularisers(splats)["source_groups"].backward()
-    assert not splats["source_gains"].grad.any()
+def test_in_si_units_sources_are_counted_in_degrees_per_second():
+    """50 °C within 400 s: a gain of 1 image unit per span is 1/8 °C per second."""
+
+    def gains(penalty, **options):
+        return ready(penalty=penalty, source_penalty=1e-5, **options)[0].per_gaussian(seeds())["source_gains"]
+
+    assert gains("ridge", penalty_units="si").l2 == pytest.approx(1e-5 / 64)
+    assert gains("group", penalty_units="si").group == pytest.approx(1e-5 / 8)
+    with pytest.raises(SceneError, match="penalty_units=scene"):
+        gains("group", penalty_units="si", scene_data=scene(thermal_range=None))
 
 
 @pytest.mark.parametrize("off", [{"source_penalty": 0.0}, {"frequencies": 0}])
 def test_a_penalty_that_is_off_is_absent(off):
     model, splats = ready(**off)
-    assert model.regularisers(splats) == {}
+    assert "group_penalty" not in penalties(model.per_gaussian(seeds()).get("source_gains", PerGaussian(None, 0.0)), 6)
 
 
 def test_groups_leave_the_frequencies_that_a_scene_needs():
@@ -378,11 +379,7 @@ def test_groups_leave_the_frequencies_that_a_scene_needs():
         driven = model.omega[4].item() / SPAN_S
         noise = 0.02 * torch.randn(len(times_s), count, generator=generator.manual_seed(1))
         observed = [0.5 + 0.2 * math.sin(driven * t) + noise[i] for i, t in enumerate(times_s)]
-        declared = model.per_gaussian(start)
-        declared = {
-            name: replace(item, l2=item.l2 / count) for name, item in declared.items()
-        }  # as the module has means
-        fit(model, splats, declared, observed, times_s, steps=1000)
+        fit(model, splats, model.per_gaussian(start), observed, times_s, steps=1000)
         strength = splats["source_gains"].detach().norm(dim=(0, 1))
         left[penalty] = (strength / strength.max() < 0.05).sum().item()
     assert left["group"] > left["ridge"]
@@ -436,6 +433,7 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
         ({"clip": "soft"}, "clip must be one of"),
         ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
         ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
+        ({"penalty_units": "kelvin"}, "penalty_units must be one of scene, si"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )

@@ -1,12 +1,17 @@
 """Grey bodies with a colour: start, formula against high precision, gradients, toggles, and what is absent when off."""
 
+from dataclasses import replace
+
 import mpmath
 import pytest
 import torch
 
-from heatsplat.contracts import Camera
+from heatsplat.contracts import Camera, SceneError
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.physics.grey_body import radiance, temperature_of
+from heatsplat.physics.planck import Band
+from heatsplat.physics.units import KELVIN_AT_0_C, kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.radiative import ATTRIBUTES, Radiative
@@ -247,3 +252,59 @@ def test_errors():
         ValueError, match="color must explain rgb images and nothing else, got a model of thermal images"
     ):
         Radiative(Static())
+
+
+# Planck's law, and surroundings that were measured ----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Synthetic(scene="static", size="tiny", frames=3).scene
+
+
+OPAQUE = {"reflectance": "kirchhoff", "law": "band", "surroundings": "measured"}
+
+
+def test_a_body_sends_what_plancks_law_and_kirchhoffs_say(room):
+    thermal = model(**OPAQUE)
+    thermal.prepare(room)
+    splats = splats_of(thermal, seeds(), disturb=0.3, dtype=torch.float64)
+    told, band, bounds = thermal.attributes(splats, query()), Band(), room.thermal_range
+    own, ambient = (
+        band.radiance(kelvin(t))
+        for t in (bounds.to_celsius(told["temperature"]), torch.tensor(room.ambient_c, dtype=torch.float64))
+    )
+    sent = told["emissivity"] * own + (1 - told["emissivity"]) * ambient
+    shown = bounds.to_unit(band.temperature(sent) - KELVIN_AT_0_C)
+    assert torch.allclose(thermal.features(splats, query())[:, 0], shown.clamp(0, 1), atol=1e-6)
+    assert "raw_gain" not in dict(thermal.named_parameters()) and "raw_surroundings" not in dict(
+        thermal.named_parameters()
+    )
+
+
+def test_its_temperature_is_one_in_kelvin(room):
+    thermal = model(**OPAQUE, degrees={"emissivity": 1, "temperature": 0, "reflectance": 0})
+    thermal.prepare(room)
+    splats = splats_of(thermal, seeds(), dtype=torch.float64)
+    told = thermal.attributes(splats, query())["temperature"]
+    assert torch.allclose(thermal.temperature(splats, 0.0), kelvin(room.thermal_range.to_celsius(told)))
+
+
+@pytest.mark.parametrize("options", [OPAQUE, {"surroundings": "measured"}, OPAQUE | {"surroundings": 0.2}])
+def test_with_what_was_measured_emission_starts_at_the_seed_values(room, options):
+    thermal = model(**options)
+    thermal.prepare(room)
+    start = seeds()
+    emitted = thermal.features(splats_of(thermal, start), query())
+    bright = start.values[:, 0] > 0.15  # more than what is mirrored already
+    assert torch.allclose(emitted[bright], start.values[bright], atol=2e-5)
+
+
+def test_measured_surroundings_need_a_measurement(room):
+    with pytest.raises(SceneError, match="thermal.surroundings=measured needs the ambient temperature"):
+        model(surroundings="measured").prepare(replace(room, ambient_c=None))
+
+
+def test_plancks_law_is_for_opaque_bodies():
+    with pytest.raises(ValueError, match="reflectance=kirchhoff"):
+        model(law="band")

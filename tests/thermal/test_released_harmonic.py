@@ -13,6 +13,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.released_harmonic import ReleasedHarmonic
+from heatsplat.training.optimisation import penalties
 
 AMBIENT_C = 26.0
 TIMES_S = (0.0, 0.5, 137.0, SPAN_S)
@@ -141,20 +142,19 @@ def test_below_the_bounds_values_act_as_the_bounds_and_get_no_gradient():
 
 
 def test_the_penalty_is_the_released_norm_of_groups():
-    model, splats, (*_, gains) = bodies()
-    (term,) = model.regularisers(splats).values()
-    assert term.item() == pytest.approx(1e-5 * gains.square().sum((0, 1)).sqrt().sum().item())
-    assert model.per_gaussian(seeds())["source_gains"].l2 == 0
-
-
-def test_gains_and_their_scale_are_a_gauge_that_only_the_penalty_sees():
     model, splats, _ = bodies()
-    shown, penalty = model.temperature(splats, 91.0).detach(), model.regularisers(splats)["source_groups"].item()
+    assert model.regularisers(splats) == {}
+    expected = {"weight_decay": 0.0, "group_penalty": 1e-5}
+    assert penalties(model.per_gaussian(seeds())["source_gains"], len(splats)) == expected
+
+
+def test_gains_and_their_scale_are_a_gauge():
+    model, splats, _ = bodies()
+    shown = model.temperature(splats, 91.0).detach()
     with torch.no_grad():
         splats["source_gains"].mul_(0.1)
         splats["source_scale"].mul_(10.0)
     torch.testing.assert_close(model.temperature(splats, 91.0).detach(), shown, rtol=1e-12, atol=0)
-    assert model.regularisers(splats)["source_groups"].item() == pytest.approx(0.1 * penalty)
 
 
 def test_it_shows_what_the_rate_form_shows():

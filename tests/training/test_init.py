@@ -1,6 +1,7 @@
 """Splats before the first step: how many, where, and how large."""
 
 import logging
+import math
 
 import pytest
 import torch
@@ -32,6 +33,7 @@ def test_no_more_start_than_density_control_allows(parts, source, caplog):
     whole, _ = start(scene, thermal, seed=0)
     with caplog.at_level(logging.INFO):
         same, _ = start(scene, thermal, seed=0, cap_max=len(whole))
+        assert len(start(scene, thermal, seed=0, cap_max=math.inf)[0]) == len(whole)
         assert not caplog.records
         first, second = (start(scene, thermal, seed=0, cap_max=100)[0] for _ in range(2))
     assert f"init: 100 of {len(whole)} Gaussians, as many as density.cap_max allows" in caplog.text

@@ -1,4 +1,4 @@
-"""Presets: every method with every one of them, what a preset leaves to the method, and what the command line overrules."""
+"""Presets and recipes: every method with every one, what a preset leaves to the method, what the command line overrules."""
 
 import itertools
 from pathlib import Path
@@ -13,7 +13,8 @@ from heatsplat.runs.checks import checked
 PRESETS = ("draft", "fast", "balanced", "full")
 METHODS = sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml"))
 TURNS = list(zip(METHODS, itertools.cycle(PRESETS), strict=False))
-DENSITY = dict.fromkeys(("draft", "fast", "balanced"), "Budget") | {"full": "Adaptive"}
+RECIPES = sorted(path.stem for path in (Path(CONF) / "recipe").glob("*.yaml"))
+PUBLISHED = ("etgs", "ti3dgs", "ravigs", "supirgs", "thermogs", "thermal3dgs", "hexplane_4dgs", "ntr_gaussian")
 OWN = {"ravigs": "CoSupport", "ti3dgs": "Proximity", "ntr_gaussian": "Adaptive", "mftg": "Adaptive"}
 
 
@@ -41,7 +42,7 @@ def test_a_method_keeps_what_is_its_own_with_every_preset(method):
             assert stop == pytest.approx(plain["density"]["stop"] * steps / 30000, abs=1)
             assert density_of(config) == density_of(plain)
         else:
-            assert density_of(config) == DENSITY[preset]
+            assert density_of(config) == "Budget"
 
 
 def test_presets_are_ordered():
@@ -77,10 +78,23 @@ def test_a_preset_chooses_among_groups_only_where_the_method_does_not(tmp_path):
     assert chosen("method=ravigs", "density=fixed") == "Fixed" and chosen("density=proximity") == "Proximity"
 
 
-def test_a_budget_beside_a_preset_is_refused():
+@pytest.mark.parametrize("other", ["preset=fast", "recipe=published"])
+def test_a_budget_beside_a_preset_or_a_recipe_is_refused(other):
     """Both choose the steps."""
-    with pytest.raises(SceneError, match=r"budget and preset both choose .* leave out one of them"):
-        checked(compose(["preset=fast", "budget=60s"]))
+    with pytest.raises(SceneError, match=rf"budget and {other.partition('=')[0]} both choose .* leave out one of them"):
+        checked(compose([other, "budget=60s"]))
+
+
+@pytest.mark.parametrize("method", PUBLISHED)
+def test_methods_train_with_the_papers_settings_and_grow_without_a_limit(method, tmp_path):
+    """Refinements come early, so that each kind of density control meets its cap, which is infinity or 360,000."""
+    assert RECIPES == ["published"]
+    module, trainer = run(
+        tmp_path, f"method={method}", "recipe=published", *TINY, "density.start=0", "density.every=2",
+        "trainer.max_steps=4", "trainer.limit_val_batches=0", "test=false",
+    )  # fmt: skip
+    assert trainer.global_step == 4 and module.density.cap_max >= 360_000
+    assert module.schedule.end == compose([f"method={method}", "recipe=published"])["max_steps"]
 
 
 @pytest.mark.parametrize(("method", "preset"), TURNS)

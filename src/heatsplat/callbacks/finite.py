@@ -53,7 +53,7 @@ class FiniteGuard(pl.Callback):
                 terms = outputs.get("terms", {}).items()
                 demand_finite(((f"loss term '{name}'", term) for name, term in terms), step, self._seen)
                 demand_finite([("loss", total)], step, self._seen)
-            if not _sum_is_finite(trainer.optimizers):
+            if not all(map(_sum_is_finite, trainer.optimizers)):
                 demand_finite([*_gradients(module), *_parameters(module)], step, self._seen)
 
     def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -95,10 +95,12 @@ def _describe(name: str, tensor: Tensor) -> str:
     )
 
 
-def _sum_is_finite(optimizers: Iterable[torch.optim.Optimizer]) -> bool:
-    """Whether the sum of all that is trained is finite; a hundredth of a step, for it goes through no module."""
-    parameters = (p for optimizer in optimizers for group in optimizer.param_groups for p in group["params"])
-    return math.isfinite(sum(p.detach().sum().item() for p in parameters))
+def _sum_is_finite(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether the sum of all that is trained is finite, which an optimiser may know of what it wrote (``OnePassAdam``)."""
+    known = optimizer.finite() if hasattr(optimizer, "finite") else None
+    if known is not None:
+        return known
+    return math.isfinite(sum(p.detach().sum().item() for group in optimizer.param_groups for p in group["params"]))
 
 
 def _gradients(module: pl.LightningModule) -> Iterator[tuple[str, Tensor]]:

@@ -42,9 +42,12 @@ class SplatStatistics(pl.Callback):
             writer.add_scalar(f"loss/{name}", value, step)
         for number, group in enumerate(trainer.optimizers[0].param_groups):
             writer.add_scalar(f"learning_rate/{group.get('name', number)}", group["lr"], step)
-            if group.get("weight_decay"):  # a penalty on squares, applied inside the optimiser and so in no loss term
+            if group.get("weight_decay"):  # penalties are applied inside the optimiser and so are in no loss term
                 squares = sum(parameter.detach().square().sum() for parameter in group["params"])
                 writer.add_scalar(f"loss/penalty/{group['name']}", 0.5 * group["weight_decay"] * squares.item(), step)
+            if group.get("group_penalty"):
+                norms = sum(parameter.detach().flatten(0, -2).norm(dim=0).sum() for parameter in group["params"])
+                writer.add_scalar(f"loss/penalty/{group['name']}", group["group_penalty"] * norms.item(), step)
         writer.add_scalar("density/count", len(module.splats), step)
         if self.histogram_every and step % self.histogram_every == 0:
             self._histograms(module, writer, step)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -29,7 +31,8 @@ class Adaptive(DensityControl):
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
         reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
         reset_opacity: opacities are lowered to at most this, as rendered.
-        cap_max: never more Gaussians than this; the strongest gradients grow first.
+        cap_max: never more Gaussians than this, infinity for no limit; the strongest gradients grow first.
+        multiple: nor more than so many times the Gaussians of the start; None: ``cap_max`` alone.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
     """
 
@@ -44,21 +47,27 @@ class Adaptive(DensityControl):
         prune_scale: float = 0.1,
         reset_every: int | None = 3000,
         reset_opacity: float = 0.01,
-        cap_max: int = 100_000,
+        cap_max: float = 100_000,
+        multiple: float | None = None,
         absgrad: bool = False,
     ) -> None:
         if every < 1 or cap_max < 1 or (reset_every is not None and reset_every < 1):
             raise ValueError(
                 f"density.every, reset_every and cap_max must be at least 1, got {every}, {reset_every}, {cap_max}"
             )
+        if multiple is not None and not multiple > 0:
+            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
         self.start, self.stop, self.every = start, stop, every
         self.grad_threshold, self.duplicate_scale = grad_threshold, duplicate_scale
         self.prune_opacity, self.prune_scale = prune_opacity, prune_scale
         self.reset_every, self.reset_opacity = reset_every, reset_opacity
         self.cap_max, self.absgrad = cap_max, absgrad
+        self.multiple, self.wanted = multiple, math.inf
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """ "gradient" [N], the sum of gradient norms, and "seen" [N], the number of views that saw the Gaussian."""
+        if self.multiple is not None:
+            self.wanted = round(self.multiple * count)
         return {"gradient": torch.zeros(count, device=device), "seen": torch.zeros(count, device=device)}
 
     @torch.no_grad()
@@ -102,9 +111,13 @@ class Adaptive(DensityControl):
         large = cloud.splats.scales.amax(dim=1) > self.duplicate_scale * extent
         return self._multiply(cloud, pull, pull > self.grad_threshold, large, generator)
 
+    def _room(self, cloud: Cloud) -> int:
+        """How many Gaussians may still come."""
+        return max(0, min(self.wanted, self.cap_max) - len(cloud))
+
     def _multiply(self, cloud: Cloud, pull: Tensor, grow: Tensor, large: Tensor, generator: torch.Generator) -> int:
         """Duplicates those of ``grow`` that are not ``large`` and splits the others; under the cap, strongest pull first."""
-        room = max(0, self.cap_max - len(cloud))
+        room = self._room(cloud)
         if int(grow.sum()) > room:  # one more Gaussian each, whether it is duplicated or split
             strongest = pull.argsort(descending=True, stable=True)[:room]
             grow = torch.zeros_like(grow)

@@ -32,7 +32,7 @@ class DensityControl:
     """
 
     absgrad: bool = False
-    cap_max: int | None = None
+    cap_max: float | None = None
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """Per-Gaussian statistics before the first step, each [count, ...]."""
@@ -46,12 +46,13 @@ class DensityControl:
         """How many maps over pixels it wants summed by blending weights in this step (``pixel_maps``); 0 costs nothing."""
         return 0
 
-    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+    def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         """The maps [H, W, S], S = ``maps_at(step)``, here 0; ``observe`` finds their sums in ``output.weighted.sums``.
 
         Args:
             error: [H, W] absolute error of each pixel in image units, mean over channels, 0 where a pixel does not count; on
                 the grid on which training renders.
+            target: [H, W, C] the training image on that grid, in image units.
             step: training step.
         """
         return error.new_zeros(*error.shape, 0)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
+from scipy.ndimage import gaussian_laplace
 from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
@@ -21,7 +22,10 @@ CURVES: dict[str, Callable[[float], float]] = {
     "linear": lambda x: x,
     "concave": lambda x: 2 * x - x * x,
 }
-SCORES = ("error", "absgrad", "uniform")
+SCORES = ("error", "edge", "absgrad", "uniform")
+BLUR = (
+    1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; those of noise are weaker then
+)
 BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
 DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
 
@@ -53,7 +57,8 @@ class Budget(DensityControl):
         every: steps between events.
         cap_max: never more Gaussians than this.
         multiple: B in Gaussians of the start; None: B is ``cap_max``.
-        score: "error", "absgrad" (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
+        score: "error", "edge" (the Laplacian of the blurred training images, in place of the error: Improved-GS), "absgrad"
+            (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
         curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
         views: steps before an event over which the score is summed.
         floor: errors up to so many standard deviations of the noise do not count; 0 counts all.
@@ -154,12 +159,13 @@ class Budget(DensityControl):
     # What is gathered ------------------------------------------------------------------------------------------------
 
     def maps_at(self, step: int) -> int:
-        """Three while scores are summed (weight, wrong pixels, error), one while only weights are."""
-        return 3 if self._scores(step) and self.score == "error" else int(self._judges(step))
+        """Three while scores are summed (weight, wrong pixels, error or edge), one while only weights are."""
+        return 3 if self._scores(step) and self.score in ("error", "edge") else int(self._judges(step))
 
-    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+    def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         beyond = (error - self.floor * (self.noise or 0.0)).clamp(min=0)
-        maps = torch.stack([torch.ones_like(error), (beyond > 0).to(error), beyond], dim=-1)
+        worth = _edges(target).to(error) if self.score == "edge" and self._scores(step) else beyond
+        maps = torch.stack([torch.ones_like(error), (beyond > 0).to(error), worth], dim=-1)
         return maps[..., : self.maps_at(step)]
 
     @torch.no_grad()
@@ -173,7 +179,7 @@ class Budget(DensityControl):
         if output.weighted is None or output.weighted.sums is None:
             return
         sums = output.weighted.sums.to(state["score"])
-        if self._scores(step) and self.score == "error":
+        if self._scores(step) and self.score in ("error", "edge"):
             for name, column in zip(("weight", "wrong", "score"), sums.unbind(1), strict=True):
                 state[name].index_add_(0, ids, column)
         if self._judges(step):
@@ -235,6 +241,11 @@ class Budget(DensityControl):
         last = self.stop // self.every - 1
         before, after = (self.curve((done - first) / (last - first + 1)) for done in (number, number + 1))
         return 1.0 if number == last else (after - before) / (1 - before)
+
+
+def _edges(image: Tensor) -> Tensor:
+    """How strong the edges of an image [H, W, C] are in its pixels, [H, W]: |Laplacian| of its blurred mean over channels."""
+    return torch.from_numpy(abs(gaussian_laplace(image.mean(-1).cpu().numpy(), BLUR)))
 
 
 def _outside(weights: Tensor, share: float) -> Tensor:

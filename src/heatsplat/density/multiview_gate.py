@@ -102,8 +102,8 @@ class MultiviewGate(Adaptive):
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """ "gradient", "absolute" and "seen" [N], over all views; "wrong", "blame" and "blaming" [N], over the V views."""
-        names = ("gradient", "absolute", "seen", "wrong", "blaming", "blame")
-        return {name: torch.zeros(count, device=device) for name in names}
+        names = ("absolute", "wrong", "blaming", "blame")
+        return super().initial_state(count, device) | {name: torch.zeros(count, device=device) for name in names}
 
     def maps_at(self, step: int) -> int:
         used = self.gate_pixels if self._grows(step) else self.late_blame
@@ -134,7 +134,7 @@ class MultiviewGate(Adaptive):
         return event if event <= self.late_stop else None
 
     @torch.no_grad()
-    def pixel_maps(self, error: Tensor, step: int) -> Tensor:
+    def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         self._mean_error = float(error.mean())  # for ``observe``, which follows in the same step
         return self.wrong(error)[..., None].to(error)
 

@@ -98,7 +98,7 @@ class Proximity(Adaptive):
                 f"density.radiance names {', '.join(self.radiance)}, but the Gaussians have "
                 f"{', '.join(cloud.splats.names)}; name the tensors that hold the radiance of this thermal model"
             )
-        room = min(int(self.insert_growth * len(cloud)), self.cap_max - len(cloud))
+        room = min(int(self.insert_growth * len(cloud)), self._room(cloud))
         if room < 1:
             return 0
         sources, lengths, ends = self._edges(cloud, extent, room)

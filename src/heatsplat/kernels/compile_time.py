@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from llvmlite import ir
@@ -31,7 +32,8 @@ def _unbox_constant(numba_type, value, c):
 
 def compile_time(kind: type) -> type:
     """The frozen dataclass ``kind``, whose values kernels may take as arguments."""
-    typeof_impl.register(kind)(lambda value, _: ConstantType(value))
+    type_of = functools.cache(ConstantType)  # asked for at every call of a kernel
+    typeof_impl.register(kind)(lambda value, _: type_of(value))
     return kind
 
 

@@ -47,8 +47,10 @@ from heatsplat.kernels.layout import (
     channels,
     feature_column,
     has_absgrad,
+    map_count,
     modalities,
     modality_of,
+    pixel_rows,
     slot_columns,
 )
 from heatsplat.kernels.scheduling import parallel_for, take
@@ -57,6 +59,7 @@ from heatsplat.kernels.simd import (
     absolute,
     bits,
     exp2,
+    load_scalar,
     load_vector,
     lowest_bit,
     minimum,
@@ -65,6 +68,7 @@ from heatsplat.kernels.simd import (
     select,
     splat,
     store_first,
+    store_scalar,
     store_vector,
     total,
     totals,
@@ -187,23 +191,38 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centr
 
 
 @inline
+def _write_block(source, place, target, offset, step, row, wide, high):
+    """Copies a vector to the pixels of a block: ``step`` numbers from one to the next, ``row`` from one row to the next."""
+    for y in range(high):
+        for x in range(wide):
+            store_scalar(target, offset + y * row + x * step, load_scalar(source, place + y * BLOCK + x))
+
+
+@inline
 def _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth):
     """Copies the state of a tile into the images, with the background behind it."""
     height, width, colours = features.shape
-    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    for y in range(min(TILE, height - top)):
-        for x in range(min(TILE, width - left)):
-            block = tile * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
-            lane = y % BLOCK * BLOCK + x % BLOCK
-            for modality in range(modalities(layout)):
-                transmittances[block, modality, lane] = abs(transmittances[block, modality, lane])
-                alpha[modality, top + y, left + x] = np.float32(1.0) - transmittances[block, modality, lane]
-            for channel in range(colours):
-                behind = transmittances[block, modality_of(layout, channel), lane]
-                image[block, channel, lane] += behind * background[channel]
-                features[top + y, left + x, channel] = image[block, channel, lane]
-            if depth.shape[0] > 0:
-                depth[top + y, left + x] = image[block, colours, lane]
+    for block in range(BLOCKS):
+        left = tile % tiles_x * TILE + block % TILE_BLOCKS * BLOCK
+        top = tile // tiles_x * TILE + block // TILE_BLOCKS * BLOCK
+        wide, high = min(BLOCK, width - left), min(BLOCK, height - top)
+        if wide <= 0 or high <= 0:
+            continue
+        here, pixel = tile * BLOCKS + block, top * width + left
+        for modality in range(modalities(layout)):
+            place = here * modalities(layout) + modality
+            behind = absolute(load_vector(transmittances, place))
+            store_vector(transmittances, place, np.float32(1.0) - behind)
+            _write_block(transmittances, place * LANES, alpha, modality * height * width + pixel, 1, width, wide, high)
+            store_vector(transmittances, place, behind)
+        for channel in range(colours):
+            place = here * channels(layout) + channel
+            behind = load_vector(transmittances, here * modalities(layout) + modality_of(layout, channel))
+            store_vector(image, place, load_vector(image, place) + behind * background[channel])
+            offset, row = pixel * colours + channel, width * colours
+            _write_block(image, place * LANES, features, offset, colours, row, wide, high)
+        if depth.shape[0] > 0:
+            _write_block(image, (here * channels(layout) + colours) * LANES, depth, pixel, 1, width, wide, high)
 
 
 @inline
@@ -247,29 +266,43 @@ def composite(
 
 
 @inline
-def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker):
-    """Copies the gradients of a tile's pixels into blocks; those of pixels outside of the image are zero."""
+def _read_block(source, offset, step, row, wide, high, target, place):
+    """Copies the pixels of a block into a vector, as ``_write_block`` does the other way."""
+    for y in range(high):
+        for x in range(wide):
+            store_scalar(target, place + y * BLOCK + x, load_scalar(source, offset + y * row + x * step))
+
+
+@inline
+def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, maps, v_pixels, worker):
+    """Copies the gradients of a tile's pixels, and maps, into blocks; those of pixels outside of the image are zero."""
     height, width, colours = v_features.shape
-    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    if left + TILE > width or top + TILE > height:
-        for k in range(BLOCKS * v_pixels.shape[1]):
-            store_vector(v_pixels, worker * BLOCKS * v_pixels.shape[1] + k, splat(0.0))
-    for y in range(min(TILE, height - top)):
-        for x in range(min(TILE, width - left)):
-            block = worker * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
-            lane = y % BLOCK * BLOCK + x % BLOCK
-            for channel in range(colours):
-                v_pixels[block, channel, lane] = v_features[top + y, left + x, channel]
-            if v_depth.shape[0] > 0:
-                v_pixels[block, colours, lane] = v_depth[top + y, left + x]
-            for modality in range(modalities(layout)):
-                v_pixels[block, channels(layout) + modality, lane] = v_alpha[modality, top + y, left + x]
+    size = pixel_rows(layout)
+    for block in range(BLOCKS):
+        left = tile % tiles_x * TILE + block % TILE_BLOCKS * BLOCK
+        top = tile // tiles_x * TILE + block // TILE_BLOCKS * BLOCK
+        wide, high = max(min(BLOCK, width - left), 0), max(min(BLOCK, height - top), 0)
+        first, pixel = (worker * BLOCKS + block) * size, top * width + left
+        if wide < BLOCK or high < BLOCK:
+            for k in range(size):
+                store_vector(v_pixels, first + k, splat(0.0))
+        for channel in range(colours):
+            offset, row = pixel * colours + channel, width * colours
+            _read_block(v_features, offset, colours, row, wide, high, v_pixels, (first + channel) * LANES)
+        if v_depth.shape[0] > 0:
+            _read_block(v_depth, pixel, 1, width, wide, high, v_pixels, (first + colours) * LANES)
+        for modality in range(modalities(layout)):
+            place, offset = first + channels(layout) + modality, modality * height * width + pixel
+            _read_block(v_alpha, offset, 1, width, wide, high, v_pixels, place * LANES)
+        for number in range(map_count(layout)):
+            place, count = first + channels(layout) + modalities(layout) + number, map_count(layout)
+            _read_block(maps, pixel * count + number, count, width * count, wide, high, v_pixels, place * LANES)
 
 
 @inline
 def _start(layout, tile, colours, transmittances, image, v_pixels, worker, state, v_background):
     """Sets a worker's pixels to what they are before the first Gaussian; adds to the background's gradient."""
-    size = channels(layout) + modalities(layout)
+    size = pixel_rows(layout)
     for block in range(BLOCKS):
         final, here = tile * BLOCKS + block, worker * BLOCKS + block
         for modality in range(modalities(layout)):
@@ -306,8 +339,8 @@ def _clear_slot(slots, slot):
 def _composite_tile_backward(
     layout, tile, tiles_x, records, instances, begin, end, centres, v_pixels, worker, state, slots
 ):  # fmt: skip
-    """Fills the gradient slots of instances ``begin`` to ``end`` of a tile."""
-    size = channels(layout) + modalities(layout)
+    """Fills the gradient slots of instances ``begin`` to ``end`` of a tile; rows of a pixel and columns have one order."""
+    size = pixel_rows(layout)
     sums = registers(slot_columns(layout))
     weights, along = registers(modalities(layout)), registers(modalities(layout))
     for instance in range(begin, end):
@@ -363,13 +396,18 @@ def _composite_tile_backward(
                 column = OPACITY_GRADIENTS + modalities(layout) + channel
                 v_pixel = load_vector(v_pixels, here * size + channel)
                 sums[column] = sums[column] + weights[modality_of(layout, channel)] * v_pixel
+            for number in range(map_count(layout)):
+                row = channels(layout) + modalities(layout) + number
+                sums[OPACITY_GRADIENTS + row] = sums[OPACITY_GRADIENTS + row] + weights[0] * load_vector(
+                    v_pixels, here * size + row
+                )
         _write_slot(layout, slots, slot, sums)
 
 
 @inline
 def _composite_tiles_backward(
     worker, layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+    v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background,
 ):  # fmt: skip
     """``composite_backward`` in tiles, as long as there are any."""
     tiles_x = (v_features.shape[1] + TILE - 1) // TILE
@@ -377,7 +415,7 @@ def _composite_tiles_backward(
     while tile < tile_ends.shape[0]:
         for channel in range(v_features.shape[2]):
             v_background[tile, channel] = 0.0
-        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, v_pixels, worker)
+        _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, maps, v_pixels, worker)
         _start(layout, tile, v_features.shape[2], transmittances, image, v_pixels, worker, state, v_background)
         _composite_tile_backward(
             layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, v_pixels,
@@ -391,19 +429,20 @@ def _composite_tiles_backward(
 @kernel
 def composite_backward(
     layout, workers, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-    v_features, v_alpha, v_depth, v_pixels, state, slots, v_background,
+    v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background,
 ):  # fmt: skip
     """Fills the gradient slots of all instances.
 
     Args:
         records ... image: as ``composite`` left them.
         v_features, v_alpha, v_depth: [H, W, C], [M, H, W], and [H, W] where the last channel is depth, else [0, 0].
-        v_pixels, state: scratch [workers * BLOCKS, channels + modalities, LANES] and [.., 2 * modalities, LANES].
+        maps: [H, W, S], S that of the layout.
+        v_pixels, state: scratch [workers * BLOCKS, channels + modalities + S, LANES] and [.., 2 * modalities, LANES].
         slots: out [instances, slot_size], columns as in ``constants``.
         v_background: out [tiles, C], the gradient of the background tile by tile.
     """
     parallel_for(
         _composite_tiles_backward, workers,
         (layout, records, instances, tile_starts, tile_ends, centres, transmittances, image, ticket,
-         v_features, v_alpha, v_depth, v_pixels, state, slots, v_background),
+         v_features, v_alpha, v_depth, maps, v_pixels, state, slots, v_background),
     )  # fmt: skip

@@ -39,7 +39,7 @@ RANK = 15  # place among the visible Gaussians of its chunk
 SCREEN = 16
 
 # Columns of a gradient slot: five moments of the gradient (see compositing), the gradients of the logarithms of the
-# opacities, of the channels, and two absolute ones where they are wanted.
+# opacities, of the channels, sums of maps, and two absolute ones where they are wanted.
 OPACITY_GRADIENTS = 5
 # Columns of ``sums``, what the projection's backward pass needs of the summed slots: the moments, and
 DEPTH_GRADIENT = 5

@@ -27,11 +27,13 @@ class Layout:
         modality_of: one entry per channel, depth included, the modality whose opacity composites it.
         modalities: how many modalities there are; one without channels still has an alpha.
         absgrad: whether the backward pass also gathers absolute screen gradients; false in the forward pass.
+        maps: how many maps over pixels the backward pass sums by the weights of the first modality; 0 in the forward pass.
     """
 
     modality_of: tuple[int, ...]
     modalities: int = 1
     absgrad: bool = False
+    maps: int = 0
 
     @property
     def channels(self) -> int:
@@ -48,9 +50,14 @@ class Layout:
         return -(-(self.feature_column + self.channels) // 8) * 8
 
     @property
+    def pixel_rows(self) -> int:
+        """Numbers that the backward pass has of a pixel: gradients of its channels and alphas, and maps."""
+        return self.channels + self.modalities + self.maps
+
+    @property
     def slot_columns(self) -> int:
         """Numbers per gradient slot (heatsplat.kernels.constants has their order)."""
-        return OPACITY_GRADIENTS + self.modalities + self.channels + 2 * self.absgrad
+        return OPACITY_GRADIENTS + self.modalities + self.channels + self.maps + 2 * self.absgrad
 
     @property
     def slot_size(self) -> int:
@@ -61,6 +68,8 @@ class Layout:
 channels = constant("channels")
 modalities = constant("modalities")
 feature_column = constant("feature_column")
+map_count = constant("maps")
+pixel_rows = constant("pixel_rows")
 slot_columns = constant("slot_columns")
 has_absgrad = constant("absgrad")
 

@@ -482,7 +482,7 @@ def _project_block_backward(
 @inline
 def _project_chunk_backward(
     chunk, means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
-    sums, v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras,
+    sums, v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
     """``project_backward`` of the Gaussians of a chunk."""
     eps2d = camera[EPS2D], camera[EPS2D_SQUARED]
@@ -496,7 +496,7 @@ def _project_chunk_backward(
         clear_invisible(block, min(LANES, end - block), lanes, rows_are_ranks, v_opacities, v_features, absgrad)
         row = sum_slots(
             block, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place,
-            v_opacities, v_features, absgrad,
+            v_opacities, v_features, maps, absgrad,
         )  # fmt: skip
         _project_block_backward(
             block, mask_of(lanes), sums, place, means, quats, scales, camera, eps2d, antialiased,
@@ -507,7 +507,7 @@ def _project_chunk_backward(
 @kernel
 def project_backward(
     means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots, sums,
-    v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras,
+    v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
     """Gradients of the Gaussians from the gradient slots that compositing filled.
 
@@ -517,11 +517,12 @@ def project_backward(
         spans, slots: see ``slots.sum_slots``.
         sums: scratch, flat: for each chunk sixteen rows of SUMS numbers and room for a slot, in whole rows of SUMS.
         v_means, v_quats, v_scales, v_opacities, v_features, v_means2d: out, all rows are written.
+        maps: out [n, S], sums of maps for the visible ones.
         absgrad: out [N, 2], or [0, 0] where it is not wanted.
         v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
     """
     parallel_for(
         _project_chunk_backward, v_cameras.shape[0],
         (means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
-         sums, v_means, v_quats, v_scales, v_opacities, v_features, absgrad, v_means2d, v_cameras),
+         sums, v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras),
     )  # fmt: skip

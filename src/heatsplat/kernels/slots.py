@@ -48,16 +48,17 @@ def clear_invisible(first, count, lanes, rows_are_ranks, v_opacities, v_features
 
 @inline
 def sum_slots(
-    first, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place, v_opacities, v_features, absgrad
+    first, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place, v_opacities, v_features, maps, absgrad
 ):  # fmt: skip
     """Adds up the slots of sixteen Gaussians and finishes the gradients that need no projection; the next row.
 
     Args:
         first, lanes: the first of the Gaussians, and bits of the visible ones.
-        row: the row of the first visible one in features that are given for the visible ones only.
+        row: the row of the first visible one in what is given for the visible ones only.
         spans: [N, 2] the first slot of a Gaussian and the one after its last.
         slots: [slots, slot_size].
-        opacities, v_opacities: [M, N]; v_features: [N, C], or [n, C] where ``rows_are_ranks``; absgrad: [N, 2] or [0, 0].
+        opacities, v_opacities: [M, N]; v_features: [N, C], or [n, C] where ``rows_are_ranks``; maps: [n, S];
+            absgrad: [N, 2] or [0, 0].
         sums: scratch, of which sixteen rows of SUMS numbers from ``place`` on are filled for the visible ones, and which has
             room for a slot after them.
     """
@@ -91,6 +92,9 @@ def sum_slots(
         column += colours
         sums[mine + DEPTH_GRADIENT] = sums[column] if with_depth else np.float32(0.0)
         column += np.int64(with_depth)
+        for number in range(maps.shape[1]):
+            maps[row, number] = sums[column + number]
+        column += maps.shape[1]
         for axis in range(absgrad.shape[1]):
             absgrad[gaussian, axis] = sums[column + axis] * TWO_LN_2
         row += 1

@@ -42,6 +42,7 @@ class RenderInputs:
     absgrad: bool
     depth: bool
     eps2d: float = EPS2D
+    maps: int = 0
 
 
 def rasterization(
@@ -123,7 +124,8 @@ def rasterization(
         backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
     if backend not in BACKENDS:
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
-    probe = _Probe(features, means, maps, signs) if maps or signs is not None else None
+    native = maps if backend == "cpu" else 0  # the others sum maps as gradients of channels that are zero
+    probe = _Probe(features, means, maps - native, signs) if maps > native or signs is not None else None
     if probe is not None:
         features = probe
         background = None if background is None else torch.cat([background.new_zeros(probe.channels), background])
@@ -132,6 +134,7 @@ def rasterization(
     inputs = RenderInputs(
         means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
         background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
+        native,
     )  # fmt: skip
     output = import_module(f"heatsplat.renderers.{backend}").render(inputs)
     return output if probe is None else probe.read(output)
@@ -159,6 +162,6 @@ class _Probe:
         return replace(
             output,
             features=features,
-            weighted=WeightedSums(image, self.rows) if self.maps else None,
+            weighted=WeightedSums(image, self.rows) if self.maps else output.weighted,
             signed=None if self.signs is None else output.features[..., self.maps],
         )

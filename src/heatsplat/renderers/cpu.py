@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from heatsplat.contracts import RenderOutput
+from heatsplat.contracts import RenderOutput, WeightedSums
 from heatsplat.kernels import binning, compositing, projection
 from heatsplat.kernels.buffers import Buffers
 from heatsplat.kernels.constants import BLOCKS, CHUNK, RANK, SCREEN, SUMS, TILE
@@ -24,7 +24,7 @@ from heatsplat.renderers.base import FOV_MARGIN, RenderInputs
 from heatsplat.renderers.reference import channel_counts
 
 _CENTRES = compositing.pixel_centres()
-_UNWANTED = np.empty((0, 0), np.float32)
+_UNWANTED, _NO_MAPS = np.empty((0, 0), np.float32), np.empty((0, 0, 0), np.float32)
 
 
 def render(inputs: RenderInputs) -> RenderOutput:
@@ -44,12 +44,13 @@ def render(inputs: RenderInputs) -> RenderOutput:
     background = features.new_zeros(features.shape[1]) if inputs.background is None else inputs.background
     _check("features", features)
     _check("background", background)
-    image, alpha, depth = _Rasterize.apply(
+    sums = torch.zeros(len(ids), inputs.maps, requires_grad=True) if inputs.maps else None
+    image, alpha, depth, maps = _Rasterize.apply(
         frame, channels, ids, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
-        inputs.viewmat, frame.means2d,
+        inputs.viewmat, frame.means2d, sums,
     )  # fmt: skip
     meta = {"means2d": frame.means2d, "radii": frame.radii, "visible_ids": ids}
-    return RenderOutput(image, alpha, depth, meta)
+    return RenderOutput(image, alpha, depth, meta, None if sums is None else WeightedSums(maps, sums))
 
 
 def _check(name: str, tensor: Tensor) -> None:
@@ -61,26 +62,29 @@ def _check(name: str, tensor: Tensor) -> None:
 
 
 class _Rasterize(torch.autograd.Function):
-    """The image of a projected frame; ``means2d`` is an input, for its gradient is what density control looks at."""
+    """The image of a projected frame; ``means2d`` and ``sums`` are inputs, for density control looks at their gradients."""
 
     @staticmethod
-    def forward(ctx, frame, channels, ids, means, quats, scales, opacities, features, background, viewmat, means2d):
+    def forward(
+        ctx, frame, channels, ids, means, quats, scales, opacities, features, background, viewmat, means2d, sums
+    ):
         ctx.frame, ctx.means2d = frame, means2d
         ctx.save_for_backward(means, quats, scales, opacities, features)
         frame.bin(channels, ids, features)
-        return frame.composite(background)
+        maps = None if sums is None else torch.zeros(frame.inputs.height, frame.inputs.width, sums.shape[1])
+        return *frame.composite(background), maps
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_image, v_alpha, v_depth):
+    def backward(ctx, v_image, v_alpha, v_depth, maps):
         means, quats, scales, opacities, features = ctx.saved_tensors
-        v_background = ctx.frame.composite_backward(v_image, v_alpha, v_depth)
-        *v_gaussians, v_means2d, absgrad, v_viewmat = ctx.frame.project_backward(
+        v_background = ctx.frame.composite_backward(v_image, v_alpha, v_depth, maps)
+        *v_gaussians, v_means2d, sums, absgrad, v_viewmat = ctx.frame.project_backward(
             means, quats, scales, opacities, features, camera=ctx.needs_input_grad[9]
         )
         if absgrad is not None:
             ctx.means2d.absgrad = absgrad
-        return None, None, None, *v_gaussians, v_background, v_viewmat, v_means2d
+        return None, None, None, *v_gaussians, v_background, v_viewmat, v_means2d, sums
 
 
 class _Frame:
@@ -124,7 +128,7 @@ class _Frame:
         array, inputs = self.buffers.array, self.inputs
         modality_of = [modality for modality, count in enumerate(channels) for _ in range(count)]
         self.layout = Layout(tuple(modality_of + [0] * inputs.depth), len(channels))
-        self.backward_layout = replace(self.layout, absgrad=inputs.absgrad)
+        self.backward_layout = replace(self.layout, absgrad=inputs.absgrad, maps=inputs.maps)
         count, slabs = len(visible), binning.SLABS * self.workers
 
         self.ids = array("ids", np.int32, count)
@@ -166,7 +170,9 @@ class _Frame:
         )  # fmt: skip
         return image, alpha, depth
 
-    def composite_backward(self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None) -> Tensor:
+    def composite_backward(
+        self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None, maps: Tensor | None
+    ) -> Tensor:
         """The gradient of the background [C]. Leaves what the Gaussians need in their slots."""
         array, layout, rows = self.buffers.array, self.backward_layout, self.workers * BLOCKS
         self.slots = array("slots", np.float32, int(self.tile_starts[-1]), layout.slot_size)
@@ -175,34 +181,35 @@ class _Frame:
             layout, self.workers, self.records, self.instances, self.tile_starts, self.tile_ends, _CENTRES,
             self.transmittances, self.composited, np.zeros(1, np.int64),
             _numpy(v_image), _numpy(v_alpha), _UNWANTED if v_depth is None else _numpy(v_depth),
-            array("v_pixels", np.float32, rows, layout.channels + layout.modalities, LANES),
+            _NO_MAPS if maps is None else _numpy(maps), array("v_pixels", np.float32, rows, layout.pixel_rows, LANES),
             array("state", np.float32, rows, 2 * layout.modalities, LANES), self.slots, v_background,
         )  # fmt: skip
         return torch.from_numpy(v_background.sum(axis=0, dtype=np.float64).astype(np.float32))
 
     def project_backward(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-        """Gradients of the Gaussians and of ``means2d``; absolute screen gradients [N, 2] where they are wanted; and the
-        gradient of the view matrix where ``camera`` wants it."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
+        """Gradients of the Gaussians and of ``means2d``; where they are wanted sums of maps [n, S] and absolute screen
+        gradients [N, 2]; and the gradient of the view matrix where ``camera`` wants it."""
         v = [torch.empty(tensor.shape) for tensor in (means, quats, scales, opacities, features)]
         absgrad = torch.empty(self.count, 2) if self.inputs.absgrad else None
-        v_means2d = torch.empty(self.count, 2)
+        v_means2d, sums = torch.empty(self.count, 2), torch.empty(len(self.ids), self.inputs.maps)
         v_cameras = np.zeros((self.chunks, 12 if camera else 0))
         scratch = LANES * SUMS + -(-self.backward_layout.slot_size // LANES) * LANES
         projection.project_backward(
             _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera, self.inputs.antialiased,
             self.inputs.depth, callable(self.inputs.features), self.first_ranks, self.seen, self.spans, self.slots,
             self.buffers.array("sums", np.float32, self.chunks * scratch),
-            *(gradient.numpy() for gradient in v), _UNWANTED if absgrad is None else absgrad.numpy(),
+            *(gradient.numpy() for gradient in v), sums.numpy(), _UNWANTED if absgrad is None else absgrad.numpy(),
             v_means2d.numpy(), v_cameras,
         )  # fmt: skip
+        sums = sums if self.inputs.maps else None
         if not camera:
-            return *v, v_means2d, absgrad, None
+            return *v, v_means2d, sums, absgrad, None
         v_viewmat = torch.zeros(4, 4)
         v_camera = torch.from_numpy(v_cameras.sum(axis=0))
         v_viewmat[:3, :3], v_viewmat[:3, 3] = v_camera[:9].view(3, 3), v_camera[9:]
-        return *v, v_means2d, absgrad, v_viewmat
+        return *v, v_means2d, sums, absgrad, v_viewmat
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:

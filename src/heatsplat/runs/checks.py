@@ -36,8 +36,8 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
         config = config | {"budget": seconds_of(config["budget"])}
         if "max_steps" in keys_of(config["overrides"]):
             raise SceneError("budget chooses the number of steps, and max_steps gives it: leave out one of them")
-        if "preset" in keys_of(config["overrides"]):
-            raise SceneError("budget and preset both choose the number of steps: leave out one of them")
+        if both := {"preset", "recipe"} & keys_of(config["overrides"]):
+            raise SceneError(f"budget and {min(both)} both choose the number of steps: leave out one of them")
     if assembly.chooses_effects(config):
         replaced = ("thermal.", "thermal=", "sensor.", "sensor=")
         idle = [text for text in config["overrides"] if text.lstrip("+~").startswith(replaced)]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered, surface_depth
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
@@ -30,7 +31,7 @@ from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.module import SplatTraining
-from heatsplat.training.session import fit, prepare_machine, restore
+from heatsplat.training.session import fit, prepare_machine, restore, without_idle_hooks
 
 log = logging.getLogger("heatsplat")
 
@@ -81,6 +82,8 @@ def complete(config: dict[str, Any], output_dir: Path) -> RunResults:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return results
     run = begin(config, output_dir)
+    if run.config["doctor"] and run.config["ckpt"] is None and (found := warn_of(run.data.scene)):
+        write_findings(found, output_dir / FINDINGS_FILE)
     return fit(run.module, run.data, run.trainer, ckpt=run.config["ckpt"], test=run.config["test"])
 
 
@@ -101,7 +104,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
 
 def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
     """The training module that a configuration describes, which takes it into its checkpoints."""
-    module = build(config["module"], output_dir=str(output_dir))
+    module = without_idle_hooks(build(config["module"], output_dir=str(output_dir)))
     module.config = config  # set, not passed: Hydra would build every part in it once more
     return module
 
@@ -120,7 +123,7 @@ def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]
     for settings in on.values():
         if "dirpath" in settings:
             settings["dirpath"] = str(output_dir / settings["dirpath"])
-    return list(build(on).values())
+    return [without_idle_hooks(callback) for callback in build(on).values()]
 
 
 @dataclass(frozen=True)

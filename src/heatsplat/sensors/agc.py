@@ -9,16 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
-from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.per_frame import PerFrame
 
 EPSILON = 1e-4  # images are kept this far from 0 and 1 under the logit, which bounds its slope by 1e4
 
 
-class GainControl(SensorPart):
+class GainControl(PerFrame):
     """sigmoid(s logit(I) + t) with one s and t per training image: a monotone stretch of contrast (SupIR-GS, Eq. 5).
 
     A stretch common to all images belongs to the scene: log s and t have mean zero over the training images. An image
-    that was not trained on has no s and t of its own and is left as it is.
+    that was not trained on has no s and t of its own: it is left as it is, or has what lies between its neighbours'.
 
     It is computed as I + [sigmoid(s logit(Ĩ) + t) - sigmoid(logit(Ĩ))], Ĩ being I clipped to [ε, 1 - ε]. That is the
     same where nothing is clipped, exactly I for s = 1 and t = 0, and keeps a gradient where something is.
@@ -26,6 +26,8 @@ class GainControl(SensorPart):
     Args:
         stretch_max: bound of s and 1/s before the mean is taken away; larger than 1.
         shift_max: bound of |t| before the mean is taken away.
+        between: False leaves images that were not trained on as they are; True gives them log s and t between those of
+            their neighbours in time, linearly, as where the stretch follows what is seen and not a switch.
         weight: of the penalty mean of (s - 1)² + t².
         lr, lr_end: learning rate and the factor on it at the end of the run.
     """
@@ -34,6 +36,7 @@ class GainControl(SensorPart):
         self,
         stretch_max: float = 2.0,
         shift_max: float = 1.0,
+        between: bool = False,
         weight: float = 5e-4,
         lr: float = 0.03,
         lr_end: float = 0.1,
@@ -43,25 +46,23 @@ class GainControl(SensorPart):
             raise ValueError(
                 f"stretch_max must be above 1 and shift_max not negative, got {stretch_max} and {shift_max}"
             )
-        self.weight, self.lr, self.lr_end = weight, lr, lr_end
+        self.between, self.weight, self.lr, self.lr_end = between, weight, lr, lr_end
         self.register_buffer("bounds", torch.tensor([math.log(stretch_max), shift_max]))
-        self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))
         self.raw = nn.Parameter(torch.zeros(0, 2))
 
     def prepare(self, scene: SceneData) -> None:
-        self.frame_ids = torch.tensor(sorted({frame.frame_id for frame in scene.train.frames}))
+        super().prepare(scene)
         self.raw = nn.Parameter(torch.zeros(len(self.frame_ids), 2))
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        row = (self.frame_ids == frame.frame_id).nonzero().flatten()
-        if len(row) == 0:
+        if not (self.between or self.trained_on(frame)):
             return image
-        log_stretch, shift = self.settings()[row[0]]
+        log_stretch, shift = self.at(self.settings(), frame)
         logits = torch.logit(image.clamp(EPSILON, 1 - EPSILON))
         return image + (torch.sigmoid(log_stretch.exp() * logits + shift) - torch.sigmoid(logits))
 
     def settings(self) -> Tensor:
-        """log s and t of the training images in order of their ids, [F, 2], each with mean zero."""
+        """log s and t of the training images in order of time, [F, 2], each with mean zero."""
         values = self.bounds * self.raw.tanh()
         return values - values.mean(0)
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
-from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.per_frame import PerFrame
 
 
-class FrameOffset(SensorPart):
+class FrameOffset(PerFrame):
     """I (1 + g_f) + o_f with one offset o_f, and one gain g_f where they are asked for, per training image.
 
     What all images share belongs to the scene: offsets and gains have mean zero over the training images. An image that
@@ -41,31 +41,20 @@ class FrameOffset(SensorPart):
             raise ValueError(f"offset_max must be positive and gain_max lie in [0, 1), got {offset_max} and {gain_max}")
         self.offset_max, self.gain_max = offset_max, gain_max
         self.weight, self.lr, self.lr_end = weight, lr, lr_end
-        self.register_buffer("moments", torch.zeros(0, dtype=torch.float64))  # of the training images, increasing
-        self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))  # in the same order
-        self.register_buffer("timed", torch.tensor(True))
         self.raw_offset = nn.Parameter(torch.zeros(0))
         self.raw_gain = nn.Parameter(torch.zeros(0)) if gain_max > 0 else None
 
     def prepare(self, scene: SceneData) -> None:
-        self.timed.fill_("time" in scene.metadata)
-        frames = sorted(scene.train.frames, key=lambda frame: (self._moment(frame), frame.frame_id))
-        self.moments = torch.tensor([self._moment(frame) for frame in frames], dtype=torch.float64)
-        self.frame_ids = torch.tensor([frame.frame_id for frame in frames])
-        self.raw_offset = nn.Parameter(torch.zeros(len(frames)))
+        super().prepare(scene)
+        self.raw_offset = nn.Parameter(torch.zeros(len(self.moments)))
         if self.raw_gain is not None:
-            self.raw_gain = nn.Parameter(torch.zeros(len(frames)))
+            self.raw_gain = nn.Parameter(torch.zeros(len(self.moments)))
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        before, after, share = self._place(frame)
-
-        def at(values: Tensor) -> Tensor:
-            return values[before] if share == 0 else torch.lerp(values[before], values[after], share)
-
-        offset = at(self.offsets())
+        offset = self.at(self.offsets(), frame)
         if self.raw_gain is None:
             return image + offset
-        return image + (image * at(self.gains()) + offset)
+        return image + (image * self.at(self.gains(), frame) + offset)
 
     def offsets(self) -> Tensor:
         """o of the training images in order of time, [F] in image units, with mean zero."""
@@ -74,26 +63,6 @@ class FrameOffset(SensorPart):
     def gains(self) -> Tensor:
         """g of the training images in order of time, [F], with mean zero; empty without gains."""
         return self.raw_offset.new_zeros(0) if self.raw_gain is None else _bounded(self.raw_gain, self.gain_max)
-
-    def _moment(self, frame: Frame) -> float:
-        """What orders images: their time, or their number. In the middle of the record for a view without."""
-        moment = frame.time_s if self.timed else frame.frame_id
-        if moment is not None:
-            return float(moment)
-        return float(self.moments[0] + self.moments[-1]) / 2
-
-    def _place(self, frame: Frame) -> tuple[int, int, float]:
-        """Training images between which a frame lies, and how far from the first to the second."""
-        own = (self.frame_ids == frame.frame_id).nonzero()
-        if len(own):
-            return int(own[0]), int(own[0]), 0.0
-        moment = self._moment(frame)
-        after = int(torch.searchsorted(self.moments, moment))
-        if after in (0, len(self.moments)):
-            end = min(after, len(self.moments) - 1)
-            return end, end, 0.0
-        earlier, later = self.moments[after - 1].item(), self.moments[after].item()
-        return after - 1, after, (moment - earlier) / (later - earlier)
 
     def penalty(self) -> Tensor:
         penalty = self.offsets().square().mean()

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import Camera, SceneData, SceneError
 from heatsplat.splats import Splats
 
+NORMALS = "normals"  # the tensor that ``surface_normals`` declares
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
 
 
@@ -39,6 +40,13 @@ class Query:
     def rows(self, tensor: Tensor) -> Tensor:
         """The rows of a per-Gaussian tensor that are asked for, [n, ...]."""
         return tensor if self.ids is None else tensor.index_select(0, self.ids)
+
+    def normals(self, splats: Splats) -> Tensor:
+        """Unit normals [n, 3] of the surfaces that the Gaussians show, of models that declared ``surface_normals``.
+
+        They point to the side from which the surface is seen. Images and not heat decide how it lies: no gradient passes.
+        """
+        return self.rows(splats[NORMALS].detach())
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,9 @@ class PerGaussian:
         lr: learning rate.
         l2: weight of the penalty l2 * sum(x²); applied inside the optimiser, where it costs nothing (Adam's coupled
             weight decay of 2 * l2 is exactly its gradient).
-        l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them.
+        l2_mean: divides l2 by the current number of Gaussians, which makes the penalty a mean over them; and ``group`` by its
+            root, which makes that one a root mean square.
+        group: weight of the penalty Σ_k √(Σ_i x_ik²) over the columns k of the last dimension; inside the optimiser, too.
         lr_end: factor on lr at the last step of the run, log-linear in between.
         paced: whether it learns faster in shorter runs (``Optimisation.length_power``). Not what many numbers make up
             together, such as the gains of a series or the input of a network: their steps add up.
@@ -87,6 +97,15 @@ class PerGaussian:
     l2_mean: bool = False
     lr_end: float = 1.0
     paced: bool = True
+    group: float = 0.0
+
+
+def surface_normals(seeds: Seeds) -> dict[str, PerGaussian]:
+    """What a model adds to its tensors that reads ``Query.normals``: a constant [N, 3] that training fills and refreshes.
+
+    Several members of one model may declare it; it is the same tensor. Where none does, normals are never computed.
+    """
+    return {NORMALS: PerGaussian(torch.zeros_like(seeds.means), 0.0)}
 
 
 class Heat(nn.Module, ABC):

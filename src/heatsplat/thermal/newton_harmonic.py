@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,7 @@ log = logging.getLogger(__name__)
 PARAMS = ("rate", "faithful")
 PENALTIES = ("group", "ridge")
 REDUCTIONS = ("sum", "mean_over_gaussians")
+UNITS = ("scene", "si")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
@@ -40,8 +42,8 @@ class NewtonHarmonic(ThermalModel):
     of it, so that a scene keeps the few frequencies that it needs.
 
     **Convention:** inside, time is counted in observed spans and temperature in image units, 0 at Tmin and 1 at Tmax;
-    so are rates and gains, and so is the penalty. A scene without a range is modelled in image values, with no
-    temperature in kelvin.
+    so are rates and gains, and so is the penalty unless asked otherwise. A scene without a range is modelled in image
+    values, with no temperature in kelvin.
 
     Tensors: "initial_state" [N], "source_gains" [N, 2, K] (sin, cos; absent without frequencies) and "log_rate" [N], or
     "log_capacity" [N] and "log_conductance" [N] in faithful form. With ``drop_sources_at``, "source_gains" becomes sparse
@@ -57,7 +59,9 @@ class NewtonHarmonic(ThermalModel):
         penalty: "group" or "ridge".
         source_penalty: its weight; 0 leaves it out.
         penalty_reduction: over Gaussians, of the squares: "mean_over_gaussians" or "sum" (the paper and the authors' code),
-            which grows with their number and, in these units, suppresses the source it should only tame.
+            which grows with their number and, in units of the scene, suppresses the source it should only tame.
+        penalty_units: what A and B are counted in by the penalty: "scene", image units per span, or "si", °C per second
+            (the paper's, times C in faithful form).
         gauge_l2: weight of the prior (log C)² in faithful form.
         ambient: "measured" (the scene's, else learned), "learned" (from the measured one, if any) or a number in °C.
         clip: how values outside the range are shown: "straight_through" clamps values but lets gradients pass, so that
@@ -87,6 +91,7 @@ class NewtonHarmonic(ThermalModel):
         penalty: str = "group",
         source_penalty: float = 1e-3,
         penalty_reduction: str = "mean_over_gaussians",
+        penalty_units: str = "scene",
         gauge_l2: float = 1e-5,
         ambient: str | float = "measured",
         clip: str = "straight_through",
@@ -103,13 +108,14 @@ class NewtonHarmonic(ThermalModel):
         check_option("param", param, PARAMS)
         check_option("penalty", penalty, PENALTIES)
         check_option("penalty_reduction", penalty_reduction, REDUCTIONS)
+        check_option("penalty_units", penalty_units, UNITS)
         check_option("clip", clip, CLIPS)
         if isinstance(ambient, str) and ambient not in ("measured", "learned"):
             raise ValueError(f"ambient must be measured, learned or a number in °C, got '{ambient}'")
         self.frequencies, self.param = frequencies, param
         self.tau_min_s, self.frequency_gain, self.separation = tau_min_s, frequency_gain, separation
         self.grouped, self.source_penalty, self.gauge_l2 = penalty == "group", source_penalty, gauge_l2
-        self.over_mean = penalty_reduction == "mean_over_gaussians"
+        self.over_mean, self.in_si = penalty_reduction == "mean_over_gaussians", penalty_units == "si"
         self.clip = clip
         self.lr_initial, self.lr_source, self.lr_rate = lr_initial, lr_source, lr_rate
         self.lr, self.lr_end = lr_ambient, lr_end
@@ -130,6 +136,11 @@ class NewtonHarmonic(ThermalModel):
             self.omega = grid * self.clock.span_s
         else:
             log.warning("scene '%s' shows one moment only: the model has no heat source", scene.name)
+        if scene.thermal_range is None and self.in_si:
+            raise SceneError(
+                f"thermal.penalty_units=si counts heat sources in °C per second, but scene '{scene.name}' has no temperature "
+                "range; use thermal.penalty_units=scene"
+            )
         if scene.thermal_range is None:
             log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
         self._set_ambient(scene)
@@ -181,8 +192,11 @@ class NewtonHarmonic(ThermalModel):
                 self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
         tensors, harmonics = self._bodies(initial), self.omega.numel()
         if harmonics > 0:
-            gains, ridge = initial.new_zeros(len(initial), 2, harmonics), 0.0 if self.grouped else self.source_penalty
-            tensors["source_gains"] = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            gains = initial.new_zeros(len(initial), 2, harmonics)
+            weight, unit = self.source_penalty, self._penalty_unit()
+            ridge, group = (0.0, weight * unit) if self.grouped else (weight * unit**2, 0.0)
+            declared = self._tensor(gains, self._lr_gains(harmonics), ridge, paced=False)
+            tensors["source_gains"] = replace(declared, group=group)
         return tensors
 
     def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
@@ -197,16 +211,12 @@ class NewtonHarmonic(ThermalModel):
         tensors["log_capacity"] = self._tensor(torch.zeros_like(initial), self.lr_rate, self.gauge_l2)
         return tensors | {"log_conductance": self._tensor(log_rate, self.lr_rate)}
 
+    def _penalty_unit(self) -> float:
+        """A gain of 1 image unit per span in the units of the penalty."""
+        return self.range.bounds.span_k / self.clock.span_s if self.in_si else 1.0
+
     def _lr_gains(self, harmonics: int) -> float:
         return self.lr_source / harmonics
-
-    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        """ "source_groups", the penalty of the groups; the other one is in the optimiser."""
-        if not self.grouped or self.source_penalty == 0 or self.omega.numel() == 0:
-            return {}
-        strengths = torch.linalg.vector_norm(splats["source_gains"], dim=(0, 1)).sum()
-        reduced = strengths / math.sqrt(len(splats)) if self.over_mean else strengths
-        return {"source_groups": self.source_penalty * reduced}
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         state = self._state(splats, query.time_s, query.ids)

@@ -10,18 +10,22 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from heatsplat.contracts import check_option
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics.grey_body import radiance, temperature_of
 from heatsplat.splats import Splats
+from heatsplat.thermal.band_scale import DEGREE, BandScale
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
+from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.harmonics import harmonics
 from heatsplat.thermal.wrapper import Wrapper
 
 DEGREES = {"emissivity": 1, "temperature": 1, "reflectance": 0}
 ATTRIBUTES = tuple(DEGREES)
 REFLECTANCES = ("free", "kirchhoff")
+LAWS = ("grey", "band")
+MEASURED = "measured"
 START = (0.05, 0.98)  # of temperature: below, 4 T³ leaves hardly a gradient; above, hardly the sigmoid's
 
 
@@ -35,6 +39,10 @@ class Radiative(Wrapper):
     **Convention:** everything is in image units. Only the sum ε σ T⁴ + ρ L is observed, so that T orders surfaces by
     heat but is no temperature in kelvin; temperatures are those of the image, through the scene's range.
 
+    With ``law="band"`` (ours) T is the image value of a black body of the surface's temperature, and the emission that of
+    a black body which sends as much in the camera's band: B(v) = ε B(T) + (1 - ε) B(L). Of a surface that looks the same
+    from all sides only this sum is observed, too: its ε stays where it started, and T is right as far as ε is.
+
     Tensors: "emissivity", "temperature", "reflectance" [N, 1, 1] (the constant harmonic, before the sigmoid) and, from
     degree 1, "emissivity_rest" and so on, [N, B - 1, 1]; those of ``color``. Without the three parameters there is
     "radiance" in their place.
@@ -44,10 +52,12 @@ class Radiative(Wrapper):
         three_parameter: False emits max(0, 1/2 + harmonics) as 3DGS does, without ε, T, ρ, σ and L (Tab. 3).
         dual_opacity: False composites both images with one opacity (Tab. 3).
         reflectance: "free", as the paper has it, or "kirchhoff": ρ = 1 - ε, as it is for opaque bodies.
+        law: of emission: "grey", ε σ T⁴ + ρ L (paper), or "band", Planck's in the camera's band, for opaque bodies.
         degrees: degree of the harmonics of each attribute, 0 to 3; that of "temperature" serves "radiance" too.
         emissivity, reflectance_start, gain, surroundings: ε, ρ, σ and L before training. T starts at what then gives
             the grey value of the training images, within 0.05 and 0.98. None is the gain with which 0.98 gives white: with
-            a lower one no Gaussian starts as bright as images are.
+            a lower one no Gaussian starts as bright as images are. Of the surroundings, "measured" keeps L at the scene's
+            ambient temperature.
         clip: how values above 1 are shown: "straight_through" clamps them but lets gradients pass; "hard" stops their
             gradient (the paper's Eq. 5); "none" shows them as they are.
         color_l2: λ_sh, weight of the squared higher harmonics of the colour, summed over harmonics and channels and
@@ -58,7 +68,7 @@ class Radiative(Wrapper):
         lr: learning rate of σ and L before softplus and sigmoid.
 
     Raises:
-        ValueError: an option is unknown, or a value is out of its range.
+        ValueError: an option is unknown, a value is out of its range, or options do not go together.
     """
 
     def __init__(
@@ -67,11 +77,12 @@ class Radiative(Wrapper):
         three_parameter: bool = True,
         dual_opacity: bool = True,
         reflectance: str = "free",
+        law: str = "grey",
         degrees: Mapping[str, int] = DEGREES,
         emissivity: float = 0.9,
         reflectance_start: float = 0.1,
         gain: float | None = None,
-        surroundings: float = 0.2,
+        surroundings: float | str = 0.2,
         clip: str = "straight_through",
         color_l2: float = 5e-5,
         lr_attributes: float = 2.5e-3,
@@ -81,18 +92,27 @@ class Radiative(Wrapper):
     ) -> None:
         super().__init__({"color": color}, own_channels=1)
         check_option("reflectance", reflectance, REFLECTANCES)
+        check_option("law", law, LAWS)
         check_option("clip", clip, CLIPS)
+        measured = surroundings == MEASURED
         if not (
-            0 < emissivity < 1 and 0 < reflectance_start < 1 and 0 < surroundings < 1 and (gain is None or gain > 0)
+            0 < emissivity < 1
+            and 0 < reflectance_start < 1
+            and (measured or 0 < surroundings < 1)
+            and (gain is None or gain > 0)
         ):
             raise ValueError(
-                "emissivity, reflectance_start and surroundings lie between 0 and 1 and gain is positive, got "
+                "emissivity, reflectance_start and surroundings (or measured) lie between 0 and 1 and gain is positive, got "
                 f"{emissivity}, {reflectance_start}, {surroundings} and {gain}"
             )
         if color.modality != "rgb" or color.companions:
             raise ValueError(f"color must explain rgb images and nothing else, got a model of {color.modality} images")
         if set(degrees) != set(ATTRIBUTES):
             raise ValueError(f"degrees must name {', '.join(ATTRIBUTES)}, got {', '.join(degrees)}")
+        if law == "band" and not (three_parameter and reflectance == "kirchhoff"):
+            raise ValueError(
+                "law=band is that of opaque bodies: it goes with three_parameter and reflectance=kirchhoff"
+            )
         self.three_parameter, self.kirchhoff, self.clip = three_parameter, reflectance == "kirchhoff", clip
         if not three_parameter:
             self.degrees = {"radiance": degrees["temperature"]}
@@ -103,11 +123,16 @@ class Radiative(Wrapper):
         self.emissivity, self.reflectance = emissivity, 1 - emissivity if self.kirchhoff else reflectance_start
         self.color_l2, self.lr = color_l2, lr
         self.lr_attributes, self.lr_rest, self.lr_attributes_end = lr_attributes, lr_rest, lr_attributes_end
-        if three_parameter:
-            if gain is None:
-                gain = (1.0 - self.reflectance * surroundings) / (emissivity * START[1] ** 4)
-            self.raw_gain = nn.Parameter(torch.tensor(math.log(math.expm1(gain))))
+        self.band = BandScale() if law == "band" else None
+        self.range = ImageRange() if law == "band" else None
+        if three_parameter and measured:
+            self.register_buffer("ambient", torch.tensor(0.5))
+        elif three_parameter:
             self.raw_surroundings = nn.Parameter(torch.logit(torch.tensor(surroundings)))
+        if three_parameter and law == "grey":
+            self._white = gain is None
+            self.raw_gain = nn.Parameter(torch.tensor(0.0 if gain is None else math.log(math.expm1(gain))))
+            self._set_white()
 
     @property
     def gain(self) -> Tensor:
@@ -116,10 +141,31 @@ class Radiative(Wrapper):
 
     @property
     def surroundings(self) -> Tensor:
-        """L, in (0, 1)."""
-        return self.raw_surroundings.sigmoid()
+        """L: in (0, 1) where it is learned, and what was measured else."""
+        return self.ambient if "ambient" in self._buffers else self.raw_surroundings.sigmoid()
+
+    @torch.no_grad()
+    def _set_white(self) -> None:
+        if self._white:
+            gain = (1.0 - self.reflectance * self.surroundings) / (self.emissivity * START[1] ** 4)
+            self.raw_gain.copy_(gain.expm1().log())
 
     # What the contract asks -----------------------------------------------------------------------------
+
+    def prepare(self, scene: SceneData) -> None:
+        super().prepare(scene)
+        if "ambient" in self._buffers:
+            if scene.thermal_range is None or scene.ambient_c is None:
+                raise SceneError(
+                    f"thermal.surroundings=measured needs the ambient temperature, which scene '{scene.name}' does not say; "
+                    "give it to the data set, or learn the surroundings with a number in (0, 1) to start from"
+                )
+            self.ambient.fill_(scene.thermal_range.to_unit(scene.ambient_c))
+            if self.band is None:
+                self._set_white()
+        if self.band is not None:
+            self.band.prepare(scene)
+            self.range.prepare(scene)
 
     @torch.no_grad()
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
@@ -141,7 +187,13 @@ class Radiative(Wrapper):
         if not self.three_parameter:
             return {"radiance": grey - 0.5}
         emissivity, reflectance = torch.full_like(grey, self.emissivity), torch.full_like(grey, self.reflectance)
-        temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings).clamp(*START)
+        if self.band is None:
+            temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings)
+        else:
+            others = (1.0 - emissivity) * self.band.root_of(self.surroundings) ** 4
+            own = (self.band.root_of(grey) ** 4 - others) / emissivity
+            temperature = self.band.value_of(own.clamp(min=0.0).sqrt().sqrt())
+        temperature = temperature.clamp(*START)
         values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
         return {name: torch.logit(values[name]) for name in self.degrees}
 
@@ -155,10 +207,17 @@ class Radiative(Wrapper):
             return told
         return told | {name: values[:, 0] for name, values in self._body(splats, query).items()}
 
+    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+        """Of bodies that send by Planck's law; the mean over directions of what it is before the sigmoid counts."""
+        if self.band is None:
+            return super().temperature(splats, time_s)
+        return self.range.kelvin((spherical_harmonics.C0 * splats["temperature"][:, 0, 0]).sigmoid())
+
     def effects(self) -> dict[str, dict]:
         effects = super().effects()
         if self.three_parameter:
-            effects["radiation"] = {"law": "ε σ T⁴", "degrees": dict(self.degrees)}
+            law = "ε σ T⁴" if self.band is None else "ε B(T)"
+            effects["radiation"] = {"law": law, "degrees": dict(self.degrees)}
             effects["reflection"] = {"reflectance": "1 - ε" if self.kirchhoff else "learned"}
         if not self.shared_opacity:
             effects["thermal_opacity"] = {"opacities": len(self.opacity_channels)}
@@ -168,6 +227,7 @@ class Radiative(Wrapper):
     def cost(self) -> int:
         directions = {1: 0, 4: 12, 9: 27, 16: 48}  # by number of harmonics: normalising, and the polynomials
         formula = 6 + 4 * len(self.degrees) if self.three_parameter else 1  # the sum, and a sigmoid per attribute
+        formula += 0 if self.band is None else 2 * DEGREE + 10  # the two polynomials and roots
         return super().cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
 
     # The thermal band -----------------------------------------------------------------------------------
@@ -177,6 +237,9 @@ class Radiative(Wrapper):
         if not self.three_parameter:
             return (self._sum(splats, query, "radiance") + 0.5).clamp(min=0.0)
         body = self._body(splats, query)
+        if self.band is not None:
+            own, others = (self.band.root_of(values) ** 4 for values in (body["temperature"], self.surroundings))
+            return self.band.value_of(torch.lerp(others.to(own), own, body["emissivity"]).sqrt().sqrt())
         sent = radiance(body["emissivity"], body["temperature"], self.gain, body["reflectance"], self.surroundings)
         return clipped(sent, self.clip)
 

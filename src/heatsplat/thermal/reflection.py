@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
-from heatsplat.geometry.rotations import shortest_axes
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian, Query, Seeds
+from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.part import HeatPart
 
 
@@ -20,7 +19,7 @@ class Reflection(HeatPart):
     """(1 - ρ) x + ρ L of what a surface emits: Kirchhoff's law for an opaque body (RaViGS, Eq. 4, with ρ = 1 - ε).
 
     The radiance L of the surroundings belongs to the scene: spherical harmonics of the direction in which the line of
-    sight goes on after it met the surface, whose normal is the shortest axis of the Gaussian. At degree 0 it is one
+    sight goes on after it met the surface, with its normal (``Query.normals``). At degree 0 it is one
     number (RaViGS), which a surface that never changes could as well emit itself.
 
     Tensor: "reflectance_logit" [N].
@@ -59,9 +58,8 @@ class Reflection(HeatPart):
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         logit = math.log(self.reflectance / (1 - self.reflectance))
-        return {
-            "reflectance_logit": PerGaussian(seeds.values.new_full((len(seeds.means),), logit), self.lr_reflectance)
-        }
+        own = {"reflectance_logit": PerGaussian(seeds.values.new_full((len(seeds.means),), logit), self.lr_reflectance)}
+        return own | surface_normals(seeds) if self.degree > 0 else own
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         share = query.rows(splats["reflectance_logit"]).sigmoid()[:, None]
@@ -74,7 +72,7 @@ class Reflection(HeatPart):
         if query.camera is None:
             raise ValueError("what a surface mirrors depends on the view: give a camera")
         means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
-        normals = shortest_axes(query.rows(splats.quats).detach(), query.rows(splats["log_scales"]).detach())
+        normals = query.normals(splats)
         sight = spherical_harmonics.unit(means - query.camera.center.to(means))
         mirrored = sight - 2 * (sight * normals).sum(1, keepdim=True) * normals
         return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import NORMALS, Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
 
 
 class Wrapper(ThermalModel):
@@ -94,7 +94,7 @@ class Wrapper(ThermalModel):
                 last = channel + sum(member.modality_channels)
                 own, channel = replace(seeds, values=seeds.values[:, channel:last]), last
             found = member.per_gaussian(own)
-            if twice := ", ".join(sorted(tensors.keys() & found.keys())):
+            if twice := ", ".join(sorted((tensors.keys() & found.keys()) - {NORMALS})):
                 raise ValueError(
                     f"two members of {type(self).__name__} call a tensor {twice}: give one a prefix, such as "
                     "thermal.companion.prefix=companion_"

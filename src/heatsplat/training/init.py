@@ -54,16 +54,15 @@ class Initialisation:
         self.separate = separate
 
     def __call__(
-        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: int | None = None
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
     ) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties).
 
         There are at most ``cap_max`` of them (``DensityControl``): of more points, a seeded draw.
         """
         times = len(thermal.opacity_channels) if self.separate else 1
-        means = self._means(
-            scene, generator_for(seed, 0, "init"), None if cap_max is None else max(cap_max // times, 1)
-        )
+        most = None if cap_max is None else max(cap_max / times, 1)
+        means = self._means(scene, generator_for(seed, 0, "init"), most)
         count, distances = len(means), neighbour_distances(means)
         if count == 1:
             distances = torch.full((1, 1), LONE_SIZE * scene.extent)
@@ -79,10 +78,10 @@ class Initialisation:
             geometry = _separate(geometry)
         return with_heat(geometry, scene, thermal, seed)
 
-    def _means(self, scene: SceneData, generator: torch.Generator, most: int | None) -> Tensor:
+    def _means(self, scene: SceneData, generator: torch.Generator, most: float | None) -> Tensor:
         points = scene.points.float()
         wanted = (self.count or 100_000) if self.source == "random" else min(self.count or len(points), len(points))
-        count = wanted if most is None else min(wanted, most)
+        count = wanted if most is None else int(min(wanted, most))
         if count < wanted:
             log.info("init: %s of %s Gaussians, as many as density.cap_max allows", f"{count:,}", f"{wanted:,}")
         if self.source == "random":
@@ -115,7 +114,7 @@ class Pretrained:
         self.path = Path(path).expanduser()
 
     def __call__(
-        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: int | None = None
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
     ) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors; more than ``cap_max`` are all kept."""
         if not self.path.is_file():

@@ -16,15 +16,17 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation
+from heatsplat.training.normals import Normals
+from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -57,6 +59,7 @@ class SplatTraining(pl.LightningModule):
         merging: what is done to Gaussians after training, before the test; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
+        normals: where normals come from, of models that read them; None: as before training, throughout.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -83,6 +86,7 @@ class SplatTraining(pl.LightningModule):
         merging: Merging | None = None,
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
+        normals: Normals | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -99,6 +103,7 @@ class SplatTraining(pl.LightningModule):
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
+        self.normals = normals or Normals()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -115,6 +120,13 @@ class SplatTraining(pl.LightningModule):
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
         self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -135,6 +147,8 @@ class SplatTraining(pl.LightningModule):
         self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
+        if NORMALS in self.splats:
+            self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -167,8 +181,8 @@ class SplatTraining(pl.LightningModule):
                 "name": name,
                 "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
-                "weight_decay": self._penalty(item),
             }
+            | penalties(item, len(self.splats))
             for name, item in self._declared.items()
         ]
         for name, parameter in self.thermal.named_parameters():
@@ -290,7 +304,8 @@ class SplatTraining(pl.LightningModule):
         self._rendered = (output, camera)
         loss = sum(terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), here)
+            target = resampled(inputs.target, camera.height, camera.width, "area")
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
@@ -330,18 +345,21 @@ class SplatTraining(pl.LightningModule):
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
+        if NORMALS in self.splats and step + 1 in self.normals.refresh:
+            self._face(self.splats[NORMALS].detach())
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
-                    group["weight_decay"] = self._penalty(self._declared[group["name"]])
+                    group |= penalties(self._declared[group["name"]], len(self.splats))
+
+    @torch.no_grad()
+    def _face(self, normals: Tensor) -> None:
+        """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
+        self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
         return Cloud(self.splats, optimizer, self._density_state, self.smoothing.kept_opacity)
-
-    def _penalty(self, item: PerGaussian) -> float:
-        """Adam's weight decay whose gradient is that of item.l2 * sum(x²), or of its mean over the Gaussians."""
-        return 2 * item.l2 / (len(self.splats) if item.l2_mean else 1)
 
     # Evaluation --------------------------------------------------------------------------------------
 
@@ -409,12 +427,17 @@ class SplatTraining(pl.LightningModule):
         told = self.attributes(frame)
         if not told:
             return {}
-        *shape, opacities = self.shapes(frame)
-        values = torch.stack(list(told.values()), dim=1)
-        output = self.renderer(*shape, opacities[:1], values, frame.camera, None, (len(told),))
+        output = self.composited(frame, torch.stack(list(told.values()), dim=1))
         alpha = output.alpha[0, ..., None]
         maps = torch.where(alpha > 0, output.features / alpha, torch.nan)
         return dict(zip(told, maps.unbind(-1), strict=True))
+
+    def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
+        """What the camera of ``frame`` sees of values [N, C] of all Gaussians, before black, in the first modality."""
+        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+        return self.renderer(
+            *shape, opacities[:1], values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
+        )
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         start = time.perf_counter()

@@ -2,16 +2,121 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
+from heatsplat.kernels import adam as kernel
+from heatsplat.kernels.simd import LANES
 from heatsplat.splats import Splats
+from heatsplat.thermal.base import PerGaussian
 from heatsplat.training.decoupled import DecoupledDecay
 
 PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
 FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does worse than at four (docs/presets.md)
+
+
+class OnePassAdam(torch.optim.Adam):
+    """torch's Adam, whose step on a processor is one kernel over all float32 tensors (heatsplat.kernels.adam).
+
+    State and options are torch's own. torch steps tensor by tensor, which for small scenes takes longer than the arithmetic.
+
+    A group may have one more option, "group_penalty": the weight of a penalty Σ_k √(Σ_i x_ik²) over the columns k of the
+    last dimension of its tensors. Its gradient is that of a weight decay of weight / √(Σ_i x_ik²), and is added like that.
+    """
+
+    _sums: np.ndarray | None = None
+
+    def finite(self) -> bool | None:
+        """Whether all that the last step wrote is finite and far from overflow; None where the kernel did not step."""
+        return None if self._sums is None else math.isfinite(self._sums.sum(dtype=np.float64))
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forgets all gradients; ``set_to_none`` False is not known here, for nothing adds to a gradient of zeros."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """One step of all parameters that have a gradient; what ``closure`` returns, which is called first."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        stepped = [(group, x) for group in self.param_groups for x in group["params"] if x.grad is not None]
+        if all(_fits_kernel(x) for _, x in stepped):
+            self._step_in_kernel(stepped)
+        else:
+            for group, x in stepped:
+                if group.get("group_penalty"):
+                    x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
+            super().step()
+            self._sums = None
+        return loss
+
+    def _step_in_kernel(self, stepped: list[tuple[dict[str, Any], torch.Tensor]]) -> None:
+        tensors, rates, kept, tasks = [], [], [], 0
+        decays = [np.array([group["weight_decay"] for group, _ in stepped], np.float32).repeat(LANES)]
+        decayed = decays[0].size
+        for row, (group, parameter) in enumerate(stepped):
+            state, gradient, count = self._state_of(parameter), parameter.grad.contiguous(), parameter.numel()
+            kept.append(gradient)  # its memory, until the kernel has read it
+            decay, period = row * LANES, LANES
+            if group.get("group_penalty") and count > 0:
+                decays.append(_group_decay(group, parameter))
+                decay, period = decayed, decays[-1].size
+                decayed += period
+            places = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
+            tensors.append((*(tensor.data_ptr() for tensor in places), count, tasks, decay, period))
+            tasks += -(-count // kernel.SHARE)
+            state["step"] += 1
+            beta1, beta2 = group["betas"]
+            done = state["step"].item()
+            rates.append((group["lr"] / (1 - beta1**done), beta1, beta2, 1 / math.sqrt(1 - beta2**done), group["eps"]))
+        self._sums = np.zeros(tasks, np.float32)
+        if tasks > 0:
+            kernel.step(np.array(tensors), np.array(rates, np.float32), np.concatenate(decays), self._sums)
+
+    def _state_of(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Moments and number of steps of a parameter, made at its first step."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state
+
+
+def _fits_kernel(parameter: torch.Tensor) -> bool:
+    """Whether a parameter and its gradient are what the kernel steps."""
+    kinds = parameter.dtype == parameter.grad.dtype == torch.float32
+    return kinds and parameter.device.type == "cpu" and parameter.is_contiguous()
+
+
+def _group_decay(group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
+    """Decay of the columns of a parameter with a penalty of groups, as often as it takes to be whole vectors."""
+    columns = parameter.shape[-1]
+    rows = max(1, kernel.SHARE // columns)
+    sums = np.empty((-(-parameter.numel() // (rows * columns)), columns), np.float32)
+    kernel.square_columns(parameter.detach().view(-1).numpy(), columns, rows, sums)
+    norms = torch.from_numpy(sums.sum(axis=0, dtype=np.float64).astype(np.float32)).sqrt()
+    decay = np.float32(group["weight_decay"]) + np.float32(group["group_penalty"]) * _reciprocals(norms).numpy()
+    return np.tile(decay, LANES)
+
+
+def _reciprocals(norms: torch.Tensor) -> torch.Tensor:
+    """1 / norms, and 0 for a norm of 0, which pulls nowhere."""
+    return torch.where(norms > 0, 1 / norms, 0.0)
+
+
+def penalties(item: PerGaussian, count: int) -> dict[str, float]:
+    """Options of a group of ``OnePassAdam`` that make the penalties of a tensor of ``count`` Gaussians."""
+    count = count if item.l2_mean else 1
+    group = {"group_penalty": item.group / math.sqrt(count)} if item.group > 0 else {}
+    return {"weight_decay": 2 * item.l2 / count} | group
 
 
 class Optimisation:
@@ -87,7 +192,7 @@ class Optimisation:
                 step, log-linear in between.
             progress: function of a step to the share of the decay that is done (``Schedule.round_progress``).
         """
-        optimizer = torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
+        optimizer = OnePassAdam(groups, betas=self.betas, eps=self.eps, fused=True)
         ends = [group.get("lr_end", 1.0) ** self.decay for group in optimizer.param_groups]
         factors = [lambda step, end=end: end ** progress(step) for end in ends]
         return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)

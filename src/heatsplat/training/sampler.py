@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch.utils.data import Sampler
@@ -22,20 +22,28 @@ class StepSampler(Sampler[int]):
         count: number of training views.
         seed: the run's seed.
         start_step: first step to draw for (``trainer.global_step``).
+        restarts: steps at which a pass over the views begins anew, increasing (``Schedule.restarts``): what counts passes
+            from the first step of a round is right in every round.
     """
 
-    def __init__(self, count: int, seed: int, start_step: int = 0) -> None:
+    def __init__(self, count: int, seed: int, start_step: int = 0, restarts: Sequence[int] = ()) -> None:
         if count < 1:
             raise ValueError(f"StepSampler needs at least one view, got {count}")
         self.count = count
         self.seed = seed
         self.start_step = start_step
+        self.restarts = tuple(restarts)
         self._epoch = -1
         self._permutation: list[int] = []
 
     def view_at(self, step: int) -> int:
         """The position of the view that training step ``step`` sees."""
-        epoch, place = divmod(step, self.count)
+        before, first = 0, 0  # passes that began before this round, and its first step
+        for restart in self.restarts:
+            if restart <= step:
+                before, first = before - (first - restart) // self.count, restart
+        epoch, place = divmod(step - first, self.count)
+        epoch += before
         if epoch != self._epoch:
             generator = generator_for(self.seed, epoch, "views")
             self._permutation = torch.randperm(self.count, generator=generator).tolist()

@@ -6,11 +6,12 @@ import logging
 import signal
 import sys
 import warnings
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.profilers import PassThroughProfiler
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
@@ -45,6 +46,35 @@ def prepare_machine(threads: int | None) -> None:
     for pattern in NOISE:
         warnings.filterwarnings("ignore", message=pattern)
     logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+
+
+class Unprofiled(PassThroughProfiler):
+    """Lightning's profiler that measures nothing, without the generator that it makes around each of a hundred hooks a step."""
+
+    _nothing = nullcontext()
+
+    def profile(self, action_name: str) -> AbstractContextManager:
+        return self._nothing
+
+
+# Lightning's hooks of a training step.
+STEP_HOOKS = (
+    "on_train_batch_start",
+    "on_before_zero_grad",
+    "on_before_backward",
+    "on_after_backward",
+    "on_before_optimizer_step",
+    "on_train_batch_end",
+)
+
+
+def without_idle_hooks(part: pl.Callback | pl.LightningModule) -> pl.Callback | pl.LightningModule:
+    """A callback or module, of which Lightning calls no hook of a step that it leaves empty: a hundred calls a step otherwise."""
+    kind = pl.Callback if isinstance(part, pl.Callback) else pl.LightningModule
+    for name in STEP_HOOKS:
+        if getattr(type(part), name) is getattr(kind, name):
+            setattr(part, name, None)
+    return part
 
 
 class StopOnInterrupt(pl.Callback):
@@ -86,6 +116,7 @@ def fit(
 ) -> RunResults:
     """Trains, then tests; what was measured. After Ctrl-C the process ends with code 130 and says how to go on."""
     stop = next(callback for callback in trainer.callbacks if isinstance(callback, StopOnInterrupt))
+    data.restarts = module.schedule.restarts
     with stop.listening():
         trainer.fit(module, datamodule=data, ckpt_path=ckpt)
     if stop.interrupted:

@@ -278,7 +278,7 @@ def _recipe(
     """Overrides of a row, without those that the command line decides."""
     method, setting = row
     recipe = [*config["recipes"].get(method, [f"method={method}"]), *_protocol(config, setting, ablation)]
-    return [text for text in recipe if not _overruled(text, given)]
+    return [text for text in recipe if text.partition("=")[0] not in given]
 
 
 def _wanted(config: Mapping[str, Any], data: Source, printed: Sequence[Figure]) -> list[str]:
@@ -306,12 +306,6 @@ def _protocol(config: Mapping[str, Any], setting: str, ablation: Mapping[str, Ma
     raise SceneError(
         f"the table's setting {setting} is in none of table.protocols, table.absent and rows of table.ablation"
     )
-
-
-def _overruled(override: str, given: Collection[str]) -> bool:
-    """Whether the command line decides what an override would; debug=... shortens runs by itself."""
-    key = override.partition("=")[0]
-    return key in given or (key == "max_steps" and "debug" in given)
 
 
 def _chosen(items: Sequence[Any], keys: Sequence[str], asked: Sequence[str] | None, what: str) -> list[Any]:

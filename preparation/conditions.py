@@ -1,0 +1,107 @@
+"""What a user says of the conditions of a recording, in °C and per cent, and how sure that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+from heatsplat.contracts import SceneError
+from heatsplat.physics.radiometry import LIMITS, Conditions
+from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.preparation.frame import Frame
+
+# The name of a setting -> that of the condition, and how its value becomes one.
+UNITS = {
+    "emissivity": ("emissivity", 1.0, 0.0),
+    "reflected_c": ("reflected_k", 1.0, KELVIN_AT_0_C),
+    "distance_m": ("distance_m", 1.0, 0.0),
+    "air_c": ("air_k", 1.0, KELVIN_AT_0_C),
+    "humidity_percent": ("humidity", 0.01, 0.0),
+    "window_transmission": ("window_transmission", 1.0, 0.0),
+    "window_c": ("window_k", 1.0, KELVIN_AT_0_C),
+}
+
+
+@dataclass(frozen=True)
+class Given:
+    """Conditions that go before those of the files; None takes the file's.
+
+    Args:
+        emissivity, window_transmission: in (0, 1].
+        reflected_c, air_c, window_c: temperatures in °C.
+        distance_m: metres.
+        humidity_percent: relative.
+    """
+
+    emissivity: float | None = None
+    reflected_c: float | None = None
+    distance_m: float | None = None
+    air_c: float | None = None
+    humidity_percent: float | None = None
+    window_transmission: float | None = None
+    window_c: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, (condition, scale, offset) in UNITS.items():
+            value, (low, high) = getattr(self, name), LIMITS[condition]
+            if value is not None and not low <= scale * value + offset <= high:
+                least, most = (low - offset) / scale, (high - offset) / scale
+                raise SceneError(f"conditions.{name}={value} must lie between {least:g} and {most:g}")
+
+    def _given(self) -> dict[str, float]:
+        return {
+            condition: scale * value + offset
+            for name, (condition, scale, offset) in UNITS.items()
+            if (value := getattr(self, name)) is not None
+        }
+
+    def conditions(self, others: Conditions) -> Conditions:
+        """These conditions, the rest from others."""
+        return replace(others, **self._given())
+
+    def settled(self, frame: Frame) -> Frame:
+        """The frame under these conditions, the rest from its file."""
+        given = self._given()
+        conditions = self.conditions(frame.conditions)
+        if frame.calibration is not None and not conditions.transmittance() > 0:
+            raise SceneError(
+                f"{frame.path}: at {conditions.distance_m:g} m of air with {100 * conditions.humidity:g} % humidity the "
+                "formula of the air has no answer; set conditions.distance_m to what is in view, or 0 for no air"
+            )
+        return replace(frame, conditions=conditions, sources={**frame.sources, **dict.fromkeys(given, "given")})
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard uncertainties (one standard deviation), in the units of ``Given``; of the distance in per cent of it.
+
+    Args:
+        camera_c: of the apparent temperature, from the camera's data sheet.
+    """
+
+    emissivity: float = 0.02
+    reflected_c: float = 5.0
+    distance_percent: float = 10.0
+    air_c: float = 3.0
+    humidity_percent: float = 10.0
+    window_transmission: float = 0.02
+    window_c: float = 3.0
+    camera_c: float = 1.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if not getattr(self, f.name) >= 0:
+                raise SceneError(f"uncertainty.{f.name} must not be negative, got {getattr(self, f.name)}")
+
+    def standard(self, conditions: Conditions) -> dict[str, float]:
+        """In the units of the conditions. A window that is not there is not uncertain."""
+        window = conditions.window_transmission < 1
+        return {
+            "emissivity": self.emissivity,
+            "reflected_k": self.reflected_c,
+            "distance_m": self.distance_percent / 100 * conditions.distance_m,
+            "air_k": self.air_c,
+            "humidity": self.humidity_percent / 100,
+            "window_transmission": self.window_transmission if window else 0.0,
+            "window_k": self.window_c if window else 0.0,
+            "camera": self.camera_c,
+        }

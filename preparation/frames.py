@@ -1,0 +1,377 @@
+"""The frames of a folder that a camera filled: which files are thermal, what they mean, which photos belong to them."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, tzinfo
+from functools import partial
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from PIL import Image
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats import dji, flir
+from heatsplat.datamodules.formats.exif import exif_in
+from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_image, to_grey
+from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
+from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.timestamps import dji_time, stem_of
+from heatsplat.physics.radiometry import Conditions
+from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
+from heatsplat.preparation.meaning import Meaning
+
+__all__ = ["Attitude", "CameraInfo", "Frame", "Position", "Reading", "Recording", "read_frames", "read_recording"]
+
+log = logging.getLogger(__name__)
+
+SEQUENCES = (".seq", ".csq")
+RECORDS = (".fff", *SEQUENCES)
+# What makers and people put into names to tell the modalities of one exposure apart.
+MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
+DJI_CLOCK = re.compile(r"DJI_\d{14}_(?=\d+)")
+GREY_LEVELS = 4.0  # colour images below are greys that were stored as colours
+KINDS = {
+    "radiometric": "radiometric files",
+    "float": "floating-point images",
+    "counts": "16-bit images",
+    "grey": "8-bit greys",
+}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a folder is read.
+
+    Args:
+        meaning: of numbers without a calibration.
+        zone: of times that have none, such as Europe/Berlin or +02:00; None leaves them as they are.
+        table: file with a row for each frame, or None.
+        columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg.
+    """
+
+    meaning: Meaning = field(default_factory=Meaning)
+    zone: str | None = None
+    table: Path | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The frames of a folder, in the order of their times, else of their names, and what was noticed on the way."""
+
+    frames: list[Frame]
+    notes: list[str]
+
+
+def read_frames(folder: Path, reading: Reading | None = None) -> list[Frame]:
+    """The thermal frames of all files in a folder (``read_recording``, without its notes)."""
+    return read_recording(folder, reading).frames
+
+
+def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
+    """The thermal frames of all files in a folder and below.
+
+    Raises:
+        SceneError: the folder holds none, several kinds of them, or a file that cannot be read or understood.
+    """
+    reading = reading or Reading()
+    if reading.zone is not None:
+        zone_of(reading.zone)
+    if not folder.is_dir():
+        raise SceneError(f"source={folder} is no folder")
+    kinds: dict[str, list[Path]] = {}
+    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file()):
+        kinds.setdefault(_kind(path), []).append(path)
+    if "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
+        kinds = _greys_in_colour(kinds, folder)
+    there = [kind for kind in KINDS if kinds.get(kind)]
+    if len([kind for kind in there if kind != "grey"]) > 1:
+        raise SceneError(
+            f"{folder} holds {' and '.join(f'{len(kinds[k])} {KINDS[k]} (such as {kinds[k][0].name})' for k in there)}; "
+            "prepare folders of one kind each"
+        )
+    if not there:
+        raise SceneError(
+            f"{folder} holds no thermal image: radiometric JPEG of FLIR or DJI, .fff, .seq, .csq, TIFF or PNG with counts or °C, "
+            "or greys"
+        )
+    kind, thermal = there[0], kinds[there[0]]
+    notes: list[str] = []
+    frames = list(_frames_of(kind, thermal, folder, reading, notes))
+    frames = _paired(frames, [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])])
+    frames = [_zoned(frame, reading.zone) for frame in _with_table(frames, reading)]
+    _check_names(frames)
+    if all(frame.time is not None for frame in frames):
+        frames.sort(key=lambda f: (_instant(f.time), f.name))
+    else:
+        notes.append(
+            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time; they are in the order of names"
+        )
+    return Recording(frames, notes)
+
+
+def _instant(moment: datetime | None) -> float:
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _kind(path: Path) -> str:
+    """ "radiometric", "float", "counts", "grey" or "colour". Raises SceneError for what is no image."""
+    if path.suffix.lower() in RECORDS:
+        return "radiometric"
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        data = read_bytes(path)
+        if flir.payload_of(data) or dji.array_of(data) is not None:
+            return "radiometric"
+    try:
+        with Image.open(path) as image:
+            mode = image.mode
+    except Exception as error:  # Pillow raises whatever a damaged file leads to
+        raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
+    if mode.startswith("I"):
+        return "counts"
+    return "float" if mode == "F" else "grey" if mode in ("L", "LA", "1") else "colour"
+
+
+def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
+    """Greys that were stored as colours count as greys. Raises SceneError where the pictures are pseudo-colours or photos."""
+    colour = kinds.get("colour", [])
+    if colour and all(colour_levels(read_image(path)[..., :3]) < GREY_LEVELS for path in colour[:3]):
+        return {"grey": colour}
+    if colour:
+        raise SceneError(
+            f"{folder} holds coloured pictures alone (such as {colour[0].name}): colours of a palette are no temperatures. "
+            "Export radiometric files, 16-bit counts, temperatures as TIFF, or greys with known bounds"
+        )
+    return kinds
+
+
+def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, notes: list[str]) -> Iterator[Frame]:
+    if kind == "radiometric":
+        for path in paths:
+            yield from _radiometric(path, folder, reading, notes)
+        return
+    sample = read_image(paths[0])
+    if kind == "grey":
+        calibration, note = reading.meaning.of_greys(folder)
+    elif kind == "counts":
+        calibration, note = reading.meaning.of_counts(sample, paths[0])
+    else:
+        calibration, note = reading.meaning.of_floats(sample, paths[0])
+    notes.append(note)
+    for path in paths:
+        details, camera = _of_exif(read_bytes(path))
+        load = partial(_grey if kind == "grey" else read_image, path)
+        yield Frame(_name(path, folder), path, 0, load, calibration, camera=camera, **details)
+
+
+def _grey(path: Path) -> np.ndarray:
+    pixels = read_image(path)
+    return to_grey(pixels[..., :3]) if pixels.ndim == 3 else pixels
+
+
+def _name(path: Path, folder: Path, number: int | None = None) -> str:
+    stem = path.relative_to(folder).with_suffix("").as_posix().replace("/", "_")
+    return stem if number is None else f"{stem}_{number:06d}"
+
+
+def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -> Iterator[Frame]:
+    if path.suffix.lower() in SEQUENCES:
+        places = flir.frames_in(path)
+        if cut := path.stat().st_size - sum(places[-1]):
+            notes.append(
+                f"{path.name}: {cut} bytes after its last whole frame are left out; was the recording cut short?"
+            )
+        for number, (start, length) in enumerate(places):
+            record = flir.Record(flir.read_part(path, start, length), f"{path}, frame {number}")
+            yield _of_flir(
+                record, path, _name(path, folder, number), number, partial(flir.read_part, path, start, length)
+            )
+        return
+    data = read_bytes(path)
+    if payload := flir.payload_of(data):
+        record = flir.Record(payload, str(path))
+        yield _of_flir(record, path, _name(path, folder), 0, lambda: flir.payload_of(read_bytes(path)), data)
+    elif dji.array_of(data) is not None:
+        yield _of_dji(path, _name(path, folder), data, reading)
+    else:
+        raise SceneError(f"{path} is no FLIR file; copy it again or remove it")
+
+
+def _of_flir(
+    record: flir.Record, path: Path, name: str, number: int, read: Callable[[], bytes], data: bytes = b""
+) -> Frame:
+    """The frame of an FFF record. It is read anew for its pixels, so that a recording need not fit into memory."""
+    found = record.measured()
+    details, camera = _of_exif(data)
+    if found.time is not None:
+        details["time"] = found.time
+    if found.latitude_deg is not None and "position" not in details:
+        details["position"] = Position(found.latitude_deg, found.longitude_deg, found.altitude_m)
+
+    def again() -> flir.Record:
+        return flir.Record(read(), record.name)
+
+    return Frame(
+        name,
+        path,
+        number,
+        load=lambda: again().counts(),
+        calibration=Calibration(found.response),
+        conditions=found.conditions,
+        sources=dict.fromkeys(found.given, "file"),
+        camera=CameraInfo(
+            camera.make or "FLIR",
+            found.model,
+            found.serial,
+            camera.focal_mm,
+            found.field_of_view_deg,
+            found.frame_rate_hz,
+        ),
+        picture=(lambda: again().picture() or b"") if record.picture() else None,
+        **details,
+    )
+
+
+def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
+    dji.temperatures(dji.array_of(data), path)  # refuses what only DJI's SDK converts
+    stated, xmp = dji.parameters_in(data), dji.xmp_in(data)
+    details, camera = _of_exif(data)
+
+    def number(key: str) -> float | None:
+        try:
+            return float(xmp[key])
+        except (KeyError, ValueError):
+            return None
+
+    if text := xmp.get("UTCAtExposure"):
+        try:
+            details["time"] = datetime.fromisoformat(text).replace(tzinfo=UTC)
+        except ValueError:
+            log.debug("%s: UTCAtExposure is %r", path, text)
+    if (place := details.get("position")) is not None:
+        spread = [s for s in (number("RtkStdLat"), number("RtkStdLon")) if s is not None]
+        details["position"] = replace(
+            place,
+            altitude_m=number("AbsoluteAltitude") or place.altitude_m,
+            above_takeoff_m=number("RelativeAltitude"),
+            horizontal_sd_m=float(np.hypot(*spread)) if len(spread) == 2 else None,
+            vertical_sd_m=number("RtkStdHgt"),
+        )
+    angles = [number(f"Gimbal{axis}Degree") for axis in ("Yaw", "Pitch", "Roll")]
+    if all(angle is not None for angle in angles):
+        details["attitude"] = Attitude(*angles)
+    return Frame(
+        name,
+        path,
+        0,
+        load=lambda: dji.array_of(read_bytes(path)),
+        calibration=reading.meaning.of_temperatures(1.0 / dji.PER_KELVIN, -273.15),
+        conditions=Conditions(**stated),
+        sources=dict.fromkeys(stated, "file"),
+        camera=replace(camera, serial=xmp.get("CameraSerialNumber") or camera.serial),
+        **details,
+    )
+
+
+def _of_exif(data: bytes) -> tuple[dict[str, object], CameraInfo]:
+    """(time and position as arguments of a frame, camera) as far as a picture's EXIF has them."""
+    found = exif_in(data) if data else {}
+    details = {"time": found["time"]} if "time" in found else {}
+    if "latitude_deg" in found:
+        details["position"] = Position(found["latitude_deg"], found["longitude_deg"], found.get("altitude_m"))
+    return details, CameraInfo(found.get("make"), found.get("model"), found.get("serial"), found.get("focal_mm"))
+
+
+def _exposure(path: Path) -> str:
+    """What the files of one exposure have in common."""
+    stem = path.stem
+    while (shorter := MODALITY.sub("", stem)) != stem:
+        stem = shorter
+    return DJI_CLOCK.sub("DJI_", stem).lower()
+
+
+def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
+    by_exposure: dict[str, list[Path]] = {}
+    for photo in photos:
+        by_exposure.setdefault(_exposure(photo), []).append(photo)
+    return [replace(f, rgb=next(iter(by_exposure.get(_exposure(f.path), [])), None)) for f in frames]
+
+
+def _zoned(frame: Frame, zone: str | None) -> Frame:
+    """The frame with a time, of its name where the file has none, in the zone that was given for those without one."""
+    time = frame.time
+    if time is None and (seconds := dji_time(frame.path.name)) is not None:
+        time = datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None)
+    if time is not None and time.tzinfo is None and zone is not None:
+        time = time.replace(tzinfo=zone_of(zone))
+    return replace(frame, time=time)
+
+
+def zone_of(name: str) -> tzinfo:
+    """A time zone: UTC, +02:00 or Europe/Berlin. Raises SceneError for anything else."""
+    try:
+        if name[:1] in "+-":
+            return datetime.fromisoformat(f"2000-01-01T00:00:00{name}").tzinfo
+        return ZoneInfo(name)
+    except (ValueError, OSError, LookupError) as error:
+        raise SceneError(f"zone={name} is no time zone; give UTC, +02:00 or a name such as Europe/Berlin") from error
+
+
+def _with_table(frames: list[Frame], reading: Reading) -> list[Frame]:
+    """Frames with what a table says of them, which goes before what their files say."""
+    if reading.table is None:
+        return frames
+    table = read_table(reading.table)
+    at = {key: table.columns.index(column) for key, column in reading.columns.items() if column in table.columns}
+    if "name" not in at:
+        raise SceneError(
+            f"table={reading.table} has no column {reading.columns.get('name')!r} with the names of files; it has "
+            f"{', '.join(table.columns)}: set table_columns.name"
+        )
+    rows = {stem_of(cells[at["name"]]): (line, cells) for line, cells in table.rows}
+
+    def of(frame: Frame) -> Frame:
+        if frame.path.stem not in rows:
+            return frame
+        line, cells = rows[frame.path.stem]
+
+        def number(key: str) -> float | None:
+            if key not in at or not cells[at[key]]:
+                return None
+            try:
+                return table.number(cells[at[key]])
+            except ValueError as error:
+                raise SceneError(
+                    f"{reading.table}, line {line}: {cells[at[key]]!r} in column {reading.columns[key]} is no number"
+                ) from error
+
+        changes: dict[str, object] = {}
+        if "time" in at and (text := cells[at["time"]]):
+            try:
+                changes["time"] = datetime.fromisoformat(text)
+            except ValueError as error:
+                raise SceneError(
+                    f"{reading.table}, line {line}: {text!r} in column {reading.columns['time']} is no date-time such as "
+                    "2024-08-06T15:35:05.376"
+                ) from error
+        if (latitude := number("latitude_deg")) is not None and (longitude := number("longitude_deg")) is not None:
+            changes["position"] = Position(latitude, longitude, number("altitude_m"), number("above_takeoff_m"))
+        angles = [number(key) for key in ("yaw_deg", "pitch_deg", "roll_deg")]
+        if all(angle is not None for angle in angles):
+            changes["attitude"] = Attitude(*angles)
+        return replace(frame, **changes)
+
+    return [of(frame) for frame in frames]
+
+
+def _check_names(frames: list[Frame]) -> None:
+    twice = [name for name, count in Counter(frame.name for frame in frames).items() if count > 1]
+    if twice:
+        first, second = [frame.path for frame in frames if frame.name == twice[0]][:2]
+        raise SceneError(f"{first} and {second} would both become {twice[0]}.tiff; rename or remove one of them")

@@ -1,0 +1,111 @@
+"""What the numbers of images without a camera's calibration mean, and when it is better to ask."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
+from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.physics.planck import Band
+from heatsplat.physics.radiometry import BandResponse, PlanckResponse
+from heatsplat.physics.units import KELVIN_AT_0_C
+
+CENTIKELVIN = 0.01
+# 16-bit frames whose median and whose bulk lie so are taken for kelvin x 100 (Lepton's TLinear, Boson's radiometric video).
+MEDIAN_C, BULK_K = (-40.0, 100.0), 200.0
+# Floats in this range may be kelvin of a room or °C of a furnace; nothing tells.
+MAYBE_KELVIN = (200.0, 400.0)
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a user says of the numbers; None leaves it to the files.
+
+    Args:
+        scale, offset_c: °C = scale * number + offset_c.
+        planck: R1, B, F, O and R2 of a FLIR calibration.
+        bounds_c: °C of black and white of greys.
+        band_um: wavelengths in which the camera sees.
+    """
+
+    scale: float | None = None
+    offset_c: float | None = None
+    planck: Sequence[float] | None = None
+    bounds_c: Sequence[float] | None = None
+    band_um: Sequence[float] = (7.5, 14.0)
+
+    def __post_init__(self) -> None:
+        if self.planck is not None and len(self.planck) != 5:
+            raise SceneError(f"counts.planck needs the five numbers [R1,B,F,O,R2], got {list(self.planck)}")
+        if self.scale is not None and not self.scale > 0:
+            raise SceneError(f"counts.scale must be positive (°C per count), got {self.scale}")
+        if self.bounds_c is not None and len(self.bounds_c) != 2:
+            raise SceneError(f"bounds_c needs two values [min, max] in °C, got {list(self.bounds_c)}")
+        if len(self.band_um) != 2 or not 0 < self.band_um[0] < self.band_um[1]:
+            raise SceneError(f"band_um needs two rising wavelengths in µm, got {list(self.band_um)}")
+
+    @property
+    def response(self) -> BandResponse:
+        """Of a camera that sees the band."""
+        return BandResponse(Band(*self.band_um, nodes=16))
+
+    def of_temperatures(self, scale: float, offset_c: float) -> Calibration:
+        """The calibration of files that hold apparent temperatures."""
+        return Calibration(self.response, scale, offset_c)
+
+    def of_counts(self, sample: np.ndarray, path: Path) -> tuple[Calibration, str]:
+        """The calibration of 16-bit images, judged from one of them, and a sentence about it.
+
+        Raises:
+            SceneError: nothing was said, and they do not look like kelvin x 100.
+        """
+        if self.planck is not None:
+            return Calibration(
+                PlanckResponse(*(float(x) for x in self.planck))
+            ), "counts, by the constants of counts.planck"
+        if self.scale is not None:
+            offset = -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
+            return self.of_temperatures(self.scale, offset), f"counts: °C = {self.scale:g} * count {offset:+g}"
+        low, median, high = np.percentile(sample, (1, 50, 99)) * CENTIKELVIN - KELVIN_AT_0_C
+        if MEDIAN_C[0] < median < MEDIAN_C[1] and high - low < BULK_K:
+            return (
+                self.of_temperatures(CENTIKELVIN, -KELVIN_AT_0_C),
+                f"counts taken for kelvin x 100, for {path.name} then has {low:.1f} .. {high:.1f} °C; "
+                "counts.scale and counts.offset_c say otherwise",
+            )
+        raise SceneError(
+            f"{path} holds 16-bit counts around {np.median(sample):.0f}, which are no kelvin x 100. Say what they mean: "
+            "counts.scale and counts.offset_c (°C = scale * count + offset), or counts.planck=[R1,B,F,O,R2] of the camera"
+        )
+
+    def of_floats(self, sample: np.ndarray, path: Path) -> tuple[Calibration, str]:
+        """The calibration of floating-point images and a sentence about it. Raises SceneError where they may be kelvin."""
+        if self.scale is not None or self.offset_c is not None:
+            scale, offset = self.scale or 1.0, self.offset_c or 0.0
+            return self.of_temperatures(scale, offset), f"floats: °C = {scale:g} * value {offset:+g}"
+        finite = sample[np.isfinite(sample)]
+        if finite.size and MAYBE_KELVIN[0] < np.median(finite) < MAYBE_KELVIN[1]:
+            raise SceneError(
+                f"{path} holds floats around {np.median(finite):.1f}: kelvin, or a furnace in °C? Say counts.offset_c=-273.15 "
+                "for kelvin, counts.offset_c=0 for °C"
+            )
+        return self.of_temperatures(1.0, 0.0), "floating-point °C"
+
+    def of_greys(self, folder: Path) -> tuple[Calibration | None, str]:
+        """The calibration of 8-bit greys, None where no bounds are known, and a sentence about it."""
+        found = None
+        if self.bounds_c is not None:
+            found, source = range_in("bounds_c", *self.bounds_c)[0], "bounds_c"
+        elif files := [file for place in (folder, folder.parent) if (file := place / BOUNDS_FILE).is_file()]:
+            found, source = read_bounds(files[0])[0], str(files[0])
+        if found is None:
+            return None, "greys without bounds: no temperatures (bounds_c=[min,max] would give them)"
+        return (
+            self.of_temperatures(found.span_k / 255.0, found.min_c),
+            f"8-bit greys, {found.min_c:g} .. {found.max_c:g} °C by {source}",
+        )

@@ -1,0 +1,229 @@
+"""The page of a preparation: what it found, what the conditions bring, and pictures of the recording."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import markdown_table
+from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
+from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.writer import QUANTILES, rows
+
+REPORT = "report.md"
+BINS = 160
+LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
+LABELS = {
+    "emissivity": "emissivity",
+    "reflected_k": "reflected temperature",
+    "distance_m": "distance",
+    "air_k": "air temperature",
+    "humidity": "relative humidity",
+    "window_transmission": "window's transmittance",
+    "window_k": "window's temperature",
+    "camera": "camera",
+}
+SUFFIX = {"reflected_k": " °C", "distance_m": " m", "air_k": " °C", "humidity": " %", "window_k": " °C"}
+NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report: Markdown under a heading.
+
+    Args:
+        title: of the heading.
+        lines: Markdown; pictures are linked by their names relative to the prepared folder.
+        values: what a program may want to read of it, as plain JSON values.
+    """
+
+    title: str
+    lines: list[str]
+    values: dict[str, object] = field(default_factory=dict)
+
+
+def write_report(target: Path, sections: Sequence[Section]) -> Path:
+    """Writes report.md and returns its path."""
+    lines = [f"# {target.name}, prepared from a camera's files", ""]
+    for section in sections:
+        lines += [f"## {section.title}", "", *section.lines, ""]
+    write_atomically(target / REPORT, "\n".join(lines))
+    return target / REPORT
+
+
+def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
+    """What was read."""
+    cameras = sorted(
+        {" ".join(filter(None, (f.camera.make, f.camera.model, f.camera.serial))) or "unknown" for f in frames}
+    )
+    sizes = sorted({"x".join(map(str, r["size"])) for r in records})
+    lines = [f"- {len(frames)} frames of {', '.join(sizes)} pixels, camera {', '.join(cameras)}"]
+    timed = [f.time for f in frames if f.time is not None]
+    if timed:
+        zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
+        lines.append(f"- {len(timed)} have a time, from {timed[0].isoformat()} to {timed[-1].isoformat()}{zones}")
+    lines.append(f"- {sum(f.position is not None for f in frames)} have a GPS position")
+    if photos := sum(r["photo"] is not None for r in records):
+        lines.append(f"- {photos} have a photo of the same moment")
+    if unknown := sum(r["unknown_pixels"] for r in records):
+        lines.append(f"- {unknown} pixels lie outside the camera's calibration and are NaN")
+    if any(f.calibration is not None for f in frames):
+        known = [r["quantiles"] for r in records if r["quantiles"]]
+        lines.append(
+            f"- {min(q[0] for q in known):.2f} .. {max(q[-1] for q in known):.2f} °C" if known else "- no temperature"
+        )
+    return Section("The recording", [*lines, *(f"- {note}" for note in notes)])
+
+
+def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], uncertain: Uncertainty) -> Section | None:
+    """What each condition is, where it comes from, what it changes and what uncertainty it brings; None for greys.
+
+    At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below.
+    """
+    usable = [i for i, r in enumerate(records) if frames[i].calibration is not None and r["quantiles"]]
+    if not usable:
+        return None
+    frame, record = frames[usable[len(usable) // 2]], records[usable[len(usable) // 2]]
+    response, c = frame.calibration.response, frame.conditions
+    celsius = torch.tensor([record["quantiles"][k] for k in (LOW, MIDDLE, HIGH)], dtype=torch.float64)
+    surface = celsius + KELVIN_AT_0_C
+    signal = measured_signal(surface, response, c)
+    standard = uncertain.standard(c)
+    parts = uncertainty(signal, response, c, standard)
+
+    def three(values: torch.Tensor, form: str) -> list[str]:
+        return ["" if not np.isfinite(x) else format(x, form) for x in values.tolist()]
+
+    head = ["", "value", "from", *(f"changes {x:.1f} °C by" for x in celsius.tolist())]
+    table = []
+    for name in LIMITS:
+        value = float(getattr(c, name))
+        shown = value - KELVIN_AT_0_C if name.endswith("_k") else 100 * value if name == "humidity" else value
+        change = [""] * 3
+        if name in NEUTRAL and value != NEUTRAL[name]:
+            change = three(surface - surface_temperature(signal, response, replace(c, **{name: NEUTRAL[name]})), "+.2f")
+        table.append(
+            [LABELS[name], f"{shown:.4g}{SUFFIX.get(name, '')}", frame.sources.get(name, "no correction"), *change]
+        )
+    unsure = [
+        [LABELS[name], _plus_minus(name, value), *three(parts[name], ".2f")]
+        for name, value in sorted(standard.items(), key=lambda item: -float(parts[item[0]].nan_to_num().max()))
+        if value
+    ]
+    unsure.append(["**all, standard**", "", *three(parts["combined"], ".2f")])
+    unsure.append(["**all, expanded (k = 2, 95 %)**", "", *three(2 * parts["combined"], ".2f")])
+    different = len({repr(f.conditions) for f in frames})
+    lines = [
+        f"Temperatures of surfaces, frame {frame.name}; the air lets {float(c.transmittance()):.4f} pass.",
+        *(
+            [f"The conditions differ between frames ({different} sets); each frame has its own."]
+            if different > 1
+            else []
+        ),
+        "",
+        *markdown_table(head, table, "llrrrr"[: len(head)]),
+        "",
+        "Uncertainty in °C by the GUM's law of propagation, for inputs that are independent of each other:",
+        "",
+        *markdown_table(["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], unsure, "llrrr"),
+    ]
+    values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
+    return Section("Radiometry", lines + _doubts(frames), values)
+
+
+def _plus_minus(name: str, value: float) -> str:
+    shown = 100 * value if name == "humidity" else value
+    return f"{shown:.3g}{SUFFIX.get(name, ' °C' if name == 'camera' else '')}"
+
+
+def _doubts(frames: Sequence[Frame]) -> list[str]:
+    """What the files say and a thermographer would ask about."""
+    found = []
+    if any(f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file" for f in frames):
+        found.append(
+            "The files say that a window was in front of the camera. If there was none, set conditions.window_transmission=1."
+        )
+    for f in frames:
+        high = f.position.above_takeoff_m if f.position else None
+        down = f.attitude is not None and f.attitude.pitch_deg < -60
+        if high and down and f.sources.get("distance_m") == "file" and high > 2 * f.conditions.distance_m:
+            found.append(
+                f"The files say {f.conditions.distance_m:g} m to the surface, but the camera looked down from {high:.0f} m: "
+                f"conditions.distance_m={high:.0f} corrects the air."
+            )
+            break
+    return ["", *(f"**{text}**" for text in found)] if found else []
+
+
+def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> Section:
+    """Histogram of every frame, and how its temperatures run over time."""
+    known = [(row, r["quantiles"]) for row, r in zip(rows(frames, records), records, strict=True) if r["quantiles"]]
+    if not known:
+        return Section("Pictures", ["No frame has a temperature."])
+    quantiles = np.array([q for _, q in known])
+    unit = "°C" if frames[0].calibration is not None else "grey"
+    timed = "time_s" in known[0][0]
+    place = np.array([row["time_s"] for row, _ in known]) if timed else np.arange(len(known))
+    edges = np.linspace(quantiles[:, 0].min(), max(quantiles[:, -1].max(), quantiles[:, 0].min() + 1e-6), BINS + 1)
+    # A frame's share of pixels in each bin, from its distribution function, which its quantiles give.
+    share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(
+        100 * share.T,
+        origin="lower",
+        aspect="auto",
+        extent=(-0.5, len(known) - 0.5, edges[0], edges[-1]),
+        cmap="magma",
+        vmax=100 * np.quantile(share, 0.995) or None,
+        interpolation="nearest",
+    )
+    figure.colorbar(image, label=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}")
+    axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
+    _save(figure, target / "report" / "histograms.png")
+
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots()
+    for low, high, alpha in ((0, -1, 0.12), (LOW, HIGH, 0.25)):
+        axes.fill_between(place, quantiles[:, low], quantiles[:, high], alpha=alpha, color="tab:red", linewidth=0)
+    axes.plot(place, quantiles[:, MIDDLE], color="tab:red", marker=".", linewidth=1)
+    axes.set(
+        xlabel="seconds since the first frame" if timed else "frame",
+        ylabel=unit,
+        title="Median of every frame, 5 .. 95 % of its pixels, and all of them",
+    )
+    axes.margins(x=0.01)
+    _save(figure, target / "report" / "over_time.png")
+    middle = quantiles[:, MIDDLE]
+    jump = np.abs(np.diff(middle)).max() if len(middle) > 1 else 0.0
+    lines = [
+        "![histogram of every frame](report/histograms.png)",
+        "",
+        "![temperatures over time](report/over_time.png)",
+        "",
+        f"The median runs from {middle.min():.2f} to {middle.max():.2f} {unit}; from one frame to the next it moves by up to "
+        f"{jump:.2f} {unit}. Steps and slopes that all pixels share are the camera's drift and its shutter, not the scene.",
+    ]
+    return Section("Pictures", lines, {"median_span": float(np.ptp(middle)), "largest_step": float(jump)})
+
+
+def _rising(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Temperatures that rise, and the share of pixels below each: of equal ones the largest share."""
+    last = np.append(np.diff(quantiles) > 0, True)
+    return np.append(quantiles[0] - 1e-9, quantiles[last]), np.append(0.0, QUANTILES[last])
+
+
+def _save(figure: Figure, path: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_atomically(path, buffer.getvalue())

@@ -1,0 +1,196 @@
+"""A prepared folder, frame by frame: an image, beside it all that is known of it, and nothing half-written.
+
+A frame is done when its .json stands beside its image and was made of the same file with the same settings. So a preparation
+that was stopped goes on where it was, and one with another emissivity makes the images anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.bounds import BOUNDS_FILE
+from heatsplat.datamodules.colmap import FRAMES_FILE
+from heatsplat.datamodules.formats.images import SUFFIXES
+from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import write_csv
+from heatsplat.io.tiff import write_temperature
+from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, measured_signal, uncertainty
+from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.frame import Frame
+
+QUANTILES = np.linspace(0.0, 1.0, 41)
+PARTIAL = ".partial"  # folder of what is being written
+
+
+class Writer:
+    """Writes the frames of a recording into a folder.
+
+    Args:
+        target: the prepared folder.
+        uncertain: how sure the conditions are.
+        keep_counts: also write the numbers as the camera stored them, as 16-bit PNG in counts/.
+    """
+
+    def __init__(self, target: Path, uncertain: Uncertainty, keep_counts: bool) -> None:
+        self.target, self.uncertain, self.keep_counts = target, uncertain, keep_counts
+        self.images = target / "images"
+
+    def check(self, frames: Sequence[Frame]) -> None:
+        """Raises SceneError where the folder holds images of another recording."""
+        ours = {frame.name for frame in frames}
+        there = (p for p in sorted(self.images.glob("*")) if p.suffix.lower() in SUFFIXES)
+        if foreign := next((p for p in there if p.stem not in ours), None):
+            raise SceneError(f"{foreign} is no frame of this recording; give an empty folder as target, or remove it")
+
+    def image_of(self, frame: Frame) -> Path:
+        """Its file in the prepared folder: float32 TIFF in °C, PNG for greys."""
+        return self.images / f"{frame.name}.{'png' if frame.calibration is None else 'tiff'}"
+
+    def write(self, frame: Frame) -> tuple[dict[str, Any], bool]:
+        """The record of a frame, and whether its image had to be written."""
+        record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
+        if (
+            (done := _read(record_file)) is not None
+            and done.get("made_of") == made_of
+            and self.image_of(frame).exists()
+        ):
+            return done, False
+        stored = frame.load()
+        pixels = replace(frame, load=lambda: stored).pixels()
+        if frame.calibration is None:
+            self._replace(self.image_of(frame), cv2.imencode(".png", stored)[1])
+        else:
+            partial = self.target / PARTIAL / f"{frame.name}.tiff"
+            write_temperature(partial, pixels)
+            self.images.mkdir(parents=True, exist_ok=True)
+            os.replace(partial, self.image_of(frame))
+        if self.keep_counts and stored.dtype == np.uint16:
+            self._replace(self.target / "counts" / f"{frame.name}.png", cv2.imencode(".png", stored)[1])
+        if frame.picture is not None and (photo := frame.picture()):
+            self._replace(self.photo_of(frame), photo)
+        record = self._record(frame, pixels) | {"made_of": made_of}
+        write_atomically(record_file, json.dumps(record, indent=1, allow_nan=False) + "\n")
+        return record, True
+
+    def photo_of(self, frame: Frame) -> Path:
+        """Where the photo inside a frame's file goes."""
+        return self.target / "visible" / f"{frame.name}.jpg"
+
+    @staticmethod
+    def _replace(path: Path, content: Any) -> None:
+        write_atomically(path, memoryview(np.frombuffer(content, np.uint8)))
+
+    def _made_of(self, frame: Frame) -> str:
+        file = frame.path.stat()
+        parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
+        return hashlib.sha256(json.dumps([*parts, repr(self.uncertain)]).encode()).hexdigest()[:32]
+
+    def _record(self, frame: Frame, pixels: np.ndarray) -> dict[str, Any]:
+        known = pixels[np.isfinite(pixels)]
+        record: dict[str, Any] = {
+            "file": self.image_of(frame).name,
+            "source": str(frame.path),
+            "number": frame.number,
+            "size": [pixels.shape[1], pixels.shape[0]],
+            "time": frame.time.isoformat() if frame.time else None,
+            "camera": asdict(frame.camera),
+            "position": asdict(frame.position) if frame.position else None,
+            "attitude": asdict(frame.attitude) if frame.attitude else None,
+            "photo": str(self.photo_of(frame) if frame.picture is not None else frame.rgb or "") or None,
+            "unknown_pixels": int(pixels.size - known.size),
+            "quantiles": [float(q) for q in np.quantile(known.astype(np.float64), QUANTILES)] if known.size else None,
+        }
+        if frame.calibration is None:
+            return record
+        record["calibration"] = calibration_as_json(frame.calibration)
+        standard = self.uncertain.standard(frame.conditions)
+        record["conditions"] = {
+            name: {
+                "value": float(getattr(frame.conditions, name)),
+                "from": frame.sources.get(name, "nowhere: no correction"),
+                "standard_uncertainty": standard[name],
+            }
+            for name in LIMITS
+        }
+        record["atmosphere"] = asdict(frame.conditions.atmosphere)
+        record["transmittance"] = float(frame.conditions.transmittance())
+        if known.size:
+            median = float(np.median(known))
+            parts = uncertainty_at(median, frame.calibration, frame.conditions, standard)
+            record["uncertainty_c"] = {"at_c": median} | {n: x if np.isfinite(x) else None for n, x in parts.items()}
+        return record
+
+    def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:
+        """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""
+        if (self.target / PARTIAL).is_dir():
+            (self.target / PARTIAL).rmdir()
+        write_csv(self.target / FRAMES_FILE, rows(frames, records))
+        found = [
+            r["quantiles"] for f, r in zip(frames, records, strict=True) if f.calibration is not None and r["quantiles"]
+        ]
+        if found:
+            low, high = min(q[0] for q in found), max(q[-1] for q in found)
+            bounds = {"absolute_min_temperature": low, "absolute_max_temperature": max(high, low + 1e-3)}
+            write_atomically(self.target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+
+
+def uncertainty_at(
+    celsius: float, calibration: Calibration, conditions: Conditions, standard: Mapping[str, float]
+) -> dict[str, float]:
+    """Standard uncertainties in K at a surface temperature (``radiometry.uncertainty``)."""
+    surface = torch.tensor([celsius + KELVIN_AT_0_C], dtype=torch.float64)
+    signal = measured_signal(surface, calibration.response, conditions)
+    return {name: float(x) for name, x in uncertainty(signal, calibration.response, conditions, standard).items()}
+
+
+def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
+    """What the numbers of a file mean, as JSON."""
+    if calibration.scale is None and isinstance(calibration.response, PlanckResponse):
+        return {"kind": "planck", **asdict(calibration.response)}
+    band = calibration.response.band
+    return {
+        "kind": "linear",
+        "scale": calibration.scale,
+        "offset_c": calibration.offset_c,
+        "band_um": [band.shortest_um, band.longest_um],
+    }
+
+
+def rows(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each frame: file, time, place, temperatures."""
+    timed = all(frame.time is not None for frame in frames)
+    first = _seconds(frames[0].time) if timed else 0.0
+    found = []
+    for frame, record in zip(frames, records, strict=True):
+        quantiles = record["quantiles"] or [None] * len(QUANTILES)
+        row = {"file": record["file"]} | ({"time_s": _seconds(frame.time) - first} if timed else {})
+        row |= {"time": record["time"], **(record["position"] or {}), **(record["attitude"] or {})}
+        found.append(row | {"least": quantiles[0], "median": quantiles[len(quantiles) // 2], "most": quantiles[-1]})
+    return found
+
+
+def _seconds(moment: datetime) -> float:
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A record that was written before, or None where there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,167 @@
+"""Tuning: what is searched and compared, when a setting counts as better, and how a study goes on."""
+
+import csv
+import math
+import sys
+
+import pytest
+import yaml
+from helpers import ROOT
+
+from heatsplat.composition import compose
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+from heatsplat.studies import tune
+
+optuna = pytest.importorskip("optuna")
+CASES = {
+    "etgs": {"scene": ["data.scene=heated"], "knobs": {"thermal.lr_source": [0.01, 1.0], "b": {"among": ["x", "y"]}}}
+}
+BEST = 0.3  # the rate at which the world below has its best PSNR
+
+
+def psnr_of(settings: dict[str, str], seed: int) -> float:
+    """A world in which the rate has an optimum, the default is a rate of 0.03, and "y" costs 1 dB."""
+    rate = float(settings.get("thermal.lr_source", 0.03))
+    noise = (0.0, 0.1, -0.1, 0.05)[seed]
+    return 40 - 5 * math.log10(rate / BEST) ** 2 - (settings.get("b") == "y") + noise
+
+
+@pytest.fixture
+def world(monkeypatch):
+    """Runs as functions; the list of the overrides that were trained, in order."""
+    started = []
+
+    def trained(place, train, overrides, study):
+        if (place / METRICS_FILE).exists():
+            return RunResults.read(place / METRICS_FILE)
+        settings = dict(text.split("=", 1) for text in overrides)
+        started.append(settings)
+        if float(settings.get("thermal.lr_source", 0)) > 0.9:
+            place.mkdir(parents=True, exist_ok=True)
+            (place / FAILED).write_text("Traceback\nSceneError: the loss is NaN\n")
+            raise SceneError("a run of the study failed")
+        seed = int(settings["seed"])
+        results = RunResults(run={"method": settings["method"], "seed": seed})
+        for name, value in (("psnr", psnr_of(settings, seed)), ("ssim", 0.9), ("mae_c", 1.0)):
+            results.put("test", name, value)
+        for name, value in (("gaussians", 1000.0), ("cpu_seconds", 3.0), ("wall_seconds", 5.0)):
+            results.put("cost", name, value)
+        place.mkdir(parents=True)
+        results.write(place / METRICS_FILE)
+        return results
+
+    monkeypatch.setattr(tune, "trained", trained)
+    return started
+
+
+def test_a_search_finds_what_is_better_and_other_seeds_confirm_it(world, tmp_path):
+    (check,) = tune.run(tmp_path, CASES, trials=12)
+    assert check.verdict == "better" and 3 < sum(check.gains) / 3 < 5.1  # 5 dB are to be had
+    assert [run["seed"] for run in world].count("0") == 13  # the default, and twelve trials
+    assert {run["seed"] for run in world[13:]} == {"1", "2", "3"} and len(world) == 13 + 6
+    with open(tmp_path / "tune.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 19 and {row["part"] for row in rows} == {"search", "check"}
+    best = max((row for row in rows if row["part"] == "search"), key=lambda row: float(row["psnr"]))
+    text = (tmp_path / "tune.md").read_text()
+    assert best["settings"].replace(" ", ", ") in text and "| better |" in text
+
+
+def test_a_study_that_was_stopped_asks_for_the_same_trials(world, tmp_path):
+    tune.run(tmp_path, CASES, trials=4)
+    before, text = list(world), (tmp_path / "tune.md").read_text()
+    tune.run(tmp_path, CASES, trials=4)
+    assert world == before and (tmp_path / "tune.md").read_text() == text
+    tune.run(tmp_path, CASES, trials=6)
+    assert len([run for run in world if run["seed"] == "0"]) == 7  # two more
+
+
+def test_a_trial_that_fails_is_told_and_the_others_go_on(world, tmp_path):
+    cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": {"among": [0.95, 0.3]}}}}
+    (check,) = tune.run(tmp_path, cases, trials=6)
+    assert check.verdict == "better" and "failed: SceneError: the loss is NaN" in (tmp_path / "tune.md").read_text()
+
+
+def test_no_trial_begins_when_the_seconds_are_spent(world, tmp_path):
+    tune.run(tmp_path, CASES, trials=9, seconds=12)
+    assert [run["seed"] for run in world].count("0") == 1 + 3  # 5 s each
+
+
+def test_a_default_that_no_trial_beats_is_not_compared(world, tmp_path):
+    cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": [0.001, 0.002]}}}
+    assert tune.run(tmp_path, cases, trials=3) == []
+    assert "no trial was better than the default" in (tmp_path / "tune.md").read_text()
+
+
+def test_lengths_are_checked_one_by_one_and_methods_chosen(world, tmp_path):
+    cases = CASES | {"3dgs": CASES["etgs"]}
+    found = tune.run(tmp_path, cases, methods=["3dgs"], check_steps=[1500, 7000], trials=8)
+    assert [(check.method, check.steps) for check in found] == [("3dgs", 1500), ("3dgs", 7000)]
+    assert {run["method"] for run in world} == {"3dgs"}
+
+
+@pytest.mark.parametrize(
+    ("default", "best", "verdict"),
+    [
+        ((30.0, 30.1, 30.2), (31.0, 31.1, 31.2), "better"),
+        ((30.0, 30.1, 30.2), (29.0, 29.1, 29.2), "worse"),
+        ((30.0, 31.0, 32.0), (30.5, 31.5, 32.5), "within the spread"),  # half a dB, and seeds differ by one
+        ((30.0, 30.1, 30.2), (31.0, 31.1, 30.1), "within the spread"),  # one seed says no
+        ((30.0,), (35.0,), "within the spread"),  # one seed says nothing
+    ],
+)
+def test_better_is_what_all_seeds_say_by_more_than_they_differ(default, best, verdict):
+    def runs(values):
+        return [RunResults(test={"psnr": value, "mae_c": -value}) for value in values]
+
+    assert tune.Check("etgs", 1500, runs(default), runs(best), "psnr").verdict == verdict
+    assert tune.Check("etgs", 1500, runs(default), runs(best), "mae_c").verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"score": "speed"}, "study.score=speed"),
+        ({"trials": 0}, "study.trials"),
+        ({"methods": ["mine"]}, r"mine has no case.*\+study.cases.mine="),
+        ({"cases": {"etgs": {"scene": []}}}, "keys scene and knobs"),
+        ({"cases": {"etgs": {"scene": [], "knobs": {"a": [2, 1]}}}}, r"knobs.a=\[2, 1\]: give \[lowest"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_trains(changed, message, world, tmp_path):
+    with pytest.raises(SceneError, match=message):
+        tune.run(tmp_path, **{"cases": CASES, **changed})
+    assert world == []
+
+
+def test_without_optuna_its_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ImportError, match=r"heatsplat\[tune\]"):
+        tune.run(tmp_path, CASES)
+
+
+def test_settings_and_scenes_of_the_study_exist():
+    """Each knob is a key of its method, whose default lies in its range, and each scene composes."""
+    config = compose(["study=tune"], "study")["study"]
+    for method, case in config["cases"].items():
+        run = compose([f"method={method}", *case["scene"], f"max_steps={config['search_steps']}"])
+        for key, values in case["knobs"].items():
+            default = run
+            for name in key.split("."):
+                default = default[name]
+            inside = default in values["among"] if "among" in values else values[0] <= default <= values[1]
+            assert inside, (method, key, default)
+
+
+def test_ranges_of_whole_numbers_give_whole_numbers():
+    kind = tune._distribution("etgs", "thermal.frequencies", [8, 64])
+    assert isinstance(kind, optuna.distributions.IntDistribution) and kind.log
+    assert isinstance(tune._distribution("etgs", "a", [-1.0, 1.0]), optuna.distributions.FloatDistribution)
+
+
+def test_the_committed_page_names_the_keys_of_the_study():
+    keys = set(yaml.safe_load((ROOT / "conf" / "study" / "tune.yaml").read_text()))
+    page = (ROOT / "docs" / "tuning.md").read_text()
+    assert {"trials", "seconds", "search_steps", "check_steps", "seeds", "cases", "methods"} <= keys
+    assert all(f"study.{key}" in page for key in ("trials", "seconds", "check_steps", "cases", "methods"))
