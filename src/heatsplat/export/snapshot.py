@@ -19,7 +19,8 @@ TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
 TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
 VIEWS = 6  # training cameras over which what depends on the view is averaged
 TIMES = 257  # samples of a quantity over time at most
-TRUTH_TIMES = 65  # the same of the truth, which costs much more to ask for
+FEW_TIMES = 65  # the same of what costs much to ask for: the truth of a scene, and models for which
+WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
 TABLE = 257  # entries of a table of temperatures
 
 
@@ -134,12 +135,13 @@ def snapshot(module: Any) -> Snapshot:
     surface = _surface(module, blended, kept) if span is not None else None
     clipped = surface is not None and _alike(_inside(surface), camera, span, tolerance / slope)
     sent = surface if clipped else camera
-    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope), clipped=clipped)]
+    most = int(min(TIMES, max(FEW_TIMES, WORK / (max(module.thermal.cost, 1) * len(means) * len(cameras)))))
+    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope, most), clipped=clipped)]
     if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
-        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope))
+        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope, most))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
-        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, TRUTH_TIMES))
+        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, FEW_TIMES))
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
     colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
@@ -204,7 +206,7 @@ def _layer(
     span: tuple[float, float] | None,
     tolerance: float,
     slope: float,
-    most_times: int = TIMES,
+    most_times: int,
 ) -> Layer:
     if span is None:
         basis = constant_basis(values_at(None).cpu())
