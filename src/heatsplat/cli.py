@@ -351,7 +351,7 @@ def prepare(config: dict[str, Any], output_dir: Path) -> None:
         prepare_machine(config["threads"])
         build(config["examination"], target=None if config["target"] is None else output_dir)
         return
-    if config["target"] is None or (config["source"] is None and config["correct"] is None):
+    if config["target"] is None or (config["source"] is None and config.get("correct") is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
     prepare_machine(config["threads"])
-    build(config["correct"] or config["preparation"], target=output_dir)
+    build(config.get("correct") or config["preparation"], target=output_dir)
