@@ -16,7 +16,6 @@ import torch
 
 from heatsplat.contracts import SceneError
 
-
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 
 
@@ -49,14 +48,20 @@ class Sift(Features):
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
         options = pycolmap.FeatureExtractionOptions(num_threads=1)
         options.sift.max_num_features, options.sift.peak_threshold = self.most, self.peak
-        pycolmap.extract_features(database, images, [name], pycolmap.CameraMode.PER_FOLDER, reader, options, pycolmap.Device.cpu)
+        pycolmap.extract_features(
+            database, images, [name], pycolmap.CameraMode.PER_FOLDER, reader, options, pycolmap.Device.cpu
+        )
 
     def match(self, database: Path, pairs: Sequence[tuple[str, str]], file: Path, seed: int) -> None:
         file.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         options = pycolmap.FeatureMatchingOptions(num_threads=1)
         options.sift.max_ratio = self.ratio
         pycolmap.match_image_pairs(
-            database, options, pycolmap.ImportedPairingOptions(match_list_path=file), verification(seed), pycolmap.Device.cpu
+            database,
+            options,
+            pycolmap.ImportedPairingOptions(match_list_path=file),
+            verification(seed),
+            pycolmap.Device.cpu,
         )
 
 
@@ -77,7 +82,12 @@ class Aliked(Features):
         with torch.no_grad():
             found = self._networks[0](image)[0]
         keypoints = found.keypoints.numpy() + 0.5  # kornia counts from the centre of the first pixel
-        np.savez(_descriptors(database, name), keypoints=found.keypoints.numpy(), descriptors=found.descriptors.numpy(), size=grey.shape)
+        np.savez(
+            _descriptors(database, name),
+            keypoints=found.keypoints.numpy(),
+            descriptors=found.descriptors.numpy(),
+            size=grey.shape,
+        )
         with pycolmap.Database.open(database) as opened:
             opened.write_keypoints(opened.read_image_with_name(name).image_id, keypoints.astype(np.float32))
 
@@ -99,7 +109,11 @@ class Aliked(Features):
         if min(len(one["keypoints"]), len(other["keypoints"])) < 2:
             return np.zeros((0, 2), np.uint32)
         sides = [
-            {"keypoints": s["keypoints"][None], "descriptors": s["descriptors"][None], "image_size": s["size"].flip(0)[None].float()}
+            {
+                "keypoints": s["keypoints"][None],
+                "descriptors": s["descriptors"][None],
+                "image_size": s["size"].flip(0)[None].float(),
+            }
             for s in (one, other)
         ]
         with torch.no_grad():

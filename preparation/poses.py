@@ -95,7 +95,9 @@ class Search:
     def __init__(self, options: FindPoses, frames: Sequence[Frame], target: Path) -> None:
         self.options, self.target, self.work = options, target, target / WORK
         if len(frames) < 3:
-            raise SceneError(f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed")
+            raise SceneError(
+                f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed"
+            )
         index = ImageIndex(target / "images")
         self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
         if options.on == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
@@ -133,7 +135,9 @@ class Search:
         missing = set(names)
         if self.database.is_file():
             with pycolmap.Database.open(self.database) as database:
-                missing -= {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
+                missing -= {
+                    image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)
+                }
         todo = [name for name in names if name in missing]
         for name in _progress(todo, "finding features"):
             reader.existing_camera_id = self._camera_of(name)
@@ -175,7 +179,9 @@ class Search:
         if places is not None:
             apart = np.linalg.norm(places[:, None] - places[None], axis=2)
             for i, row in enumerate(apart):
-                found |= {(min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j}
+                found |= {
+                    (min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j
+                }
         return [(names[i], names[j]) for i, j in sorted(found)]
 
     def map(self) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
@@ -246,7 +252,9 @@ class Search:
             pose = rig.sensor_from_rig(sensor)
             values["thermal_from_rgb"] = np.asarray(pose.matrix()).round(6).tolist()
             where = ", ".join(f"{x:.4g}" for x in pose.inverse().translation)
-            lines.append(f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward).")
+            lines.append(
+                f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward)."
+            )
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
         return Section("Poses", lines, values)
 
@@ -325,7 +333,11 @@ class Search:
         for image in database.read_all_images():
             name = self.name_of.get(image.name)
             if self.options.on == "rgb":
-                name = self.name_of.get(image.name.replace("rgb/", "thermal/", 1)) if image.name.startswith("rgb/") else None
+                name = (
+                    self.name_of.get(image.name.replace("rgb/", "thermal/", 1))
+                    if image.name.startswith("rgb/")
+                    else None
+                )
             fix = None if name is None else _fix(self.frames[name])
             if fix is None:
                 continue
@@ -371,7 +383,9 @@ class Search:
             if features[copy] < FEW_FEATURES:
                 reason = f"only {features[copy]} features: too little contrast, or blurred"
             elif not partners[copy]:
-                reason = f"{features[copy]} features, but no other frame shows enough of them: no overlap, or changed heat"
+                reason = (
+                    f"{features[copy]} features, but no other frame shows enough of them: no overlap, or changed heat"
+                )
             elif copy in elsewhere:
                 reason = f"belongs to a group of {elsewhere[copy]} frames that nothing connects to the others"
             else:
@@ -451,4 +465,3 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
     return iter(track(items, what, transient=True)) if items else iter(())
-

@@ -15,7 +15,15 @@ from torch import Tensor
 
 from heatsplat.datamodules.formats.geodesy import latitude_longitude
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.synthetic_scene.film import Recording, Size, pixel_centres, expose, film, own_threads, pixel_rays
+from heatsplat.datamodules.synthetic_scene.film import (
+    Recording,
+    Size,
+    expose,
+    film,
+    own_threads,
+    pixel_centres,
+    pixel_rays,
+)
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.geometry.projection import look_at
 from heatsplat.physics.units import KELVIN_AT_0_C
@@ -78,7 +86,9 @@ def write_camera(recording: Recording, folder: Path, field: Field = Field(), see
     rays = pixel_rays(lens, pixel_centres(lens))
     with own_threads():
         for frame, time_s in enumerate(recording.times_s):
-            _, color = expose(recording.scene, lens, rays, rig @ torch.from_numpy(recording.viewmats[frame]), float(time_s))
+            _, color = expose(
+                recording.scene, lens, rays, rig @ torch.from_numpy(recording.viewmats[frame]), float(time_s)
+            )
             when = field.start + timedelta(seconds=float(time_s) + field.rgb_clock_s)
             about = _exif(when, "Visible", lens.fx * PIXEL_MM, None if positions is None else positions[frame])
             pixels = (color.clamp(0, 1) * 255.0).round().to(torch.uint8).numpy()
@@ -113,7 +123,9 @@ def rgb_from_thermal(field: Field) -> Tensor:
     return pose
 
 
-def flight(size: Size, hour: float = 14.0, duration_s: float = 240.0, seed: int = 0, **camera: float | Sequence[float]) -> Recording:
+def flight(
+    size: Size, hour: float = 14.0, duration_s: float = 240.0, seed: int = 0, **camera: float | Sequence[float]
+) -> Recording:
     """The synthetic yard as a drone films it in one go: once and a half around it, from two heights.
 
     Args:

@@ -51,13 +51,15 @@ def find(material: Material) -> list[Finding]:
                 )
             )
     flat = [f for f in range(len(material.images)) if _plateau(material.known(f)) > PLATEAU]
-    if len(flat) > 0.1 * len(material.images) and not any(one.check == "bounds" and "cut off" in one.what for one in found):
+    if len(flat) > 0.1 * len(material.images) and not any(
+        one.check == "bounds" and "cut off" in one.what for one in found
+    ):
         share = sum(_plateau(material.known(f)) for f in flat) / len(flat)
         found.append(
             Finding(
                 "saturation",
                 min(1.0, 3.0 * share),
-                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have exactly the largest value.",
+                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have the largest value.",
                 "The detector or the export saturates: record in the high range, or mask what is hotter.",
                 tuple(material.name(f) for f in flat),
             )

@@ -29,7 +29,11 @@ def find(material: Material) -> list[Finding]:
     fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
-    steps = {k: float(fits.diagonal(k).median() - own[: count - abs(k)].median()) for k in (-3, -2, -1, 1, 2, 3) if abs(k) < count - 2}
+    steps = {
+        k: float(fits.diagonal(k).median() - own[: count - abs(k)].median())
+        for k in (-3, -2, -1, 1, 2, 3)
+        if abs(k) < count - 2
+    }
     step, gain = max(steps.items(), key=lambda item: item[1])
     strangers = float(fits[~torch.eye(count, dtype=torch.bool)].median())
     if gain > BETTER:
@@ -38,7 +42,8 @@ def find(material: Material) -> list[Finding]:
             Finding(
                 "pairing",
                 0.6,
-                f"Thermal images fit the photo {abs(step)} frame(s) {'later' if step > 0 else 'earlier'} better than their own{late}.",
+                f"Thermal images fit the photo {abs(step)} frame(s) {'later' if step > 0 else 'earlier'} better than their "
+                f"own{late}.",
                 "Pair them anew: shift one list, or correct the clock of one camera.",
             )
         )
@@ -69,7 +74,9 @@ def find(material: Material) -> list[Finding]:
 def _clock(material: Material) -> Finding | None:
     if material.rgb_times_s is None or material.times_s is None:
         return None
-    apart = torch.tensor(material.rgb_times_s, dtype=torch.float64) - torch.tensor(material.times_s, dtype=torch.float64)
+    apart = torch.tensor(material.rgb_times_s, dtype=torch.float64) - torch.tensor(
+        material.times_s, dtype=torch.float64
+    )
     usual = float(torch.tensor(sorted(material.times_s), dtype=torch.float64).diff().median())
     offset = float(apart.median())
     if abs(offset) < max(0.5 * usual, 0.2):

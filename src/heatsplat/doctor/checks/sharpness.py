@@ -37,7 +37,9 @@ def find(material: Material) -> list[Finding]:
 def _sharpness(image: Tensor, noise: float) -> float:
     """Fine gradients over coarse ones: the strongest hundredth at single pixels, and after a mean over 4."""
     image = image.nan_to_num()
-    fine = (_gradient(image).flatten().square().topk(max(1, image.numel() // 100)).values.mean() - 2 * noise**2).clamp_min(0)
+    fine = (
+        _gradient(image).flatten().square().topk(max(1, image.numel() // 100)).values.mean() - 2 * noise**2
+    ).clamp_min(0)
     coarse = functional.avg_pool2d(image[None, None], 4, stride=1)[0, 0]
     rough = _gradient(coarse).flatten().square().topk(max(1, coarse.numel() // 100)).values.mean()
     return float((fine / rough.clamp_min(1e-18)).sqrt())
