@@ -13,26 +13,29 @@ from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
-from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, SKIES, OutdoorScene, in_weather, training_frames
+from heatsplat.datamodules.synthetic_scene.outdoor import SKIES, OutdoorScene, in_weather, training_frames
+from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, YARDS
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.rooms import ROOM, number_of, room
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
+from heatsplat.physics.units import DAY_S
 
 
 class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, cooling, ..., or
-            room_0, room_1 and so on, rooms furnished at random.
+        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
+            cooling, ..., or room_0, room_1 and so on, rooms furnished at random.
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
         only: name of a surface; only its pixels count. None: all do.
-        weather: of outdoor: fair (None), calm, windy or overcast; all start from the same midnight.
-        split: a rule, or None for the preset's own: day 1 against day 2 outdoors, every 8th frame elsewhere.
+        weather: outdoors: fair (None), calm, windy or overcast; all start from the same midnight.
+        days: of outdoor_true: 2 to 7, of which the last is held out; None takes 2.
+        split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere.
         root: not used; the name is there so that every data set takes the same keys.
         **options: of ``SceneDataModule``: downscale, seed, ...
     """
@@ -47,16 +50,21 @@ class Synthetic(SceneDataModule):
         scene_seed: int = 0,
         only: str | None = None,
         weather: str | None = None,
+        days: int | None = None,
         split: str | None = None,
         root: str | None = None,
         **options,
     ) -> None:
-        own_split = "json" if scene in OUTDOOR else "every_8th"
+        own_split = "json" if scene in YARDS else "every_8th"
         super().__init__(root=root, scene=scene, split=split or own_split, **options)
-        if scene not in PRESETS and scene not in OUTDOOR and number_of(scene) is None:
-            known = ", ".join((*PRESETS, *OUTDOOR, f"{ROOM}0, {ROOM}1 and so on"))
+        if scene not in PRESETS and scene not in YARDS and number_of(scene) is None:
+            known = ", ".join((*PRESETS, *YARDS, f"{ROOM}0, {ROOM}1 and so on"))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
-        if weather is not None and scene not in OUTDOOR:
+        if days is not None and (scene != "outdoor_true" or not 2 <= days <= MOST_DAYS):
+            raise SceneError(
+                f"data.days={days}: outdoor_true lasts 2 to {MOST_DAYS} days, other scenes are as long as they are"
+            )
+        if weather is not None and scene not in YARDS:
             raise SceneError(f"data.weather={weather}: scene '{scene}' lies in a room without weather; leave it null")
         if weather is not None and weather not in SKIES:
             raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
@@ -70,12 +78,15 @@ class Synthetic(SceneDataModule):
         self.noise_k = noise_k
         self.scene_seed = scene_seed
         self.only = only
-        self.weather = weather
+        self.weather, self.days = weather, days
 
     def load(self) -> SceneData:
         """The recording as a scene; its truth and probes come from the solver."""
-        outdoors = self.scene_name in OUTDOOR
-        world = OutdoorScene(in_weather(OUTDOOR[self.scene_name], self.weather)) if outdoors else None
+        world, outdoors = None, self.scene_name in YARDS
+        if outdoors:
+            solved, known = YARDS[self.scene_name]
+            known = in_weather(known, self.weather)
+            world = solved(known if self.days is None else replace(known, duration_s=self.days * DAY_S))
         number = number_of(self.scene_name)
         indoors = None if outdoors else Scene(PRESETS[self.scene_name] if number is None else room(number))
         recording = film(world or indoors, self.size, self.scene_seed, self.noise_k)
@@ -115,7 +126,7 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
             **(_of_the_yard(world, recording) if outdoors else {}),
-            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {}),
+            **({"true_attributes": recording.scene.grey_bodies} if indoors and indoors.mirrors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
 

@@ -369,14 +369,15 @@ class OutdoorScene(Scene):
         return torch.tensor([self.preset.labels.index(surface.label) for surface in self.preset.surfaces])[which]
 
     def route(self, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-        """Times [F] and world-to-camera matrices [F, 4, 4] of a drone: two thirds of the frames on the first day.
+        """Times [F] and world-to-camera matrices [F, 4, 4] of a drone: a third of the frames on the last day.
 
         Successive frames look from directions 137.5° apart, so that every part of a day sees every side.
         """
         first = training_frames(frames)
         jitter = torch.rand(frames, generator=generator_for(seed, 0, "flight times"), dtype=torch.float64).numpy()
-        slot = np.concatenate([np.arange(first) / first, 1.0 + np.arange(frames - first) / (frames - first)])
-        width = np.where(np.arange(frames) < first, 1.0 / first, 1.0 / (frames - first))
+        days = self.preset.duration_s / DAY_S - 1.0  # before the last
+        slot = np.concatenate([days * np.arange(first) / first, days + np.arange(frames - first) / (frames - first)])
+        width = np.where(np.arange(frames) < first, days / first, 1.0 / (frames - first))
         times = np.round(DAY_S * (slot + width * (0.2 + 0.6 * jitter)), 3)
 
         wobble = torch.rand(frames, 4, generator=generator_for(seed, 0, "flight path"), dtype=torch.float64)
@@ -398,7 +399,7 @@ class OutdoorScene(Scene):
 
 
 def training_frames(frames: int) -> int:
-    """How many of a record's frames are taken on the first day: two thirds, and at least one on the second."""
+    """How many of a record's frames are taken before its last day: two thirds, and at least one on that day."""
     return min(frames - frames // 3, frames - 1)
 
 

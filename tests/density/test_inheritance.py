@@ -14,8 +14,8 @@ from heatsplat.thermal.base import Query
 ALONE = torch.tensor([0])
 # Fields of place or of the direction of view, which are no property of a Gaussian: its children read them where they are.
 PLACED = {
-    "thermal3dgs", "ti3dgs", "through_air", "hexplane_4dgs", "ntr_gaussian", "thermogs", "3dgs_ir", "mftg", "msmg", "ommg",
-    "ravigs",
+    "thermal3dgs", "ti3dgs", "hexplane_4dgs", "ntr_gaussian", "thermogs", "3dgs_ir", "mftg", "msmg", "ommg", "ravigs",
+    "through_air",
 }  # fmt: skip
 
 

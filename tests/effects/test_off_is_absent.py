@@ -525,7 +525,7 @@ def written_out(model, splats, query, off):
     start = bounds().to_celsius(query.rows(splats["initial_state"])) - celsius(model.reference_k).item()
     log_rate = query.rows(splats["log_rate"]).clamp(math.log(1e-7), math.log(0.1))
     if sunny:
-        sun, normals = between(0.0, 200.0, "raw_sun"), model._normals(splats, query)
+        sun, normals = between(0.0, 200.0, "raw_sun"), query.normals(splats)
     if radiates:
         share = between(0.02, 0.98, "raw_share")
     if windy:

@@ -2,12 +2,15 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
+import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 from heatsplat.physics import energy_balance
-from heatsplat.physics.energy_balance import Climate, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate, Core, Surface, power_excess
 from tests.physics.weather_reference import drivers, solved
 
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
@@ -66,10 +69,10 @@ def test_both_agree_where_nothing_is_nonlinear():
 @pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
-    leaves = [x.clone().requires_grad_() for x in surface]
+    leaves = [x.clone().requires_grad_() for x in surface[:-1]]  # but for a core
     at = 40_000.0  # the start is still remembered by some
     gradients = torch.autograd.grad(getattr(climate, solution)(Surface(*leaves), at).sum(), leaves)
-    for number, (name, gradient) in enumerate(zip(Surface._fields, gradients, strict=True)):
+    for number, (name, gradient) in enumerate(zip(Surface._fields[:-1], gradients, strict=True)):
         for column in range(3) if name == "normals" else (0,):
             step = torch.zeros_like(surface[number])
             step[(..., column) if name == "normals" else ...] = 1e-4
@@ -161,14 +164,80 @@ def test_cost_does_not_depend_on_the_length_of_the_record():
 
 def test_extreme_bodies_stay_finite_in_float32():
     climate = Climate(drivers())
-    surface = Surface(*(x.float() for x in bodies(wind=True)))._replace(
+    surface = Surface(*(x.float() for x in bodies(wind=True)[:-1]))._replace(
         log_rate=torch.tensor([math.log(1e-7), math.log(0.1), math.log(0.1), math.log(1e-7)]),
         share=torch.tensor([0.98, 0.02, 0.98, 0.02]),
         sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
         wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
     )
     for solution in (climate.linear_temperature, climate.stepped_temperature):
-        leaves = [x.clone().requires_grad_() for x in surface]
+        leaves = [x.clone().requires_grad_() for x in surface[:-1]]
         x = solution(Surface(*leaves), 130_000.0)
         assert x.isfinite().all()
         assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves))
+    for rate, coupling in product((1e-7, 0.1), (0.02, 50.0)):
+        leaves = [torch.full((4,), value).requires_grad_() for value in (0.0, math.log(rate), coupling)]
+        x = climate.linear_temperature(surface._replace(core=Core(*leaves)), 130_000.0)
+        assert x.isfinite().all()
+        assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves))
+
+
+CORES = Core(tensor(10, -3, 0, 4), -tensor(1800.0, 7200.0, 40_000.0, 300_000.0).log(), tensor(0.3, 1.5, 8.0, 0.8))
+
+
+def test_bodies_of_two_nodes_are_those_of_a_stiff_solver(climate):
+    """scipy on both nodes of each body, T⁴ and wind linearised about its mean as the closed form has them."""
+    surface = bodies(wind=True)._replace(core=CORES)
+    found = course(climate.linear_temperature, surface)
+    about = climate.mean_temperature(surface)
+    times = climate.drivers.times_s.numpy()
+    reference = climate.drivers.reference_k
+    up = climate.drivers.up
+    for i in range(4):
+        r, p, v, g = (float(x[i]) for x in (surface.log_rate.exp(), surface.share, surface.wind, surface.sun))
+        mean, normal = float(about[i]), surface.normals[i]
+        sky = float(0.5 * (1 + normal @ up))
+        lit = (climate.drivers.beams @ normal).clamp(min=0) + sky * climate.drivers.light
+        waves = sky * climate.drivers.sky + (1 - sky) * climate.drivers.around
+        wind, air = climate.drivers.wind_anomaly, climate.drivers.air
+        calm = wind - climate.wind_anomaly_mean
+        convection = (1 - p) * (1 + v * climate.wind_anomaly_mean)
+        force = g * lit + convection * air + (1 - p) * v * calm * (air - mean) + p * waves
+        steep = (1 + mean / reference) ** 3
+        force = (force + p * (steep * mean - power_excess(torch.tensor(mean), reference))).numpy()
+        kappa, mu = float(CORES.coupling[i]), float(CORES.log_rate[i].exp())
+
+        def rate(t, state, force=force, r=r, s=convection + p * steep, kappa=kappa, mu=mu):
+            x, y = state
+            return r * (np.interp(t, times, force) - s * x + kappa * (y - x)), mu * (x - y)
+
+        start = float(surface.start[i]), float(CORES.start[i])
+        truth = solve_ivp(
+            rate, (times[0], times[-1]), start, "Radau", MOMENTS.numpy(), rtol=1e-8, atol=1e-8, max_step=300.0
+        )
+        assert abs(truth.y[0] - found[i].numpy()).max() < 3e-3, i
+        assert np.ptp(truth.y[1]) > 0.5
+
+
+def test_a_core_that_hardly_couples_or_follows_at_once_is_no_core(climate):
+    surface = bodies(wind=True)
+    plain = course(climate.linear_temperature, surface)
+    faint = surface._replace(core=CORES._replace(coupling=torch.full_like(CORES.coupling, 1e-9)))
+    torch.testing.assert_close(course(climate.linear_temperature, faint), plain, atol=1e-3, rtol=0)
+    with pytest.raises(ValueError, match="two nodes"):
+        climate.stepped_temperature(faint, 0.0)
+
+
+def test_derivatives_by_what_lies_behind_are_those_of_the_values(climate):
+    leaves = [x.clone().requires_grad_() for x in CORES]
+    surface, at = bodies(wind=True), 40_000.0
+    climate.linear_temperature(surface._replace(core=Core(*leaves)), at).sum().backward()
+    for number, leaf in enumerate(leaves):
+        step = torch.zeros(4, dtype=torch.float64) + 1e-4
+        up, down = (
+            climate.linear_temperature(
+                surface._replace(core=Core(*(x + sign * step if k == number else x for k, x in enumerate(CORES)))), at
+            )
+            for sign in (1, -1)
+        )
+        torch.testing.assert_close((up - down) / 2e-4, leaf.grad, atol=0.02 * float(leaf.grad.abs().max()), rtol=0.0)

@@ -213,6 +213,8 @@ def test_a_night_only_record_works_without_sun():
         ({"sky": "blue"}, "sky must be one of auto, brutsaert"),
         ({"normals": "up"}, "normals must be one of seen, level, got 'up'"),
         ({"clip": "soft"}, "clip must be one of"),
+        ({"nodes": 3}, "nodes must be one of 1, 2, got '3'"),
+        ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )
@@ -228,3 +230,22 @@ def test_the_yaml_builds_the_defaults_of_the_class():
     for name, value in vars(plain).items():
         if isinstance(value, (int, float, str)) and not name.startswith("_"):
             assert getattr(built, name) == value, name
+
+
+def test_a_core_is_there_only_where_it_is_asked_for_and_stays_warm_after_dusk():
+    plain, without = ready()
+    model, splats = ready(nodes=2)
+    core = {"initial_core", "log_core_rate", "log_coupling"}
+    assert core <= set(splats.names) and not core & set(without.names)
+    assert "relaxation" in model.effects() and "relaxation" not in plain.effects()
+    assert model.cost == 2 * plain.cost
+    with torch.no_grad():
+        splats["log_coupling"].fill_(math.log(3.0))
+    dusk = 20 * HOUR
+    assert (model.temperature(splats, dusk) > plain.temperature(without, dusk) + 0.5).all()
+    noon = model.features(splats, Query(time_s=12 * HOUR))
+    noon.sum().backward()
+    assert all((splats[name].grad != 0).any() for name in core)
+    told = model.attributes(splats, Query(time_s=0.0))
+    torch.testing.assert_close(told["core_coupling"], torch.full((6,), 3.0))
+    torch.testing.assert_close(told["core_time_constant_h"], torch.full((6,), 6.0))

@@ -10,7 +10,7 @@ from heatsplat.composition import CONF, compose
 from heatsplat.contracts import SceneError
 from heatsplat.runs.checks import checked
 
-PRESETS = ("draft", "fast", "balanced")
+PRESETS = ("draft", "fast", "balanced", "full")
 METHODS = sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml"))
 TURNS = list(zip(METHODS, itertools.cycle(PRESETS), strict=False))
 RECIPES = sorted(path.stem for path in (Path(CONF) / "recipe").glob("*.yaml"))

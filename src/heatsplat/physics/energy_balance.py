@@ -20,6 +20,14 @@ and in kelvin above the reference, x = T - R, with w(x) = (T⁴ - R⁴) / (4 R³
 which leaves one rate per surface and so the response tables (responses.py, sunlight.py): its cost does not depend on the
 record. ``stepped_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
 
+A body with depth has a core behind its surface, which only the surface heats (two nodes):
+
+    dx/dt = r [... + κ (y - x)],    dy/dt = μ (x - y),
+
+with κ the conductance between them over H and μ that conductance over the capacity of the core. With the stiffness s that
+linearising leaves, both relax at two rates a₁ > μ > a₂, and x is a mean of the responses of one node at those rates: two
+looks at the same tables, nothing is stepped.
+
 **Convention:** kelvin above the reference, kW/m², seconds; every driver is linear between its samples.
 """
 
@@ -41,6 +49,50 @@ MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean cou
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
 
 
+class Core(NamedTuple):
+    """What lies behind the surfaces of n bodies of two nodes, each [n]; see the module.
+
+    Args:
+        start: y at the first sample of the record, in kelvin above the reference.
+        log_rate: log μ, μ in 1/s.
+        coupling: κ, positive.
+    """
+
+    start: Tensor
+    log_rate: Tensor
+    coupling: Tensor
+
+
+class _TwoRates(NamedTuple):
+    """How n bodies of two nodes relax: [n] each.
+
+    Args:
+        log_rates: of a₁ and a₂.
+        share: of the response at a₁ in the mean of both.
+        own: share of e^{-a₁ t} in what is left of the surface's own start.
+        of_core: factor of e^{-a₂ t} - e^{-a₁ t} in what is left of the core's.
+    """
+
+    log_rates: tuple[Tensor, Tensor]
+    share: Tensor
+    own: Tensor
+    of_core: Tensor
+
+
+def _two_rates(core: Core, log_rate: Tensor, stiffness: Tensor | float) -> _TwoRates:
+    """Of surfaces with log r and s: the eigenvalues in units of r (s + κ), so that no digits are lost at any rates."""
+    leaving = stiffness + core.coupling
+    coupled = core.coupling / leaving
+    log_scale = log_rate + leaving.log()
+    slow = torch.exp(core.log_rate - log_scale)
+    root = ((1 - slow).square() + 4 * slow * coupled).sqrt()
+    fast = 0.5 * (1 + slow + root)
+    own = 0.5 * (1 - slow + root) / root
+    log_fast = log_scale + fast.log()
+    log_slow = log_scale + (1 - coupled).log() + core.log_rate - log_fast  # a₁ a₂ = r s μ
+    return _TwoRates((log_fast, log_slow), own * (1 - coupled) / fast, own, coupled / root)
+
+
 class Surface(NamedTuple):
     """What decides the temperature of n surfaces, each [n]; see the module for the symbols.
 
@@ -51,6 +103,7 @@ class Surface(NamedTuple):
         share: p, or None where nothing radiates.
         wind: v, or None where wind is not known.
         normals: [n, 3] unit vectors, or None for surfaces that lie level.
+        core: what lies behind, or None for bodies of one node.
     """
 
     start: Tensor
@@ -59,6 +112,7 @@ class Surface(NamedTuple):
     share: Tensor | None = None
     wind: Tensor | None = None
     normals: Tensor | None = None
+    core: Core | None = None
 
 
 @dataclass(frozen=True)
@@ -178,22 +232,39 @@ class Climate:
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
         stiffness = self._convection(surface)
-        mean = 0.0 if stiffness is None else self.mean_temperature(surface)
+        mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), None
         if surface.share is not None:
             steep = (1 + mean / self.drivers.reference_k) ** 3
             constant = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
             stiffness = (stiffness + surface.share * steep).clamp(min=MIN_STIFFNESS)
-        log_rate = surface.log_rate if stiffness is None else surface.log_rate + stiffness.log()
-        settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
-        beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
-        kept = torch.exp(-log_rate.exp() * (time_s - float(self.drivers.times_s[0])))
-        forced = self.forcing(surface, settled, beam, mean)
-        if surface.share is not None:
-            forced = forced + constant * (1 - kept)
-        return surface.start * kept + (forced if stiffness is None else forced / stiffness)
+
+        def response(log_rate: Tensor) -> tuple[Tensor, Tensor]:
+            """What a body of this one rate follows, before it is divided by its stiffness, and what it keeps of its start."""
+            settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
+            beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
+            kept = torch.exp(-log_rate.exp() * (time_s - float(self.drivers.times_s[0])))
+            forced = self.forcing(surface, settled, beam, mean)
+            return forced if constant is None else forced + constant * (1 - kept), kept
+
+        if surface.core is None:
+            forced, kept = response(surface.log_rate if stiffness is None else surface.log_rate + stiffness.log())
+            left = surface.start * kept
+        else:
+            rates = _two_rates(surface.core, surface.log_rate, 1.0 if stiffness is None else stiffness)
+            (fast, fast_kept), (slow, slow_kept) = map(response, rates.log_rates)
+            forced = slow + rates.share * (fast - slow)
+            left = surface.start * (slow_kept + rates.own * (fast_kept - slow_kept))
+            left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
+        return left + (forced if stiffness is None else forced / stiffness)
 
     def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:
-        """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers."""
+        """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers.
+
+        Raises:
+            ValueError: the bodies have two nodes, which only ``linear_temperature`` knows.
+        """
+        if surface.core is not None:
+            raise ValueError("bodies of two nodes are solved about a mean only: use linear_temperature")
         absent = [value is None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
         columns = [surface.start, surface.log_rate, surface.share, surface.sun, surface.wind]
         parameters = torch.stack([column for column in columns if column is not None], dim=1)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.physics import sky
-from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate, Core, Drivers, Surface, power_excess
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.splats import Splats
@@ -30,6 +30,9 @@ SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes di
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
 START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
 START_TIME_CONSTANT_S = 3600.0
+START_CORE_S = 6 * 3600.0  # time constant of a core, and its coupling beside the surface's exchange: soil, walls
+START_COUPLING = 0.5
+COUPLINGS = (math.log(0.02), math.log(50.0))
 START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
 COSTS = {"linear": 400, "corrected": 30_000}
@@ -49,15 +52,20 @@ class EnergyBalance(ThermalModel):
     common factor of α, h, e and C; α from C/h of surfaces that the sun never meets; the rate of surfaces that settle between
     any two samples of the weather.
 
+    Bodies of two nodes have a core behind the surface, which follows it at a rate of its own: ground and walls that are warm
+    after dusk. Both rates are looked up in the same tables; it costs twice as much.
+
     **Convention:** the record's first sample is the start. In another weather (a scene whose record is another) surfaces
     start from the state that they had at the start of the trained record, whenever the other one starts.
 
     Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW;
-    "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection.
+    "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two nodes "initial_core" in
+    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H.
 
     Args:
         solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
             record; "corrected" solves the full balance and costs the samples that a surface remembers.
+        nodes: 1, or 2 for bodies with a core (with solution "linear").
         sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
             humidity and the last without), or None: nothing radiates.
         wind: whether wind, if recorded, moves convection.
@@ -80,6 +88,7 @@ class EnergyBalance(ThermalModel):
     def __init__(
         self,
         solution: str = "linear",
+        nodes: int = 1,
         sky: str | None = "auto",
         wind: bool = True,
         sun: bool = True,
@@ -101,10 +110,13 @@ class EnergyBalance(ThermalModel):
             ("sky", sky, (*SKIES, None)),
         ):
             check_option(name, value, known)
+        check_option("nodes", nodes, (1, 2))
+        if nodes == 2 and solution != "linear":
+            raise ValueError("nodes=2 is solved about a mean only: give solution=linear, or nodes=1")
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
-        self._sky, self._wind, self._sun = sky, wind, sun
+        self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
         self.climate: Climate | None = None
@@ -150,6 +162,10 @@ class EnergyBalance(ThermalModel):
             "initial_state": tensor(grey, self.lr_initial),
             "log_rate": tensor(torch.full_like(grey, -math.log(START_TIME_CONSTANT_S)), self.lr_rate),
         }
+        if self.nodes == 2:
+            tensors["initial_core"] = tensor(grey.clone(), self.lr_initial)
+            tensors["log_core_rate"] = tensor(torch.full_like(grey, -math.log(START_CORE_S)), self.lr_rate)
+            tensors["log_coupling"] = tensor(torch.full_like(grey, math.log(START_COUPLING)), self.lr_rate)
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
@@ -175,6 +191,9 @@ class EnergyBalance(ThermalModel):
         the assumed emissivity absorptivity, convection at mean wind and heat capacity per area."""
         surface = self._surface(splats, query)
         values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
+        if surface.core is not None:
+            values["core_time_constant_h"] = torch.exp(-surface.core.log_rate) / 3600.0
+            values["core_coupling"] = surface.core.coupling
         if self._sunlit:
             values["sun_k_per_kw_m2"] = surface.sun
         if surface.wind is not None:
@@ -194,7 +213,7 @@ class EnergyBalance(ThermalModel):
     @property
     def cost(self) -> int:
         # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 150 steps of some 200.
-        return COSTS[self.solution]
+        return COSTS[self.solution] * self.nodes
 
     # The balance ----------------------------------------------------------------------------------------
 
@@ -220,15 +239,22 @@ class EnergyBalance(ThermalModel):
         def bounded(name: str, low: float, high: float) -> Tensor:
             return low + (high - low) * query.rows(splats[name]).sigmoid()
 
-        initial = query.rows(splats["initial_state"])
+        def state(name: str) -> Tensor:
+            return self.range.bounds.to_celsius(query.rows(splats[name])) - celsius(self.reference_k).item()
+
+        def core() -> Core:
+            coupling = query.rows(splats["log_coupling"]).clamp(*COUPLINGS).exp()
+            return Core(state("initial_core"), query.rows(splats["log_core_rate"]).clamp(*LOG_RATES), coupling)
+
         drivers = self.climate.drivers
         return Surface(
-            start=self.range.bounds.to_celsius(initial) - celsius(self.reference_k).item(),
+            start=state("initial_state"),
             log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
             share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
             wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
             normals=query.normals(splats) if drivers.up is not None else None,
+            core=core() if self.nodes == 2 else None,
         )
 
     def _first_sun(self, grey: Tensor) -> Tensor:
@@ -247,6 +273,8 @@ class EnergyBalance(ThermalModel):
         reference = self.reference_k.item()
         air_k = kelvin(weather.air_c)
         effects: dict[str, dict[str, Any]] = {"convection": {"air": "recorded"}}
+        if self.nodes == 2:
+            effects["relaxation"] = {"nodes": "surface and core"}
         parts: dict[str, Any] = {}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
         if self._sky is not None:
