@@ -26,8 +26,8 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static, ...,
-            or room_0, room_1 and so on, rooms furnished at random.
+        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
+            cooling, ..., or room_0, room_1 and so on, rooms furnished at random.
         size: tiny, demo or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
@@ -125,8 +125,8 @@ class Synthetic(SceneDataModule):
             },
             probes=probes,
             truth=recording.scene.truth,
-            **({"true_attributes": recording.scene.grey_bodies} if recording.scene.mirrors else {})
-            | (_of_the_yard(world, recording) if outdoors else {}),
+            **(_of_the_yard(world, recording) if outdoors else {}),
+            **({"true_attributes": recording.scene.grey_bodies} if indoors and indoors.mirrors else {}),
         )
         return scene if recording.clean is None else _with_clean(scene, recording)
 

@@ -47,14 +47,21 @@ class Given:
                 least, most = (low - offset) / scale, (high - offset) / scale
                 raise SceneError(f"conditions.{name}={value} must lie between {least:g} and {most:g}")
 
-    def settled(self, frame: Frame) -> Frame:
-        """The frame under these conditions, the rest from its file."""
-        given = {
+    def _given(self) -> dict[str, float]:
+        return {
             condition: scale * value + offset
             for name, (condition, scale, offset) in UNITS.items()
             if (value := getattr(self, name)) is not None
         }
-        conditions = replace(frame.conditions, **given)
+
+    def conditions(self, others: Conditions) -> Conditions:
+        """These conditions, the rest from others."""
+        return replace(others, **self._given())
+
+    def settled(self, frame: Frame) -> Frame:
+        """The frame under these conditions, the rest from its file."""
+        given = self._given()
+        conditions = self.conditions(frame.conditions)
         if frame.calibration is not None and not conditions.transmittance() > 0:
             raise SceneError(
                 f"{frame.path}: at {conditions.distance_m:g} m of air with {100 * conditions.humidity:g} % humidity the "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
@@ -81,6 +81,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         SceneError: the folder holds none, several kinds of them, or a file that cannot be read or understood.
     """
     reading = reading or Reading()
+    if reading.zone is not None:
+        zone_of(reading.zone)
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
@@ -201,7 +203,9 @@ def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -
         raise SceneError(f"{path} is no FLIR file; copy it again or remove it")
 
 
-def _of_flir(record: flir.Record, path: Path, name: str, number: int, read, data: bytes = b"") -> Frame:
+def _of_flir(
+    record: flir.Record, path: Path, name: str, number: int, read: Callable[[], bytes], data: bytes = b""
+) -> Frame:
     """The frame of an FFF record. It is read anew for its pixels, so that a recording need not fit into memory."""
     found = record.measured()
     details, camera = _of_exif(data)

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from heatsplat.composition import compose, composed
 
-TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "threads=2")
+TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", "threads=2")
 
 
 def compose_run(output_dir: Path, *overrides: str, config_name: str = "train") -> DictConfig:

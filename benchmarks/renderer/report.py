@@ -76,6 +76,8 @@ def training_table(rows: list[Row]) -> list[str]:
         ]
         body.append([part, *cells])
     body.append(["ratio", *(f"{row['ratio']:.2f}" for row in rows)])
+    body.append(["processor, all threads", *(_ms(row["processor"]) for row in rows)])
+    body.append(["ratio of those", *(f"{row['processor_ratio']:.2f}" for row in rows)])
     body.append(["load", *(f"{row['load']:.1f}" for row in rows)])
     return markdown_table(columns, body)
 

@@ -79,7 +79,7 @@ class Recording:
     def shows(self, frame: int, surface: str) -> np.ndarray:
         """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
         number = [one.name for one in self.scene.preset.surfaces].index(surface)
-        rays = pixel_rays(self.lens, _pixel_centres(self.lens))
+        rays = pixel_rays(self.lens, pixel_centres(self.lens))
         _, which = hits(self.scene, torch.from_numpy(self.viewmats[frame]), rays)
         return (which == number).reshape(self.lens.height, self.lens.width).numpy()
 
@@ -110,7 +110,7 @@ def film(
     """
     lens = _lens(size, distortion, pixel_aspect)
     times, viewmats = (scene.route or partial(_by_hand, scene.preset))(size.frames, seed)
-    rays = pixel_rays(lens, _pixel_centres(lens))
+    rays = pixel_rays(lens, pixel_centres(lens))
     celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
     lows, highs = np.empty(size.frames), np.empty(size.frames)
@@ -229,7 +229,7 @@ def camera_path(times_s: np.ndarray, duration_s: float, seed: int, approach_m: f
     return viewmats
 
 
-def _pixel_centres(lens: Lens) -> Tensor:
+def pixel_centres(lens: Lens) -> Tensor:
     """Pixel positions [H * W, 2] (x, y), row by row."""
     y, x = torch.meshgrid(
         torch.arange(lens.height, dtype=torch.float64), torch.arange(lens.width, dtype=torch.float64), indexing="ij"
@@ -269,18 +269,14 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         time_s: seconds from the start of the record.
     """
     when = torch.tensor([time_s], dtype=torch.float64)
-    haze, gloss = scene.preset.haze, scene.preset.gloss
+    haze = scene.preset.haze
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
         color = scene.visible(points, which, directions @ viewmat[:3, :3])
         celsius = scene.celsius(scene.heat_at(points, which), when)[:, 0]
-        if scene.mirrors:
-            celsius = scene.apparent(celsius, points, which, directions @ viewmat[:3, :3], when)
-        if gloss:
-            outwards = -torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
-            ambient = scene.preset.ambient_c
-            celsius = ambient + gloss.apparent(celsius - ambient, outwards, scene.normals(points, which))
+        sight = torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
+        celsius = scene.apparent(celsius, points, which, sight, time_s)
         if haze:
             distance = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).norm(dim=1)
             ambient = scene.preset.ambient_c
@@ -294,7 +290,7 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
     edges = (((image - around).abs() > _EDGE_K).reshape(-1) | clear).nonzero()[:, 0]  # behind glass, heat has none
     third = torch.tensor([-1 / 3, 0.0, 1 / 3], dtype=torch.float64)
     within = torch.cartesian_prod(third, third)
-    fine_celsius, fine_color, _ = look(pixel_rays(lens, (_pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
+    fine_celsius, fine_color, _ = look(pixel_rays(lens, (pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
     celsius[edges] = fine_celsius.reshape(-1, len(within)).mean(1)
     color[edges] = fine_color.reshape(-1, len(within), 3).mean(1)
     return celsius.reshape(lens.height, lens.width), color.reshape(lens.height, lens.width, 3)

@@ -165,29 +165,38 @@ class Scene:
         """Whether a surface is no black body."""
         return bool((self.emissivity < 1.0).any())
 
-    def apparent(self, celsius: Tensor, points: Tensor, which: Tensor, directions: Tensor, when: Tensor) -> Tensor:
-        """How warm a camera takes points [n, 3] for, in °C [n]: opaque grey bodies that mirror what they face.
+    def apparent(self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float) -> Tensor:
+        """What a camera takes for the temperature [n] of ``celsius`` [n] at points [n, 3] that it sees along ``sight`` [n, 3].
+
+        Args:
+            which: [n] surfaces of the points; where there is none (-1), T is what is seen.
+            sight: [n, 3] unit vectors from the camera, in the world.
+            time_s: seconds from the start of the record.
+        """
+        bright = (self.emissivity[which] < 1.0).nonzero()[:, 0]
+        if len(bright):
+            celsius = celsius.index_put((bright,), self._mirroring(celsius, points, which, sight, time_s, bright))
+        gloss, ambient = self.preset.gloss, self.preset.ambient_c
+        if gloss is None:
+            return celsius
+        return ambient + gloss.apparent(celsius - ambient, -sight, self.normals(points, which))
+
+    def _mirroring(
+        self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float, bright: Tensor
+    ) -> Tensor:
+        """How warm a camera takes the points ``bright`` [m] for, in °C [m]: opaque grey bodies that mirror what they face.
 
         B(apparent) = ε B(T) + (1 - ε) B(T_m), with the radiance B of black bodies in the camera's band (Planck) and the
         temperature T_m of what the mirrored ray meets first: a black body there (one mirror is seen, not a mirror in a
         mirror), or the surroundings at ambient temperature.
-
-        Args:
-            celsius: [n] T.
-            which: [n] surfaces of the points; where there is none (-1), T is what is seen.
-            directions: [n, 3] from the camera, in the world.
-            when: [1] seconds.
         """
-        bright = (self.emissivity[which] < 1.0).nonzero()[:, 0]
-        on, surface, sight = points[bright], which[bright], torch.nn.functional.normalize(directions[bright], dim=1)
+        on, surface, when = points[bright], which[bright], torch.tensor([time_s], dtype=torch.float64)
         normals = self.normals(on, surface)
-        mirrored = sight - 2.0 * dot(sight, normals)[:, None] * normals
+        mirrored = sight[bright] - 2.0 * dot(sight[bright], normals)[:, None] * normals
         met, met_surface = self.first_hits(on + _OFF_SURFACE_M * normals, mirrored)
         facing = self.facing(met, met_surface, mirrored, when)
         own, others = (_BAND.radiance(kelvin(t)) for t in (celsius[bright], facing))
-        seen = celsius.clone()
-        seen[bright] = _BAND.temperature(torch.lerp(others, own, self.emissivity[surface])) - KELVIN_AT_0_C
-        return seen
+        return _BAND.temperature(torch.lerp(others, own, self.emissivity[surface])) - KELVIN_AT_0_C
 
     def facing(self, points: Tensor, which: Tensor, directions: Tensor, when: Tensor) -> Tensor:
         """How warm mirrored rays [n, 3] find what they first meet, or the surroundings, in °C [n]; as ``first_hits`` has it."""

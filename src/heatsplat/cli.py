@@ -79,6 +79,7 @@ EXAMPLES = {
     "evaluate": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
     "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
+    "view": ("ckpt=outputs/.../checkpoints/last.ckpt",),
     "study": ("study=frontier study.runs=outputs",),
     "prepare": ("source=/data/flight target=/data/my_scene",),
 }
@@ -301,6 +302,22 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
 
 @_command
 @_job
+def view(config: dict[str, Any], output_dir: Path) -> None:
+    """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
+    from heatsplat.runs.run import load
+    from heatsplat.training.session import prepare_machine
+    from heatsplat.viewer.page import FILE, write_viewer
+
+    prepare_machine(config["threads"])
+    trained = load(
+        config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
+    )
+    path = write_viewer(trained.module, output_dir / FILE)
+    log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
+
+
+@_command
+@_job
 def study(config: dict[str, Any], output_dir: Path) -> None:
     """Runs a study; its tables and pictures lie in the run's folder.
 
@@ -326,9 +343,15 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
 @_command
 @_job
 def prepare(config: dict[str, Any], output_dir: Path) -> None:
-    """Makes a scene that trains of a camera's files."""
+    """Makes a scene that trains of a camera's files, or corrects a trained scene pixel by pixel (correct=scene)."""
     from heatsplat.contracts import SceneError
+    from heatsplat.training.session import prepare_machine
 
-    if config["source"] is None or config["target"] is None:
+    if config["check"] is not None:
+        prepare_machine(config["threads"])
+        build(config["examination"], target=None if config["target"] is None else output_dir)
+        return
+    if config["target"] is None or (config["source"] is None and config["correct"] is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
-    build(config["preparation"], target=output_dir)
+    prepare_machine(config["threads"])
+    build(config["correct"] or config["preparation"], target=output_dir)

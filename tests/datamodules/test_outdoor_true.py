@@ -46,7 +46,7 @@ def test_the_camera_sees_cold_sky_in_the_roof_and_the_truth_does_not():
     when = torch.tensor([time], dtype=torch.float64)
     celsius = scene.celsius(scene.heat_at(on, which), when)[:, 0]
     normal = scene.normals(on, which)
-    seen = scene.apparent(celsius, on, which, -normal, when)  # straight at it: the mirror shows the sky at 45 degrees
+    seen = scene.apparent(celsius, on, which, -normal, time)  # straight at it: the mirror shows the sky at 45 degrees
     sky = float(scene._sky_celsius(normal[:, 2], time))
     emissivity = scene.materials[int(which)].emissivity
     assert sky < float(celsius)

@@ -122,7 +122,7 @@ def test_a_mirror_shows_what_it_faces_by_plancks_and_kirchhoffs_laws():
     points[2, 1], points[2, 2] = 1.0, 0.5
     directions = torch.tensor([[0.0, 2.0, -2.0], [0.0, -1.0, -1.0], [0.0, 3.0, 0.0]], dtype=torch.float64)
     which, own = torch.tensor([0, 0, 1]), torch.tensor([30.0, 30.0, 80.0], dtype=torch.float64)
-    seen = scene.apparent(own, points, which, directions, torch.tensor([100.0], dtype=torch.float64))
+    seen = scene.apparent(own, points, which, directions, 100.0)
     for found, facing in zip(seen.tolist()[:2], (80.0, 22.0), strict=True):
         assert band_radiance(found) == pytest.approx(0.3 * band_radiance(30.0) + 0.7 * band_radiance(facing), rel=1e-8)
     assert seen[2] == 80.0  # a black body shows itself

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from camera_files import PLANCK, dji_jpeg, fff, flir_jpeg, raw_for, temperatures
 from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
 
 from heatsplat.contracts import SceneError
@@ -13,69 +14,11 @@ from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.formats.flir import Record
 from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.formats.radiometric import Calibration, has_temperatures, read_celsius, surface_celsius
-from heatsplat.physics.radiometry import PlanckResponse
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 FLIR, M3T = DATA / "flir", DATA / "m3t_heath"
 needs_flir = pytest.mark.skipif(not FLIR.is_dir(), reason="real FLIR data is not at ../shared/data/flir")
 needs_m3t = pytest.mark.skipif(not M3T.is_dir(), reason="real DJI data is not at ../shared/data/m3t_heath")
-
-PLANCK = PlanckResponse(r1=16000.0, b=1430.0, f=1.0, o=-7000, r2=0.012)
-
-
-def fff(raw, order="<", png=False, pixels=None):
-    """An FFF file with a raw image and a camera record in the given byte order."""
-    head = bytearray(32)
-    struct.pack_into(f"{order}HHH", head, 0, 2, raw.shape[1], raw.shape[0])
-    if pixels is None:
-        pixels = raw.astype(f"{order}u2").tobytes()
-        if png:
-            pixels = cv2.imencode(".png", raw.byteswap())[1].tobytes()
-    image = bytes(head) + pixels
-    camera = bytearray(0x400)
-    struct.pack_into(f"{order}fff", camera, 0x58, PLANCK.r1, PLANCK.b, PLANCK.f)
-    struct.pack_into(f"{order}i", camera, 0x308, PLANCK.o)
-    struct.pack_into(f"{order}f", camera, 0x30C, PLANCK.r2)
-    header = bytearray(64)
-    header[:4] = b"FFF\0"
-    struct.pack_into(">III", header, 20, 100, 64, 2)
-    directory = bytearray(64)
-    start = 128
-    for i, (kind, record) in enumerate(((1, image), (32, bytes(camera)))):
-        struct.pack_into(">H", directory, 32 * i, kind)
-        struct.pack_into(">II", directory, 32 * i + 12, start, len(record))
-        start += len(record)
-    return bytes(header) + bytes(directory) + image + bytes(camera)
-
-
-def jpeg_with(marker, blocks):
-    """A JPEG with extra segments after its first marker."""
-    picture = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH), 90, np.uint8))[1].tobytes()
-    segments = b"".join(bytes([0xFF, marker]) + struct.pack(">H", len(b) + 2) + b for b in blocks)
-    return picture[:2] + segments + picture[2:]
-
-
-def flir_jpeg(raw, **options):
-    data = fff(raw, **options)
-    parts = [data[i : i + 2000] for i in range(0, len(data), 2000)]
-    blocks = [b"FLIR\0\x01" + bytes([i, len(parts) - 1]) + part for i, part in enumerate(parts)]
-    return jpeg_with(0xE1, [b"Exif\0\0nothing", *blocks[::-1]])  # blocks are numbered, their order does not count
-
-
-def dji_jpeg(raw):
-    data = raw.astype("<u2").tobytes()
-    return jpeg_with(0xE3, [data[i : i + 65000] for i in range(0, len(data), 65000)])
-
-
-def raw_for(celsius):
-    """Raw values that the Planck formula turns into temperatures, from the formula's inverse."""
-    signal = PLANCK.r1 / (np.exp(PLANCK.b / (celsius + 273.15)) - PLANCK.f)
-    return np.rint(signal / PLANCK.r2 - PLANCK.o).astype(np.uint16)
-
-
-def temperatures(index=0, height=HEIGHT, width=WIDTH):
-    y, x = np.mgrid[:height, :width]
-    return 10 + 0.4 * x + 0.2 * y + index
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

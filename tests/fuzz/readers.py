@@ -22,9 +22,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "datamodules"))
 
+from camera_files import flir_jpeg, raw_for, temperatures
 from layouts import names, points, write_colmap
 from mutate import Outcome, campaign, damaged_copy, guarded
-from test_radiometric import flir_jpeg, raw_for, temperatures
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.colmap import Colmap

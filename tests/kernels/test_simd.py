@@ -148,3 +148,15 @@ def test_low_bytes_become_two_words():
     x = np.arange(250, 266, dtype=np.int32)
     low, high = words(x)
     assert np.array([low, high]).astype("<i8").tobytes() == (x & 255).astype(np.uint8).tobytes()
+
+
+@kernel
+def reversed_scalars(x, out):
+    for k in range(x.size):
+        simd.store_scalar(out, x.size - 1 - k, simd.load_scalar(x, k))
+
+
+def test_scalars_are_elements_of_the_flat_order():
+    x, out = np.arange(24, dtype=np.float32).reshape(2, 3, 4), np.zeros((4, 6), np.float32)
+    reversed_scalars(x, out)
+    np.testing.assert_array_equal(out.ravel(), x.ravel()[::-1])

@@ -14,6 +14,7 @@ from heatsplat.physics.radiometry import (
     BandResponse,
     Conditions,
     PlanckResponse,
+    directional_emissivity,
     measured_signal,
     sensitivities,
     surface_temperature,
@@ -154,3 +155,17 @@ def test_propagated_uncertainty_is_the_spread_that_chance_gives():
 def test_the_constants_of_the_air_count():
     dry = Atmosphere(beta_1=0.0, beta_2=0.0)
     assert transmittance(100.0, 293.15, 0.1, dry) == transmittance(100.0, 293.15, 0.9, dry)
+
+
+@pytest.mark.parametrize("index", [1.3, 1.5, 4.0])
+@pytest.mark.parametrize("degrees", [0.0, 45.0, 80.0, 89.9])
+def test_emissivity_at_an_angle_is_that_of_fresnel(index, degrees):
+    """Against the amplitudes of both polarisations by Snell's law in 40 digits."""
+    with mpmath.workdps(40):
+        angle, n = mpmath.radians(mpmath.mpf(degrees)), mpmath.mpf(index)
+        inside = mpmath.asin(mpmath.sin(angle) / n)
+        cos_i, cos_t = mpmath.cos(angle), mpmath.cos(inside)
+        s, p = (cos_i - n * cos_t) / (cos_i + n * cos_t), (n * cos_i - cos_t) / (n * cos_i + cos_t)
+        truth = mpmath.mpf("0.9") * (1 - (s**2 + p**2) / 2) / (1 - ((n - 1) / (n + 1)) ** 2)
+        cosine = double(float(cos_i))
+    assert directional_emissivity(0.9, cosine, index).item() == pytest.approx(float(truth), rel=1e-9, abs=1e-12)

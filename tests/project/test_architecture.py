@@ -24,9 +24,12 @@ ALLOWED = {
     "density": {"contracts", "geometry", "physics", "splats"},
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
-    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat"},
+    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat", "viewer"},
+    "export": {"contracts", "physics", "renderers", "shots"},
+    "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},
-    "runs": {"contracts", "composition", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
+    "doctor": {"contracts", "effects", "io", "physics"},
+    "runs": {"contracts", "composition", "doctor", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
     "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
@@ -41,9 +44,9 @@ ALLOWED = {
         "kernels",
     },  # fmt: skip
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies"},
+    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies", "viewer"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
-    "preparation": {"contracts", "datamodules", "geometry", "io", "physics", "runs"},
+    "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
 }
 BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name what is in them
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know

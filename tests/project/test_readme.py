@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+from camera_files import temperatures
 from commands import succeeds
 from running import compose_run
 
@@ -62,11 +63,14 @@ def data(tmp_path_factory) -> Path:
     from heatsplat.datamodules.synthetic_scene.presets import PRESETS
     from heatsplat.datamodules.synthetic_scene.scene import Scene
     from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
+    from heatsplat.io.tiff import write_temperature
 
     folder = tmp_path_factory.mktemp("data")
     recording = film(Scene(PRESETS["cooling"]), SIZES["tiny"], seed=0, noise_k=0.05)
     LAYOUTS["rhd"](recording, folder / "RHD" / "cooling_bench")
     LAYOUTS["colmap"](recording, folder / "my_scene")
+    for index in range(2):
+        write_temperature(folder / "flight" / f"frame_{index}.tiff", temperatures(index))
     return folder
 
 
@@ -100,6 +104,8 @@ def test_python_commands_run(command, trained, data, tmp_path):
             words += ["table.methods=[3dgs,etgs]"]
         if "ablation=" in command:  # one seed
             words += ["hydra.sweeper.params={seed:'0'}"]
+    elif "prepare.py" in command:
+        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared"]
     elif "render.py" in command:
         words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
     else:
@@ -112,8 +118,12 @@ def test_python_commands_run(command, trained, data, tmp_path):
         assert len(list(tmp_path.rglob("metrics.json"))) == expected
     elif "study.py" in command:
         assert (tmp_path / "done" / "frontier.html").exists()
+    elif "prepare.py" in command:
+        assert (tmp_path / "prepared" / "report.md").exists()
     elif "simplify.py" in command:
         assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+    elif "view.py" in command:
+        assert (tmp_path / "done" / "viewer.html").exists()
     else:
         assert (tmp_path / "views" / "video.mp4").exists()
 
@@ -142,7 +152,7 @@ def test_make_targets_exist():
     assert [target for target in re.findall(r"`?make (\w+)`?", TEXT) if f"make {target} " not in known] == []
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "study"])
+@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "study"])
 def test_console_commands_are_installed(name):
     programs = [one for one in entry_points(group="console_scripts") if one.name == f"heatsplat-{name}"]
     if not programs:

@@ -59,6 +59,6 @@ def test_levels_are_checkpoints_and_splats_for_viewers(merged, tmp_path):
 
 
 def test_levels_that_do_not_increase_are_refused(tmp_path):
-    for levels in ([], [0.1, 0.1], [0.0]):
+    for levels in ([], [0.1, 0.1], [0.0], 0.0, "far", [0.1, "a"]):
         with pytest.raises(SceneError, match="levels_c"):
             write_levels(None, FlatMerging(), levels, tmp_path)

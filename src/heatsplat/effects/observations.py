@@ -133,7 +133,7 @@ def observe(scene: SceneData) -> Observations:
     elif len(scene.points) < 1:
         why = "the scene has no points to follow through the images"
     else:
-        tracks = _tracks(scene.points.double(), views, images, noise)
+        tracks = tracks_of(scene.points.double(), views, images, noise)
         if tracks is None:
             why = f"no scene point is seen in {MIN_FRAMES} or more training views"
     return Observations(scene, images, masks, times_s, noise, still, tracks, why)
@@ -181,7 +181,7 @@ def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
     )
 
 
-def _tracks(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
+def tracks_of(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
     """Tracks of scene points; None where too few are seen often enough."""
     points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
     count, height, width = images.shape

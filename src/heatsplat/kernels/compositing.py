@@ -59,6 +59,7 @@ from heatsplat.kernels.simd import (
     absolute,
     bits,
     exp2,
+    load_scalar,
     load_vector,
     lowest_bit,
     minimum,
@@ -67,6 +68,7 @@ from heatsplat.kernels.simd import (
     select,
     splat,
     store_first,
+    store_scalar,
     store_vector,
     total,
     totals,
@@ -189,23 +191,38 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centr
 
 
 @inline
+def _write_block(source, place, target, offset, step, row, wide, high):
+    """Copies a vector to the pixels of a block: ``step`` numbers from one to the next, ``row`` from one row to the next."""
+    for y in range(high):
+        for x in range(wide):
+            store_scalar(target, offset + y * row + x * step, load_scalar(source, place + y * BLOCK + x))
+
+
+@inline
 def _write_tile(layout, tile, tiles_x, transmittances, image, background, features, alpha, depth):
     """Copies the state of a tile into the images, with the background behind it."""
     height, width, colours = features.shape
-    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    for y in range(min(TILE, height - top)):
-        for x in range(min(TILE, width - left)):
-            block = tile * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
-            lane = y % BLOCK * BLOCK + x % BLOCK
-            for modality in range(modalities(layout)):
-                transmittances[block, modality, lane] = abs(transmittances[block, modality, lane])
-                alpha[modality, top + y, left + x] = np.float32(1.0) - transmittances[block, modality, lane]
-            for channel in range(colours):
-                behind = transmittances[block, modality_of(layout, channel), lane]
-                image[block, channel, lane] += behind * background[channel]
-                features[top + y, left + x, channel] = image[block, channel, lane]
-            if depth.shape[0] > 0:
-                depth[top + y, left + x] = image[block, colours, lane]
+    for block in range(BLOCKS):
+        left = tile % tiles_x * TILE + block % TILE_BLOCKS * BLOCK
+        top = tile // tiles_x * TILE + block // TILE_BLOCKS * BLOCK
+        wide, high = min(BLOCK, width - left), min(BLOCK, height - top)
+        if wide <= 0 or high <= 0:
+            continue
+        here, pixel = tile * BLOCKS + block, top * width + left
+        for modality in range(modalities(layout)):
+            place = here * modalities(layout) + modality
+            behind = absolute(load_vector(transmittances, place))
+            store_vector(transmittances, place, np.float32(1.0) - behind)
+            _write_block(transmittances, place * LANES, alpha, modality * height * width + pixel, 1, width, wide, high)
+            store_vector(transmittances, place, behind)
+        for channel in range(colours):
+            place = here * channels(layout) + channel
+            behind = load_vector(transmittances, here * modalities(layout) + modality_of(layout, channel))
+            store_vector(image, place, load_vector(image, place) + behind * background[channel])
+            offset, row = pixel * colours + channel, width * colours
+            _write_block(image, place * LANES, features, offset, colours, row, wide, high)
+        if depth.shape[0] > 0:
+            _write_block(image, (here * channels(layout) + colours) * LANES, depth, pixel, 1, width, wide, high)
 
 
 @inline
@@ -249,26 +266,37 @@ def composite(
 
 
 @inline
+def _read_block(source, offset, step, row, wide, high, target, place):
+    """Copies the pixels of a block into a vector, as ``_write_block`` does the other way."""
+    for y in range(high):
+        for x in range(wide):
+            store_scalar(target, place + y * BLOCK + x, load_scalar(source, offset + y * row + x * step))
+
+
+@inline
 def _read_gradients(layout, tile, tiles_x, v_features, v_alpha, v_depth, maps, v_pixels, worker):
     """Copies the gradients of a tile's pixels, and maps, into blocks; those of pixels outside of the image are zero."""
     height, width, colours = v_features.shape
-    left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-    if left + TILE > width or top + TILE > height:
-        for k in range(BLOCKS * v_pixels.shape[1]):
-            store_vector(v_pixels, worker * BLOCKS * v_pixels.shape[1] + k, splat(0.0))
-    for y in range(min(TILE, height - top)):
-        for x in range(min(TILE, width - left)):
-            block = worker * BLOCKS + y // BLOCK * TILE_BLOCKS + x // BLOCK
-            lane = y % BLOCK * BLOCK + x % BLOCK
-            for channel in range(colours):
-                v_pixels[block, channel, lane] = v_features[top + y, left + x, channel]
-            if v_depth.shape[0] > 0:
-                v_pixels[block, colours, lane] = v_depth[top + y, left + x]
-            for modality in range(modalities(layout)):
-                v_pixels[block, channels(layout) + modality, lane] = v_alpha[modality, top + y, left + x]
-            for number in range(map_count(layout)):
-                row = channels(layout) + modalities(layout) + number
-                v_pixels[block, row, lane] = maps[top + y, left + x, number]
+    size = pixel_rows(layout)
+    for block in range(BLOCKS):
+        left = tile % tiles_x * TILE + block % TILE_BLOCKS * BLOCK
+        top = tile // tiles_x * TILE + block // TILE_BLOCKS * BLOCK
+        wide, high = max(min(BLOCK, width - left), 0), max(min(BLOCK, height - top), 0)
+        first, pixel = (worker * BLOCKS + block) * size, top * width + left
+        if wide < BLOCK or high < BLOCK:
+            for k in range(size):
+                store_vector(v_pixels, first + k, splat(0.0))
+        for channel in range(colours):
+            offset, row = pixel * colours + channel, width * colours
+            _read_block(v_features, offset, colours, row, wide, high, v_pixels, (first + channel) * LANES)
+        if v_depth.shape[0] > 0:
+            _read_block(v_depth, pixel, 1, width, wide, high, v_pixels, (first + colours) * LANES)
+        for modality in range(modalities(layout)):
+            place, offset = first + channels(layout) + modality, modality * height * width + pixel
+            _read_block(v_alpha, offset, 1, width, wide, high, v_pixels, place * LANES)
+        for number in range(map_count(layout)):
+            place, count = first + channels(layout) + modalities(layout) + number, map_count(layout)
+            _read_block(maps, pixel * count + number, count, width * count, wide, high, v_pixels, place * LANES)
 
 
 @inline

@@ -441,6 +441,21 @@ def load_scalar(typing_context, array, offset):
     return array.dtype(array, offset), generate
 
 
+@intrinsic
+def store_scalar(typing_context, array, offset, value):
+    """Writes element ``offset`` of a contiguous array in its flat order, without wrap-around of negative indices."""
+    if not isinstance(array, types.Array) or array.layout != "C":
+        raise TypingError(f"store_scalar needs a contiguous array, got {array}")
+
+    def generate(context, builder, signature, values):
+        data = context.make_array(array)(context, builder, values[0]).data
+        offset = context.cast(builder, values[1], types.unliteral(signature.args[1]), types.int64)
+        builder.store(values[2], builder.gep(data, [offset]))
+        return context.get_dummy_value()
+
+    return types.void(array, offset, array.dtype), generate
+
+
 def _rows_mask(builder, context, rows, rows_type, columns: int):
     """A mask of the numbers of the first ``rows`` rows of sixteen."""
     limit = context.cast(builder, rows, types.unliteral(rows_type), types.int32)

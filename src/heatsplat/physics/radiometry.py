@@ -220,3 +220,20 @@ def uncertainty(
     slopes = sensitivities(signal, response, conditions)
     parts = {name: slopes[name].abs() * value for name, value in standard.items()}
     return parts | {"combined": torch.stack(list(parts.values())).square().sum(0).sqrt()}
+
+
+def directional_emissivity(normal: Quantity, cosine: Tensor, index: float) -> Tensor:
+    """Emissivity of a smooth dielectric seen at an angle: that along its normal, less as Fresnel's reflectance grows.
+
+    ε(θ) = ε(0) (1 - R(θ)) / (1 - R(0)) with R of unpolarised light; 1.5 is common for paint, brick, plastics and water-poor
+    materials in the thermal infrared.
+
+    Args:
+        normal: ε(0).
+        cosine: cos θ between line of sight and normal, in [0, 1], of any shape.
+        index: refractive index n, above 1.
+    """
+    inside = (1.0 - (1.0 - cosine.double().square()) / index**2).sqrt()
+    across = ((cosine - index * inside) / (cosine + index * inside)).square()
+    along = ((index * cosine - inside) / (index * cosine + inside)).square()
+    return normal * (1.0 - 0.5 * (across + along)) / (1.0 - ((index - 1.0) / (index + 1.0)) ** 2)

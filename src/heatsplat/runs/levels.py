@@ -25,7 +25,7 @@ LEVELS_FILE = "levels.json"
 def write_levels(
     trained: Trained,
     merging: Any,
-    levels_c: Sequence[float],
+    levels_c: Sequence[float] | float,
     output_dir: Path,
     ply: bool = True,
     time_s: float | None = None,
@@ -37,7 +37,7 @@ def write_levels(
     Args:
         trained: the scene.
         merging: how Gaussians are merged (``density.merging.FlatMerging``).
-        levels_c: °C that each level may lose, increasing.
+        levels_c: °C that each level may lose, increasing; or that of a single one.
         output_dir: folder of the files.
         ply: write the Gaussians for viewers as well, with their temperature.
         time_s: of the PLY files, seconds since the first training frame; None takes the middle of the record.
@@ -45,11 +45,15 @@ def write_levels(
     Raises:
         SceneError: levels do not increase from above 0, or the Gaussians of the method cannot be merged.
     """
-    levels_c = [float(level) for level in levels_c]
-    if not levels_c or any(after <= before for before, after in zip((0.0, *levels_c), levels_c, strict=False)):
+    wanted = levels_c if isinstance(levels_c, Sequence) else [levels_c]
+    try:
+        increasing = all(before < after for before, after in zip((0.0, *wanted), wanted, strict=False))
+    except TypeError:
+        increasing = False
+    if not increasing or len(wanted) == 0:
         raise SceneError(f"levels_c must be increasing numbers of °C above 0, got {levels_c}")
     module, written, found = trained.module, [], []
-    for number, level in enumerate(merging.levels(module, levels_c)):
+    for number, level in enumerate(merging.levels(module, [float(level) for level in wanted])):
         found.append(level.found | {"checkpoint": f"lod_{number}.ckpt"})
         with module.showing(level.splats):
             kept = trained.checkpoint[CHECKPOINT_KEY] | {

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered, surface_depth
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
@@ -81,6 +82,8 @@ def complete(config: dict[str, Any], output_dir: Path) -> RunResults:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return results
     run = begin(config, output_dir)
+    if run.config["doctor"] and run.config["ckpt"] is None and (found := warn_of(run.data.scene)):
+        write_findings(found, output_dir / FINDINGS_FILE)
     return fit(run.module, run.data, run.trainer, ckpt=run.config["ckpt"], test=run.config["test"])
 
 

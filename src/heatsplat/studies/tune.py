@@ -49,7 +49,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Runs:
+class MethodRuns:
     """Where the runs of a method lie, and what all of them have.
 
     Args:
@@ -155,7 +155,7 @@ def run(
     done: list[Trial] = []
     checks: list[Check] = []
     for method, case in chosen.items():
-        runs = Runs(method, output_dir, train, [*overrides, f"method={method}", *case["scene"]])
+        runs = MethodRuns(method, output_dir, train, [*overrides, f"method={method}", *case["scene"]])
         default = Trial(method, "default", {}, runs.result("default", {}, search_steps, SEARCH_SEED))
         tried = [default, *_search(runs, case["knobs"], trials, seconds, search_steps, score)]
         done += tried
@@ -223,7 +223,7 @@ def _optuna() -> Any:
 
 
 def _search(
-    runs: Runs, knobs: Mapping[str, Any], trials: int, seconds: float | None, steps: int, score: str
+    runs: MethodRuns, knobs: Mapping[str, Any], trials: int, seconds: float | None, steps: int, score: str
 ) -> Iterator[Trial]:
     """The trials of a method, each as soon as it has ended."""
     optuna = _optuna()

@@ -394,6 +394,11 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
 
     @torch.no_grad()
+    def shapes(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, scales and opacities [M, N] of all Gaussians as they are rendered in a frame."""
+        return self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+
+    @torch.no_grad()
     def emissions(self, splats: Splats, frame: Frame) -> Tensor:
         """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
         return self.thermal.features(splats, _query(frame))

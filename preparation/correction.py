@@ -1,0 +1,305 @@
+"""Radiometry pixel by pixel, once a scene is trained: its own depth is the distance, its own surfaces give the angle.
+
+A tool that sees one image at a time has one distance for all pixels and an emissivity that knows no angle. A trained scene
+knows both, so the air between a pixel's surface and the camera, and what the surface emits in that direction, are corrected
+for each pixel.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from heatsplat.contracts import Camera, SceneData, SceneError, View
+from heatsplat.datamodules.bounds import BOUNDS_FILE
+from heatsplat.datamodules.colmap import FRAMES_FILE
+from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.geometry.sight_lines import cosines, distances
+from heatsplat.io.pictures import Bar, Panel, colorize, write_png
+from heatsplat.io.pictures import compose as side_by_side
+from heatsplat.io.results import write_atomically
+from heatsplat.io.tables import markdown_table, write_csv
+from heatsplat.io.tiff import write_temperature
+from heatsplat.physics.planck import Band
+from heatsplat.physics.radiometry import (
+    LIMITS,
+    Atmosphere,
+    BandResponse,
+    Conditions,
+    PlanckResponse,
+    Response,
+    directional_emissivity,
+    measured_signal,
+    surface_temperature,
+)
+from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.report import Section, write_report
+from heatsplat.runs.run import load
+
+log = logging.getLogger(__name__)
+
+GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
+PERCENT = (1, 5, 50, 95, 99)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """One image, corrected.
+
+    Args:
+        one: °C with one distance for all pixels and no angle, [H, W] float64.
+        distance_only: °C with a distance for each pixel.
+        celsius: °C with a distance and an angle for each pixel.
+        distance_m: to the surface; NaN where there is none.
+        angle_deg: between line of sight and normal; NaN where it is not known.
+    """
+
+    one: Tensor
+    distance_only: Tensor
+    celsius: Tensor
+    distance_m: Tensor
+    angle_deg: Tensor
+
+
+def corrected(
+    celsius: Tensor,
+    camera: Camera,
+    depth: Tensor,
+    metres_per_unit: float,
+    response: Response,
+    done: Conditions,
+    wanted: Conditions,
+    index: float | None,
+) -> Corrected:
+    """An image of a trained scene under conditions that are known for each pixel.
+
+    Args:
+        celsius: [H, W] temperatures as they were trained on, NaN where unknown.
+        camera, depth: of the image; camera z [H, W] in world units, infinite where there is no surface.
+        metres_per_unit: scale of the world.
+        response: of the thermal camera.
+        done: conditions that the temperatures are corrected for already; that is taken back first.
+        wanted: those to correct for; their distance is the one for all pixels, and stays where there is no surface.
+        index: refractive index of the surfaces; None leaves the emissivity the same at all angles.
+    """
+    signal = measured_signal(celsius.double() + KELVIN_AT_0_C, response, done)
+    metres = distances(camera, depth) * metres_per_unit
+    there = metres.isfinite()
+    near = replace(wanted, distance_m=torch.where(there, metres, wanted.distance_m))
+    cosine = cosines(camera, depth)
+    full = near
+    if index is not None:
+        seen = cosine.nan_to_num(1.0).clamp(min=GRAZING)
+        full = replace(near, emissivity=directional_emissivity(wanted.emissivity, seen, index))
+    one, distance_only, all_of_it = (
+        surface_temperature(signal, response, conditions) - KELVIN_AT_0_C for conditions in (wanted, near, full)
+    )
+    angle = torch.rad2deg(torch.arccos(cosine))
+    return Corrected(one, distance_only, all_of_it, metres.where(there, torch.nan), angle)
+
+
+def correct(
+    ckpt: str | None,
+    target: Path,
+    *,
+    conditions: Mapping[str, float | None],
+    band_um: Sequence[float],
+    refractive_index: float | None,
+    metres_per_unit: float | None,
+    trust: Sequence[str] = (),
+) -> Path:
+    """Corrects the images of a trained scene pixel by pixel and returns the path of a report on what that changed.
+
+    The folder then has images/ (float32 TIFF in °C), the cameras in sparse/0, temperature_bounds.json and frames.csv: it trains
+    with ``data=colmap``. What the scene's own preparation corrected for is taken back first.
+
+    Args:
+        ckpt: checkpoint of a run on the scene.
+        target: folder of the corrected scene.
+        conditions: arguments of ``Given``; None takes those of the preparation.
+        band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
+        refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
+        metres_per_unit: scale of the world; None takes the scene's.
+        trust: classes of yours that the checkpoint may name.
+
+    Raises:
+        SceneError: the scene has no temperatures or no scale, or the conditions leave nothing to correct.
+    """
+    trained = load(ckpt, trust=trust)
+    root = Path(trained.config["data"]["root"] or ".")
+    folders = [root, root / str(trained.config["data"].get("scene"))]
+    return correct_scene(
+        trained.scene,
+        trained.depth,
+        folders,
+        target,
+        Given(**conditions),
+        BandResponse(Band(*band_um, nodes=16)),
+        refractive_index,
+        metres_per_unit or trained.scene.metres_per_unit,
+    )
+
+
+def correct_scene(
+    scene: SceneData,
+    depth_of: Any,
+    folders: Sequence[Path],
+    target: Path,
+    given: Given,
+    response: Response,
+    index: float | None,
+    metres_per_unit: float | None,
+) -> Path:
+    """As ``correct``, of a scene whose depth [H, W] in a frame ``depth_of`` gives; ``folders`` may hold its preparation."""
+    if scene.thermal_range is None:
+        raise SceneError(
+            f"{scene.name} has no temperatures to correct; prepare it from a camera's files, or give it bounds"
+        )
+    if not metres_per_unit:
+        raise SceneError(
+            "the scale of the scene is not known, and the air between camera and surface counts in metres: give "
+            "correct.metres_per_unit (poses with GPS have 1)"
+        )
+    if index is not None and not index > 1:
+        raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
+    views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
+    far = typical_distance(views, depth_of) * metres_per_unit
+    changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
+    rows, cameras, shown = [], {}, None
+    low, high = np.inf, -np.inf
+    for number, view in enumerate(track(views, "correcting")):
+        own, done = preparation_of(view.frame.name, folders)
+        wanted = given.conditions(done)
+        if wanted.distance_m == 0:
+            wanted = replace(wanted, distance_m=far)
+        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].double())
+        if view.mask is not None:
+            celsius = celsius.where(view.mask, torch.nan)
+        depth = depth_of(view.frame)
+        found = corrected(celsius, view.camera, depth, metres_per_unit, own or response, done, wanted, index)
+        changes["distance"].append(_known(found.distance_only - found.one))
+        changes["angle"].append(_known(found.celsius - found.distance_only))
+        changes["both"].append(_known(found.celsius - found.one))
+        name = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
+        image = found.celsius.float().numpy()
+        write_temperature(target / "images" / name, image)
+        if np.isfinite(image).any():
+            low, high = min(low, float(np.nanmin(image))), max(high, float(np.nanmax(image)))
+        rows.append({"file": name} | ({"time_s": view.frame.time_s} if view.frame.time_s is not None else {}))
+        cameras[name] = view.camera
+        shown = found if number == len(views) // 2 else shown
+    if not low < high:
+        raise SceneError(
+            f"under these conditions no pixel of {scene.name} has a temperature; are they those of the recording?"
+        )
+    _write_cameras(target, scene, cameras)
+    write_csv(target / FRAMES_FILE, rows)
+    bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
+    write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+    write_png(target / "report" / "correction.png", _picture(shown))
+    page = write_report(target, [_section(changes, far, wanted, index, len(views))])
+    log.info("%s", page)
+    return page
+
+
+def _known(values: Tensor) -> np.ndarray:
+    return values[values.isfinite()].float().numpy()
+
+
+def typical_distance(views: Sequence[View], depth_of: Any) -> float:
+    """Median distance in world units over a few views; what one would give for all pixels. Raises SceneError without surfaces."""
+    few = views[:: max(1, len(views) // 8)]
+    found = [distances(view.camera, depth_of(view.frame)) for view in few]
+    known = torch.cat([d[d.isfinite()] for d in found])
+    if not len(known):
+        raise SceneError("the trained scene shows no surface to any of its cameras; train it longer")
+    return float(known.median())
+
+
+def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None, Conditions]:
+    """The calibration and the conditions that an image was prepared with; None and no correction where nothing says so."""
+    path = next((p for f in folders if (p := (f / "images" / name).with_suffix(".json")).is_file()), None)
+    if path is None:
+        return None, Conditions()
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        stated = {key: float(record["conditions"][key]["value"]) for key in LIMITS}
+        done = Conditions(**stated, atmosphere=Atmosphere(**record["atmosphere"]))
+        kind = dict(record["calibration"])
+        if kind.pop("kind") == "planck":
+            return PlanckResponse(**kind), done
+        return BandResponse(Band(*kind["band_um"], nodes=16)), done
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise SceneError(f"{path} is no record of a preparation ({error}); prepare the scene again") from error
+
+
+def _write_cameras(target: Path, scene: SceneData, cameras: Mapping[str, Camera]) -> None:
+    kinds: dict[tuple, int] = {}
+    camera_of = {}
+    for name, camera in cameras.items():
+        k = camera.K.tolist()
+        kind = ("PINHOLE", (k[0][0], k[1][1], k[0][2], k[1][2]), camera.width, camera.height)
+        camera_of[name] = kinds.setdefault(kind, len(kinds))
+    poses = {name: camera.viewmat.double().numpy() for name, camera in cameras.items()}
+    colours = scene.point_colors if scene.point_colors is not None else torch.full((len(scene.points), 3), 0.5)
+    points = scene.points.double().numpy()
+    write_model(target / "sparse" / "0", poses, list(kinds), points, _bytes(colours), camera_of=camera_of)
+
+
+def _bytes(colours: Tensor) -> np.ndarray:
+    return (colours.double().clamp(0, 1) * 255).round().numpy().astype(np.uint8)
+
+
+def _picture(found: Corrected) -> np.ndarray:
+    change = found.celsius - found.one
+    most = max(float(np.nanquantile(change.abs().numpy(), 0.99)), 1e-3)
+    panels = []
+    for values, title, unit, ends in (
+        (found.distance_m, "distance", "m", None),
+        (found.angle_deg, "angle", "°", (0.0, 90.0)),
+        (found.celsius, "temperature", "°C", None),
+        (change, "change against one distance", "°C", (-most, most)),
+    ):
+        known = values[values.isfinite()]
+        low, high = ends or (float(known.quantile(0.01)), float(known.quantile(0.99))) if len(known) else (0.0, 1.0)
+        colours = "RdBu_r" if title.startswith("change") else "inferno"
+        panels.append(Panel(colorize(values, low, high, colours), title, Bar(low, high, unit, colours)))
+    return side_by_side(panels)
+
+
+def _section(
+    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int
+) -> Section:
+    """What a distance and an angle for each pixel changed, in °C."""
+    names = {"distance": "distance of each pixel", "angle": "angle of each pixel", "both": "both"}
+    table, values = [], {}
+    for key, name in names.items():
+        found = np.concatenate(changes[key]) if changes[key] else np.zeros(0)
+        quantiles = np.percentile(found, PERCENT) if found.size else np.full(len(PERCENT), np.nan)
+        spread = float(np.abs(found).mean()) if found.size else float("nan")
+        table.append([name, f"{spread:.3f}", *(f"{q:+.3f}" for q in quantiles)])
+        values[key] = {
+            "mean_abs_c": spread,
+            "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
+        }
+    lines = [
+        f"{count} images, against one distance of {float(c.distance_m):.1f} m for all pixels (the scene's median is {far:.1f} m) "
+        f"and an emissivity of {float(c.emissivity):g} at every angle. Air {float(c.air_k) - KELVIN_AT_0_C:.1f} °C, "
+        f"{100 * float(c.humidity):.0f} %, reflected {float(c.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
+        + (f"refractive index {index:g}." if index is not None else "no angle."),
+        "",
+        *markdown_table(["change in °C", "mean of its size", *(f"{p} %" for p in PERCENT)], table, "lrrrrrr"),
+        "",
+        "![distance, angle, temperature and change](report/correction.png)",
+    ]
+    return Section("What a distance and an angle for each pixel change", lines, values)

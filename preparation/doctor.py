@@ -1,0 +1,93 @@
+"""The doctor on a folder: a scene that trains, or a camera's files that have no poses yet."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from heatsplat.contracts import SceneData, SceneError, evenly_spread
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import find_model
+from heatsplat.datamodules.formats.exif import exif_in
+from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
+from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
+from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
+from heatsplat.preparation.frames import Reading, read_recording
+from heatsplat.preparation.report import Section
+
+log = logging.getLogger(__name__)
+
+
+def check(folder: str, target: Path | None = None, downscale: float = 1.0) -> list[Finding]:
+    """Looks for what is wrong with a folder, prints a table of it, and writes it to doctor.json.
+
+    Args:
+        folder: a scene with a COLMAP model or transforms.json, or a camera's files.
+        target: where doctor.json is written; None: in the working directory.
+        downscale: factor by which images of a scene shrink before they are looked at.
+
+    Raises:
+        SceneError: the folder holds neither.
+    """
+    found = examine(material_in(Path(folder).expanduser(), downscale))
+    show(found, str(folder))
+    path = (target or Path()) / FINDINGS_FILE
+    write_findings(found, path)
+    log.info("%s", path)
+    return found
+
+
+def section(folder: Path) -> Section:
+    """The part of a preparation's report on what is wrong with a camera's files."""
+    found = examine(material_in(folder))
+    lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
+    return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
+
+
+def material_in(folder: Path, downscale: float = 1.0) -> Material:
+    """What there is to look at in a folder. Raises SceneError where it holds neither scene nor recording."""
+    if not folder.is_dir():
+        raise SceneError(f"check={folder}: there is no such folder")
+    if find_model(folder) is not None:
+        return material_of(_colmap(folder, downscale))
+    if find_transforms(folder):
+        return material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)
+    return _recorded(folder)
+
+
+def _colmap(folder: Path, downscale: float) -> SceneData:
+    """A scene with a sparse model, with counts and photos where folders of the usual names hold them."""
+    raw = "raw16" if (folder / "raw16").is_dir() else None
+    rgb = "rgb" if (folder / "rgb").is_dir() else None
+    times = "times.csv" if (folder / "times.csv").is_file() else None
+    return Colmap(root=str(folder), raw=raw, rgb=rgb, time_csv=times, downscale=downscale).scene
+
+
+def _recorded(folder: Path) -> Material:
+    """A camera's files, without poses."""
+    frames = read_recording(folder, Reading()).frames
+    chosen = evenly_spread(len(frames), MAX_FRAMES)
+    images = [frames[i].pixels() for i in chosen]
+    kept = [k for k, image in enumerate(images) if image.shape == images[0].shape]
+    known = all(frame.calibration is not None for frame in frames)
+    times = [None if frame.time is None else frame.time.timestamp() for frame in frames]
+    return Material(
+        names=[frame.name for frame in frames],
+        times_s=None if any(time is None for time in times) else times,
+        chosen=[chosen[k] for k in kept],
+        images=torch.from_numpy(np.stack([images[k] for k in kept])).double(),
+        unit_k=1.0 if known else None,
+        rgb_times_s=_photo_times([frame.rgb for frame in frames]),
+    )
+
+
+def _photo_times(photos: Sequence[Path | None]) -> list[float] | None:
+    """When photos were taken, on their camera's clock; None where one does not say."""
+    times = [None if photo is None else exif_in(photo.read_bytes()).get("time") for photo in photos]
+    if not times or any(time is None for time in times):
+        return None
+    return [time.timestamp() for time in times]

@@ -1,0 +1,454 @@
+"""Where the cameras stood: structure from motion on the thermal frames, or on the photos of a camera beside them."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import cv2  # before pycolmap: formats/colmap.py says why
+import numpy as np
+import pycolmap
+from rich.progress import Progress, track
+
+from heatsplat.contracts import SceneError, check_option
+from heatsplat.datamodules.formats.geodesy import east_north_up
+from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.preparation.features import Features
+from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.report import Section
+from heatsplat.preparation.stretch import Stretch
+
+log = logging.getLogger(__name__)
+
+WORK = ".poses"  # folder in the prepared one: copies, features and matches, from which a stopped search goes on
+SOURCES = ("thermal", "rgb")
+FEW_FEATURES = 60
+PAIRS_AT_ONCE = 200
+
+
+@dataclass(frozen=True)
+class FindPoses:
+    """Cameras by COLMAP's incremental mapping; called with the frames and the prepared folder, it writes sparse/0.
+
+    The model keeps the lens that was found; whoever loads the scene takes its distortion out of the temperatures
+    (interpolated once, as floating point). With GPS the world is east, north and up in metres of the first fix; without it
+    scale and orientation are the reconstruction's own. One thread and one seed: the same frames give the same bits.
+
+    Args:
+        on: "thermal" frames, or "rgb": the photos that belong to them; where the thermal camera stands beside the visible
+            one is then calibrated on the way, from the thermal features.
+        features: what finds and matches features.
+        camera_model: of COLMAP, for each camera: SIMPLE_RADIAL, RADIAL, OPENCV, ...
+        focal_px: focal length of the thermal camera in pixels; None for what the files say, or a guess that is refined.
+        pixel_um: pitch of the detector's pixels in µm, for files that say a focal length in mm.
+        refine_focal: "auto" where the files say nothing, True or False. Flat ground from straight above does not tell it.
+        video: frames follow each other: only neighbours in time (and in space, by GPS) are matched. None: where there are
+            more than ``all_pairs``.
+        all_pairs: number of frames up to which all pairs are matched.
+        overlap: neighbours in time on each side; beyond them those at 2, 4, 8, ... times that distance.
+        gps: whether positions count.
+        gps_sd_m: standard deviation of positions of files that state none: horizontal, vertical.
+        clip: limit of local equalisation.
+        seed: of COLMAP's random draws.
+    """
+
+    features: Features
+    on: str = "thermal"
+    camera_model: str = "SIMPLE_RADIAL"
+    focal_px: float | None = None
+    pixel_um: float = 12.0
+    refine_focal: str | bool = "auto"
+    video: bool | None = None
+    all_pairs: int = 120
+    overlap: int = 10
+    gps: bool = True
+    gps_sd_m: tuple[float, float] = (2.0, 4.0)
+    clip: float = 3.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_option("poses.on", self.on, SOURCES, SceneError)
+        check_option("poses.refine_focal", self.refine_focal, ("auto", True, False), SceneError)
+
+    def __call__(self, frames: list[Frame], target: Path) -> Section:
+        """Writes ``target``/sparse/0. Returns what was found, what was not, and why.
+
+        Raises:
+            SceneError: no two frames could be brought together.
+        """
+        search = Search(self, frames, target)
+        search.copies()
+        search.find_features()
+        search.match()
+        model, others = search.map()
+        return search.finish(model, others)
+
+
+class Search:
+    """One search for cameras, step by step; what is done already in the folder is not done again."""
+
+    def __init__(self, options: FindPoses, frames: Sequence[Frame], target: Path) -> None:
+        self.options, self.target, self.work = options, target, target / WORK
+        if len(frames) < 3:
+            raise SceneError(f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed")
+        index = ImageIndex(target / "images")
+        self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
+        if options.on == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
+            raise SceneError(
+                f"poses.on=rgb: {len(lacking)} of {len(frames)} frames have no photo, such as {lacking[0]}; "
+                "give the folder of photos, or find poses.on=thermal"
+            )
+        self.copy_of = {name: f"thermal/{Path(name).with_suffix('.png').as_posix()}" for name in self.frames}
+        self.name_of = {copy: name for name, copy in self.copy_of.items()}
+        self.database = self.work / "database.db"
+        self.origin = self._origin()
+
+    def copies(self) -> None:
+        """8-bit copies of all frames (and photos) in the work folder."""
+        images = self.work / "images"
+        todo = [name for name in self.frames if not (images / self.copy_of[name]).is_file()]
+        if todo:
+            stretch = Stretch([frame.pixels for frame in self.frames.values()], self.options.clip)
+            for name in _progress(todo, "stretching"):
+                _write_png(images / self.copy_of[name], stretch(self.frames[name].pixels()))
+        if self.options.on == "rgb":
+            for name in _progress(list(self.frames), "copying photos"):
+                copy = images / self._photo(name)
+                if not copy.is_file():
+                    _write_png(copy, to_grey(read_image(self.frames[name].rgb)))
+
+    def find_features(self) -> None:
+        """Features of all copies, in the database."""
+        cameras = {"thermal/": self._thermal_focal()}
+        names = list(self.name_of)
+        if self.options.on == "rgb":
+            cameras["rgb/"] = None
+            names += [self._photo(name) for name in self.frames]
+        reader = pycolmap.ImageReaderOptions(camera_model=self.options.camera_model)
+        missing = set(names)
+        if self.database.is_file():
+            with pycolmap.Database.open(self.database) as database:
+                missing -= {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
+        todo = [name for name in names if name in missing]
+        for name in _progress(todo, "finding features"):
+            reader.existing_camera_id = self._camera_of(name)
+            self.options.features.extract(self.database, self.work / "images", name, reader)
+        if not todo:
+            return
+        with pycolmap.Database.open(self.database) as database:
+            self._set_cameras(database, cameras)
+            self._write_priors(database)
+            if self.options.on == "rgb":
+                cameras = [
+                    pycolmap.RigConfigCamera(ref_sensor=True, image_prefix="rgb/"),
+                    pycolmap.RigConfigCamera(image_prefix="thermal/", cam_from_rig=pycolmap.Rigid3d()),
+                ]
+                pycolmap.apply_rig_config([pycolmap.RigConfig(cameras=cameras)], database)
+
+    def match(self) -> None:
+        """Matches of all pairs that may overlap, verified."""
+        pairs = [(self.copy_of[a], self.copy_of[b]) for a, b in self.pairs()]
+        if self.options.on == "rgb":
+            pairs += [(self._photo(a), self._photo(b)) for a, b in self.pairs()]
+        blocks = [pairs[i : i + PAIRS_AT_ONCE] for i in range(0, len(pairs), PAIRS_AT_ONCE)]
+        for block in _progress(blocks, f"matching {len(pairs)} pairs"):
+            self.options.features.match(self.database, block, self.work / "pairs.txt", self.options.seed)
+
+    def pairs(self) -> list[tuple[str, str]]:
+        """Names of frames that are matched with each other."""
+        names = sorted(self.frames, key=lambda name: (_moment(self.frames[name]), name))
+        video = len(names) > self.options.all_pairs if self.options.video is None else self.options.video
+        if not video:
+            return list(combinations(names, 2))
+        steps = {*range(1, self.options.overlap + 1)}
+        step = 2 * self.options.overlap
+        while step < len(names):
+            steps.add(step)
+            step *= 2
+        found = {(i, i + step) for step in steps for i in range(len(names) - step)}
+        places = self._places(names)
+        if places is not None:
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+            for i, row in enumerate(apart):
+                found |= {(min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j}
+        return [(names[i], names[j]) for i, j in sorted(found)]
+
+    def map(self) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
+        """The largest reconstruction, and those that it does not connect to."""
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed, options.num_threads = self.options.seed, 1
+        options.min_model_size = 3
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.init_min_num_inliers = 50
+        refine = self.options.refine_focal
+        options.ba_refine_focal_length = self._thermal_focal() is None if refine == "auto" else refine
+        options.mapper.abs_pose_refine_focal_length = options.ba_refine_focal_length
+        if self.options.on == "rgb":
+            options.ba_refine_focal_length = True
+        options.use_prior_position = self.origin is not None
+        options.use_robust_loss_on_prior_position = True
+        folder = self.work / "models"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        with Progress(transient=True) as bar:
+            task = bar.add_task("placing cameras", total=len(self.frames))
+            models = pycolmap.incremental_mapping(
+                self.database, self.work / "images", folder, options, next_image_callback=lambda: bar.advance(task)
+            )
+        if not models:
+            raise SceneError(self._nothing())
+        ordered = sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+        return ordered[0], ordered[1:]
+
+    def finish(self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> Section:
+        """Writes the model of the thermal frames and says what became of every frame."""
+        kept = {image.name: image for image in model.images.values() if image.has_pose and image.name in self.name_of}
+        if len(kept) < 3:
+            raise SceneError(self._nothing())
+        written = thermal_only(model, self.name_of)
+        folder = self.target / "sparse" / "0"
+        write_whole(written, folder, self.work)
+        missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
+        errors = self._gps_residuals(model, kept)
+        camera = next(iter(kept.values())).camera
+        values: dict[str, Any] = {
+            "registered": len(kept),
+            "frames": len(self.frames),
+            "points": written.num_points3D(),
+            "reprojection_error_px": round(model.compute_mean_reprojection_error(), 4),
+            "camera": {"model": camera.model.name, "params": [round(float(p), 6) for p in camera.params]},
+            "not_registered": missing,
+            "metres_per_unit": None if self.origin is None else 1.0,
+            "origin": None if self.origin is None else [float(x) for x in self.origin],
+        }
+        lines = [
+            f"{len(kept)} of {len(self.frames)} frames found their camera; {values['points']} points, reprojection error "
+            f"{values['reprojection_error_px']:.2f} px.",
+            f"Camera: {camera.model.name}, {', '.join(f'{p:.5g}' for p in camera.params)} (distortion is taken out of the "
+            "temperatures when the scene is loaded, as floating point).",
+        ]
+        if errors is not None:
+            values["gps_residual_m"] = [round(float(e), 3) for e in errors]
+            lines.append(
+                f"World: east, north, up in metres of the first GPS fix; cameras lie {errors[0]:.2f} m beside and "
+                f"{errors[1]:.2f} m above or below their fixes (rms)."
+            )
+        else:
+            lines.append("World: scale and orientation of the reconstruction; no GPS that would tell them.")
+        if self.options.on == "rgb":
+            rig = next(iter(model.rigs.values()))
+            sensor = camera.sensor_id
+            pose = rig.sensor_from_rig(sensor)
+            values["thermal_from_rgb"] = np.asarray(pose.matrix()).round(6).tolist()
+            where = ", ".join(f"{x:.4g}" for x in pose.inverse().translation)
+            lines.append(f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward).")
+        lines += [f"- {name}: {reason}" for name, reason in missing.items()]
+        return Section("Poses", lines, values)
+
+    # What the frames say -----------------------------------------------------------------------------------------------
+
+    def _photo(self, name: str) -> str:
+        return self.copy_of[name].replace("thermal/", "rgb/", 1)
+
+    def _thermal_focal(self) -> float | None:
+        """Focal length in pixels that the user or the files give, or None."""
+        if self.options.focal_px is not None:
+            return float(self.options.focal_px)
+        first = next(iter(self.frames.values()))
+        angle = first.camera.field_of_view_deg
+        if not angle:
+            millimetres = first.camera.focal_mm
+            return None if millimetres is None else 1000.0 * millimetres / self.options.pixel_um
+        return 0.5 * first.pixels().shape[1] / float(np.tan(np.radians(0.5 * angle)))
+
+    def _camera_of(self, copy: str) -> int:
+        """Number of the camera that copies of the same folder and size have already; -1 for none."""
+        if not self.database.is_file():
+            return -1
+        shape = _shape(self.work / "images" / copy)
+        with pycolmap.Database.open(self.database) as database:
+            for image in database.read_all_images():
+                if image.name.split("/")[0] == copy.split("/")[0]:
+                    camera = database.read_camera(image.camera_id)
+                    if (camera.height, camera.width) == shape:
+                        return camera.camera_id
+        return -1
+
+    def _set_cameras(self, database: pycolmap.Database, focal: dict[str, float | None]) -> None:
+        """One camera for each folder of copies, at the focal length that is known."""
+        images = database.read_all_images()
+        for prefix, length in focal.items():
+            own = [image for image in images if image.name.startswith(prefix)]
+            for camera_id in {image.camera_id for image in own}:
+                camera = database.read_camera(camera_id)
+                if length is not None:
+                    for i in camera.focal_length_idxs():
+                        camera.params[i] = length
+                    camera.has_prior_focal_length = True
+                    database.update_camera(camera)
+
+    def _origin(self) -> np.ndarray | None:
+        """Latitude, longitude and altitude of the first fix; None where GPS does not count or cannot tell frames apart."""
+        if not self.options.gps:
+            return None
+        fixes = [_fix(frame) for frame in self.frames.values()]
+        known = np.array([fix for fix in fixes if fix is not None])
+        if len(known) < 3:
+            return None
+        metres = east_north_up(known, known[0])
+        spread = np.linalg.norm(metres[:, :2] - metres[:, :2].mean(0), axis=1).max()
+        if spread < 2.0 * self._sd(next(f for f in self.frames.values() if f.position))[0]:
+            log.warning("GPS says that all frames were taken within %.1f m; it is not used", spread)
+            return None
+        return known[0]
+
+    def _sd(self, frame: Frame) -> tuple[float, float]:
+        position, (across, up) = frame.position, self.options.gps_sd_m
+        return position.horizontal_sd_m or across, position.vertical_sd_m or up
+
+    def _places(self, names: Sequence[str]) -> np.ndarray | None:
+        """Metres [n, 3] of the frames by GPS; None where it does not count or one lacks it."""
+        fixes = [_fix(self.frames[name]) for name in names]
+        if self.origin is None or any(fix is None for fix in fixes):
+            return None
+        return east_north_up(np.array(fixes), self.origin)
+
+    def _write_priors(self, database: pycolmap.Database) -> None:
+        if self.origin is None:
+            return
+        database.clear_pose_priors()
+        for image in database.read_all_images():
+            name = self.name_of.get(image.name)
+            if self.options.on == "rgb":
+                name = self.name_of.get(image.name.replace("rgb/", "thermal/", 1)) if image.name.startswith("rgb/") else None
+            fix = None if name is None else _fix(self.frames[name])
+            if fix is None:
+                continue
+            across, up = self._sd(self.frames[name])
+            database.write_pose_prior(
+                pycolmap.PosePrior(
+                    corr_data_id=image.data_id,
+                    position=east_north_up(np.array([fix]), self.origin)[0],
+                    position_covariance=np.diag([across**2, across**2, up**2]),
+                    coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                )
+            )
+
+    def _gps_residuals(self, model: pycolmap.Reconstruction, kept: dict[str, pycolmap.Image]) -> np.ndarray | None:
+        """Root mean square of how far cameras lie from their fixes: horizontally and vertically, in metres."""
+        if self.origin is None:
+            return None
+        known = {copy: fix for copy in kept if (fix := _fix(self.frames[self.name_of[copy]])) is not None}
+        found = np.array([kept[copy].projection_center() for copy in known])
+        away = found - east_north_up(np.array(list(known.values())), self.origin)
+        return np.sqrt(np.array([(away[:, :2] ** 2).sum(1).mean(), (away[:, 2] ** 2).mean()]))
+
+    # What did not work --------------------------------------------------------------------------------------------------
+
+    def _counts(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Features of every copy, and with how many other copies it has verified matches."""
+        with pycolmap.Database.open(self.database) as database:
+            images = {image.image_id: image.name for image in database.read_all_images()}
+            features = {name: database.num_keypoints_for_image(key) for key, name in images.items()}
+            partners = dict.fromkeys(images.values(), 0)
+            for pair, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+                if inliers >= 15:
+                    for key in pycolmap.pair_id_to_image_pair(pair):
+                        partners[images[key]] += 1
+        return features, partners
+
+    def _why_not(self, missing: set[str], others: Sequence[pycolmap.Reconstruction]) -> dict[str, str]:
+        """Why each of the copies has no camera, by name of its frame."""
+        features, partners = self._counts()
+        elsewhere = {image.name: m.num_reg_images() for m in others for image in m.images.values() if image.has_pose}
+        reasons = {}
+        for copy in sorted(missing):
+            if features[copy] < FEW_FEATURES:
+                reason = f"only {features[copy]} features: too little contrast, or blurred"
+            elif not partners[copy]:
+                reason = f"{features[copy]} features, but no other frame shows enough of them: no overlap, or changed heat"
+            elif copy in elsewhere:
+                reason = f"belongs to a group of {elsewhere[copy]} frames that nothing connects to the others"
+            else:
+                reason = f"matches {partners[copy]} other frame(s), but too few of the points that were found"
+            reasons[self.name_of[copy]] = reason
+        return reasons
+
+    def _nothing(self) -> str:
+        features, partners = self._counts()
+        thermal = [features[copy] for copy in self.name_of]
+        return (
+            f"no cameras could be found: frames have {np.median(thermal):.0f} features (median) and overlap with "
+            f"{np.median([partners[copy] for copy in self.name_of]):.0f} others. More overlap between frames helps, and "
+            "photos of a camera beside (poses.on=rgb); or bring a sparse model or transforms.json of another tool"
+        )
+
+
+def thermal_only(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> pycolmap.Reconstruction:
+    """The thermal images of a model under their own names, each a frame of its own, with the points of all cameras."""
+    kept = [image for image in model.images.values() if image.has_pose and image.name in name_of]
+    own = pycolmap.Reconstruction()
+    for camera_id in sorted({image.camera_id for image in kept}):
+        own.add_camera_with_trivial_rig(model.cameras[camera_id])
+    for image in sorted(kept, key=lambda image: name_of[image.name]):
+        fresh = pycolmap.Image(
+            name=name_of[image.name],
+            camera_id=image.camera_id,
+            image_id=image.image_id,
+            keypoints=np.array([p.xy for p in image.points2D]).reshape(-1, 2),
+        )
+        own.add_image_with_trivial_frame(fresh, image.cam_from_world())
+    seen = {image.image_id for image in kept}
+    for key, point in sorted(model.points3D.items()):
+        track = pycolmap.Track([e for e in point.track.elements if e.image_id in seen])
+        own.add_point3D_with_id(key, pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=track))
+    return own
+
+
+def write_whole(model: pycolmap.Reconstruction, folder: Path, work: Path) -> None:
+    """Writes a model so that ``folder`` is never half of one."""
+    fresh = work / "sparse"
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    model.write_binary(str(fresh))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    fresh.rename(folder)
+
+
+def _fix(frame: Frame) -> tuple[float, float, float] | None:
+    """Latitude, longitude and altitude of a frame; where take-off is the better zero, above it."""
+    at = frame.position
+    if at is None:
+        return None
+    height = at.above_takeoff_m if at.above_takeoff_m is not None else at.altitude_m
+    return at.latitude_deg, at.longitude_deg, 0.0 if height is None else height
+
+
+def _shape(path: Path) -> tuple[int, int]:
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape
+
+
+def _moment(frame: Frame) -> float:
+    return 0.0 if frame.time is None else frame.time.timestamp()
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    """Written whole or not at all: a stopped search must not find half a copy."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not done:
+        raise SceneError(f"{path} cannot be written")
+    fresh = path.with_suffix(".part")
+    fresh.write_bytes(data.tobytes())
+    fresh.rename(path)
+
+
+def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
+    return iter(track(items, what, transient=True)) if items else iter(())
+

@@ -1,0 +1,156 @@
+"""What a check is, what it looks at, and what it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Camera, SceneData, View, evenly_spread
+from heatsplat.effects.observations import Tracks, tracks_of
+from heatsplat.physics.noise import noise_of, quantum_of
+
+# Frames that are looked at: enough to find what is common, and cheap beside a training.
+MAX_FRAMES = 32
+NAMED = 3  # frames that a finding names
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong.
+
+    Args:
+        check: name of the check.
+        cost: what it costs, as a share of the scene's contrast (standard deviation of image values) that training will get
+            wrong where it is; findings are ordered by it.
+        what: in a sentence, with figures in their units.
+        remedy: what helps, in a sentence.
+        frames: names of the frames that it concerns; empty where it concerns all.
+    """
+
+    check: str
+    cost: float
+    what: str
+    remedy: str
+    frames: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a doctor looks at: a recording with or without cameras.
+
+    Args:
+        names, times_s: of all frames, in the order of the recording; times in seconds, None where there are none.
+        chosen: positions in them of the frames whose images are here.
+        images: [F, H, W] float64 of those frames: image values, or °C where there is no range yet; NaN does not count.
+        unit_k: kelvin per image value, None where they are no temperatures.
+        masks: [F, H, W] bool, or None where all pixels count.
+        rgb: visible images [H, W, 3] of the same frames and cameras, or None.
+        rgb_times_s: when the photos of all frames were taken, on their own camera's clock, or None.
+        cameras: of the same frames, or None.
+        points: [P, 3] of the scene, or None.
+        bounds_c: temperatures of image values 0 and 1, or None.
+        clipped: share of pixels that lay outside the bounds, or None where unknown.
+        views: the views of ``images``, for tracks; empty without cameras.
+    """
+
+    names: Sequence[str]
+    times_s: Sequence[float] | None
+    chosen: Sequence[int]
+    images: Tensor
+    unit_k: float | None = None
+    masks: Tensor | None = None
+    rgb: Sequence[Tensor] | None = None
+    rgb_times_s: Sequence[float] | None = None
+    cameras: Sequence[Camera] | None = None
+    points: Tensor | None = None
+    bounds_c: tuple[float, float] | None = None
+    clipped: float | None = None
+    views: Sequence[View] = ()
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of a pixel's noise, in units of ``images``."""
+        first = self.known(0)
+        return noise_of(self.images, quantum_of(first), self.masks)
+
+    @cached_property
+    def contrast(self) -> float:
+        """Standard deviation of what the images show."""
+        spread = torch.stack([self.known(f).std() for f in range(len(self.images))]) if len(self.images) else torch.zeros(1)
+        return max(float(spread.median()), self.noise, 1e-9)
+
+    @cached_property
+    def tracks(self) -> Tracks | None:
+        """Scene points through the images, or None where there are no cameras and points, or too few."""
+        if self.cameras is None or self.points is None or not len(self.points):
+            return None
+        return tracks_of(self.points.double(), list(self.views), self.images, self.noise)
+
+    def known(self, frame: int) -> Tensor:
+        """Values [n] of the pixels of a frame that count."""
+        image = self.images[frame]
+        counts = image.isfinite() if self.masks is None else image.isfinite() & self.masks[frame]
+        return image[counts]
+
+    def name(self, frame: int) -> str:
+        """Name of a frame of ``images``."""
+        return self.names[self.chosen[frame]]
+
+    def size(self, value: float) -> str:
+        """A difference of values in words."""
+        return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something that can be wrong.
+
+    Args:
+        name: in findings and docs.
+        summary: what is looked at, in a sentence.
+        find: what is wrong with a recording; empty where nothing is or where it cannot be told.
+    """
+
+    name: str
+    summary: str
+    find: Callable[[Material], list[Finding]]
+
+
+def material_of(scene: SceneData) -> Material:
+    """What a doctor looks at of a scene: its training views."""
+    frames = scene.train.frames
+    chosen = evenly_spread(len(frames), MAX_FRAMES)
+    views = [scene.train[i] for i in chosen]
+    kept = [(i, view) for i, view in zip(chosen, views, strict=True) if view.thermal is not None]
+    shape = kept[0][1].thermal.shape[:2] if kept else (0, 0)
+    kept = [(i, view) for i, view in kept if view.thermal.shape[:2] == shape]
+    views = [view for _, view in kept]
+    masks = None
+    if any(view.mask is not None for view in views):
+        everywhere = torch.ones(shape, dtype=torch.bool)
+        masks = torch.stack([everywhere if view.mask is None else view.mask for view in views])
+    times = [frame.time_s for frame in frames]
+    bounds = scene.thermal_range
+    return Material(
+        names=[frame.name for frame in frames],
+        times_s=None if any(time is None for time in times) else times,
+        chosen=[i for i, _ in kept],
+        images=torch.stack([view.thermal.mean(2) for view in views]).double() if views else torch.zeros(0, 1, 1),
+        unit_k=None if bounds is None else bounds.span_k,
+        masks=masks,
+        rgb=[view.rgb for view in views] if views and all(view.rgb is not None for view in views) else None,
+        cameras=[view.camera for view in views],
+        points=scene.points,
+        bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
+        clipped=scene.notes.get("clipped_fraction"),
+        views=views,
+    )
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few of many names."""
+    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")

@@ -1,0 +1,72 @@
+"""Video whose contrast the camera stretched, taken for temperatures."""
+
+from __future__ import annotations
+
+import torch
+
+from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.doctor.checks.drift import frame_levels
+
+MIN_POINTS, MIN_FRAMES = 40, 5
+GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
+EXPLAINED = 0.5  # share of what levels leave that gains have to explain
+FULL, MOST = 0.004, 0.9  # frames whose darkest and lightest pixels are black and white, and their share
+
+
+def find(material: Material) -> list[Finding]:
+    if material.unit_k is None or len(material.images) < MIN_FRAMES:
+        return []
+    gains = _gains(material)
+    stretched = _fills_the_range(material)
+    if gains is None and not stretched:
+        return []
+    said = []
+    if stretched:
+        said.append("every frame reaches from black to white")
+    if gains is not None:
+        said.append(f"the contrast of the same points changes by {100 * gains:.0f} % from frame to frame")
+    return [
+        Finding(
+            "agc",
+            0.5 if gains is None else min(1.0, 2.0 * gains + 0.1),
+            f"The images have temperature bounds, but {' and '.join(said)}: the camera adjusted them (AGC), and greys are no "
+            "temperatures.",
+            "Export radiometric files (16 bits, TIFF, R-JPEG) or switch AGC off; of video that is all there is, take the bounds "
+            "away and let method=auto simulate agc.",
+        )
+    ]
+
+
+def _gains(material: Material) -> float | None:
+    """Spread of the contrast of the same points from frame to frame where it explains what they change by; else None."""
+    tracks = material.tracks
+    if tracks is None or len(tracks.points) < MIN_POINTS:
+        return None
+    levels = frame_levels(tracks.values, tracks.weights)
+    used = tracks.weights > 0
+    known = torch.where(used, tracks.values - levels, torch.nan)
+    points = known.nanmean(dim=1, keepdim=True)
+    points = torch.where(used, points - torch.where(used, points, torch.nan).nanmean(dim=0), torch.nan)
+    own = known - known.nanmean(dim=0)
+    gain = (own * points).nansum(0) / points.square().nansum(0).clamp_min(1e-12)
+    left, after = (own - points).abs().nanmedian(), (own - gain * points).abs().nanmedian()
+    gain = gain[used.sum(0) >= MIN_POINTS // 2]
+    if len(gain) < MIN_FRAMES or float(after) > (1.0 - EXPLAINED) * float(left):
+        return None
+    # A scene that cools loses contrast smoothly; a camera leaps.
+    middle = 0.5 * (gain[:-2] + gain[2:])
+    leaps = float((gain[1:-1] - middle).std()) / float(gain.mean().abs().clamp_min(1e-9))
+    return leaps if leaps > GAIN else None
+
+
+def _fills_the_range(material: Material) -> bool:
+    full = 0
+    for f in range(len(material.images)):
+        known = material.known(f)
+        if len(known):
+            low, high = known.quantile(torch.tensor([0.005, 0.995], dtype=known.dtype))
+            full += bool(low <= FULL * 3) and bool(high >= 1 - FULL * 3)
+    return full >= MOST * len(material.images)
+
+
+CHECK = Check("agc", "whether bounds are given to images whose contrast the camera changed", find)

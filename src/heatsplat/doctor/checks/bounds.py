@@ -1,0 +1,72 @@
+"""Bounds against pixels, and saturation."""
+
+from __future__ import annotations
+
+import torch
+
+from heatsplat.doctor.base import Check, Finding, Material
+
+CLIPPED = 0.005  # share of pixels beyond the bounds
+NARROW = 0.15  # of the range that pixels use
+EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
+PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
+
+
+def find(material: Material) -> list[Finding]:
+    found = []
+    values = torch.cat([material.known(f)[::7] for f in range(len(material.images))])
+    if not len(values):
+        return []
+    if material.bounds_c is not None:
+        low, high = material.bounds_c
+        clipped = material.clipped
+        if clipped is None:
+            clipped = float(((values <= 0) | (values >= 1)).double().mean())
+        if clipped > CLIPPED:
+            found.append(
+                Finding(
+                    "bounds",
+                    min(1.0, 3.0 * clipped),
+                    f"{100 * clipped:.1f} % of the pixels lie at or beyond the bounds {low:g} .. {high:g} °C and are cut off.",
+                    "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images.",
+                )
+            )
+        used = float(values.quantile(0.999) - values.quantile(0.001)) if len(values) < 1 << 24 else 1.0
+        if used < NARROW:
+            found.append(
+                Finding(
+                    "bounds",
+                    0.05,
+                    f"The images use {100 * used:.0f} % of the bounds {low:g} .. {high:g} °C.",
+                    "Narrow the bounds to what the scene shows: losses and 8-bit greys spend the rest on nothing.",
+                )
+            )
+        if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
+            found.append(
+                Finding(
+                    "bounds",
+                    0.9,
+                    f"The images are said to show {low:g} .. {high:g} °C.",
+                    "Check the unit (°C, kelvin, counts) and data.raw_scale, data.raw_offset_c.",
+                )
+            )
+    flat = [f for f in range(len(material.images)) if _plateau(material.known(f)) > PLATEAU]
+    if len(flat) > 0.1 * len(material.images) and not any(one.check == "bounds" and "cut off" in one.what for one in found):
+        share = sum(_plateau(material.known(f)) for f in flat) / len(flat)
+        found.append(
+            Finding(
+                "saturation",
+                min(1.0, 3.0 * share),
+                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have exactly the largest value.",
+                "The detector or the export saturates: record in the high range, or mask what is hotter.",
+                tuple(material.name(f) for f in flat),
+            )
+        )
+    return found
+
+
+def _plateau(values: torch.Tensor) -> float:
+    return float((values == values.max()).double().mean()) if len(values) else 0.0
+
+
+CHECK = Check("bounds", "whether pixels fit their bounds, and whether images saturate", find)

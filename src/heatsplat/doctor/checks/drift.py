@@ -1,0 +1,97 @@
+"""A level that drifts from frame to frame, and shutters that set it back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.effects.observations import Tracks
+
+MIN_POINTS, MIN_FRAMES = 40, 5
+LEAST = 3.0  # times the noise of a pixel
+# Two halves of the points tell of the same level if a sensor drifts: correlation, and range of the ratio of their sizes, of
+# what leaps from frame to frame and of what wanders slowly. Where a scene warms, cools or hazes the ratio is 1.66 and more,
+# and where it is not, the correlation 0.3; where a sensor drifts 1.27 and less, and 0.66 (m3t_heath: 0.95 and 1.16).
+LEAPS, WANDERS = (0.55, 0.75, 1.4), (0.98, 0.9, 1.1)
+JUMP = 3.0  # times the usual step between frames
+
+
+def find(material: Material) -> list[Finding]:
+    tracks = material.tracks
+    if tracks is None or len(tracks.points) < MIN_POINTS or len(material.images) < MIN_FRAMES:
+        return []
+    values, weights = tracks.values, tracks.weights
+    levels = frame_levels(values, weights)
+    if float(levels.std()) < LEAST * material.noise or not _in_common(tracks, levels, material.noise):
+        return []
+    before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
+    shutters = [material.name(f) for f in _shutters(levels)]
+    resets = f", and is set back at {some(shutters)} (shutter)" if shutters else ""
+    return [
+        Finding(
+            "drift",
+            before / material.contrast,
+            f"The level of all points wanders from frame to frame by {material.size(float(levels.max() - levels.min()))}{resets}: "
+            f"one point differs between frames by {material.size(before)}, by {material.size(after)} without it.",
+            "method=auto simulates it (frame_offset); other methods take sensor=frame_offset.",
+            tuple(shutters),
+        )
+    ]
+
+
+def frame_levels(values: Tensor, weights: Tensor) -> Tensor:
+    """Level [F] of each frame above the others, with median 0, from values [P, F] of points: alternating medians."""
+    known = torch.where(weights > 0, values, torch.nan)
+    levels = values.new_zeros(values.shape[1])
+    for _ in range(10):
+        points = (known - levels).nanmedian(dim=1, keepdim=True).values
+        levels = (known - points).nanmedian(dim=0).values.nan_to_num()
+        levels = levels - levels.median()
+    return levels
+
+
+def _in_common(tracks: Tracks, levels: Tensor, noise: float) -> bool:
+    """Whether points that change most and points that change least, warm ones and cold ones tell of the same levels."""
+    used = tracks.weights > 0
+    count = used.sum(1).clamp_min(1)
+    mean = (tracks.values * used).sum(1) / count
+    change = (((tracks.values - mean[:, None]) * used).square().sum(1) / count).sqrt()
+    halves = []
+    for order in (change, mean):
+        upper = order > order.median()
+        halves.append([frame_levels(tracks.values[keep], tracks.weights[keep]) for keep in (upper, ~upper)])
+    leaps = float(_leaps(levels).std()) > LEAST * noise
+    return (leaps and all(_same(_leaps(one), _leaps(other), *LEAPS) for one, other in halves)) or all(
+        _same(one, other, *WANDERS) for one, other in halves
+    )
+
+
+def _leaps(levels: Tensor) -> Tensor:
+    """What a level has beyond the middle of its neighbours."""
+    return levels[1:-1] - 0.5 * (levels[2:] + levels[:-2])
+
+
+def _same(one: Tensor, other: Tensor, correlated: float, low: float, high: float) -> bool:
+    one, other = one - one.mean(), other - other.mean()
+    sizes = float(one.norm()), float(other.norm())
+    if min(sizes) == 0:
+        return False
+    return float(one @ other) / (sizes[0] * sizes[1]) > correlated and low < sizes[0] / sizes[1] < high
+
+
+def _spread(values: Tensor, weights: Tensor, levels: Tensor) -> float:
+    """How much a point differs from itself in other frames: standard deviation, from the median of all."""
+    left = torch.where(weights > 0, values - levels, torch.nan)
+    left = left - left.nanmedian(dim=1, keepdim=True).values
+    return 1.4826 * float(left.abs().nanmedian())
+
+
+def _shutters(levels: Tensor) -> list[int]:
+    """Frames at which the level falls or leaps by far more than from frame to frame."""
+    steps = levels.diff()
+    usual = float(steps.abs().median())
+    return [f + 1 for f in range(len(steps)) if float(steps[f].abs()) > JUMP * max(usual, 1e-9)]
+
+
+CHECK = Check("drift", "whether the level of all points wanders from frame to frame, and shutters set it back", find)

@@ -1,0 +1,124 @@
+"""Photos and thermal images: whether they belong together, lie on each other, and share a clock."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.doctor.base import Check, Finding, Material
+
+SHORTER = 64  # pixels of the shorter side at which edges are compared
+MIN_FRAMES = 5
+BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
+NEARLY_ALL = 0.7
+OFF = 0.025  # of the width: how far photos may lie beside thermal images
+
+
+def find(material: Material) -> list[Finding]:
+    found = []
+    clocks = _clock(material)
+    if clocks is not None:
+        found.append(clocks)
+    if material.rgb is None or len(material.rgb) < MIN_FRAMES:
+        return found
+    heat = torch.stack([_edges(image) for image in material.images])
+    light = torch.stack([_edges(photo.double().mean(2)) for photo in material.rgb])
+    if heat.shape != light.shape:
+        return found
+    fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
+    count = len(fits)
+    own = fits.diagonal()
+    steps = {k: float(fits.diagonal(k).median() - own[: count - abs(k)].median()) for k in (-3, -2, -1, 1, 2, 3) if abs(k) < count - 2}
+    step, gain = max(steps.items(), key=lambda item: item[1])
+    strangers = float(fits[~torch.eye(count, dtype=torch.bool)].median())
+    if gain > BETTER:
+        late = _late(material, step)
+        found.append(
+            Finding(
+                "pairing",
+                0.6,
+                f"Thermal images fit the photo {abs(step)} frame(s) {'later' if step > 0 else 'earlier'} better than their own{late}.",
+                "Pair them anew: shift one list, or correct the clock of one camera.",
+            )
+        )
+    elif float((own < strangers + 0.5 * BETTER).double().mean()) > NEARLY_ALL and float(fits.max()) > 0.3:
+        found.append(
+            Finding(
+                "pairing",
+                0.5,
+                "Photos do not fit their thermal images better than those of other frames.",
+                "Check that both folders list the same moments under the same names.",
+            )
+        )
+    else:
+        shift = _shift(heat, light)
+        if shift is not None and shift.norm() > OFF * heat.shape[2]:
+            x, y = (shift * material.images.shape[2] / heat.shape[2]).tolist()
+            found.append(
+                Finding(
+                    "pairing",
+                    0.3,
+                    f"Photos lie beside their thermal images, by about ({x:.0f}, {y:.0f}) pixels (right, down).",
+                    "Rectify them onto the thermal camera first: data.rgb are images of the same camera.",
+                )
+            )
+    return found
+
+
+def _clock(material: Material) -> Finding | None:
+    if material.rgb_times_s is None or material.times_s is None:
+        return None
+    apart = torch.tensor(material.rgb_times_s, dtype=torch.float64) - torch.tensor(material.times_s, dtype=torch.float64)
+    usual = float(torch.tensor(sorted(material.times_s), dtype=torch.float64).diff().median())
+    offset = float(apart.median())
+    if abs(offset) < max(0.5 * usual, 0.2):
+        return None
+    return Finding(
+        "pairing",
+        0.1,
+        f"The clock of the visible camera is {offset:+.1f} s against that of the thermal one.",
+        "Set both clocks, or trust the order of the files; times come from the thermal files.",
+    )
+
+
+def _late(material: Material, step: int) -> str:
+    if material.times_s is None or len(material.chosen) != len(material.names):
+        return ""
+    usual = float(torch.tensor(sorted(material.times_s), dtype=torch.float64).diff().median())
+    return f" (about {abs(step) * usual:.3g} s)"
+
+
+def _edges(image: Tensor) -> Tensor:
+    """Strength of edges of an image [H, W], on a coarse grid, compressed so that no single one rules."""
+    shorter = min(image.shape)
+    scale = max(1.0, shorter / SHORTER)
+    size = (round(image.shape[0] / scale), round(image.shape[1] / scale))
+    small = functional.interpolate(image[None, None].nan_to_num(), size, mode="area")
+    x = functional.pad(small.diff(dim=3), (0, 1))
+    y = functional.pad(small.diff(dim=2), (0, 0, 0, 1))
+    strength = torch.hypot(x, y)
+    strength = strength / (strength + strength.mean())
+    return functional.avg_pool2d(strength, 3, stride=1, padding=1)[0, 0]
+
+
+def _unit(rows: Tensor) -> Tensor:
+    return functional.normalize(rows - rows.mean(1, keepdim=True), dim=1)
+
+
+def _shift(heat: Tensor, light: Tensor) -> Tensor | None:
+    """By how much photos lie beside thermal images, on the coarse grid [2] (right, down); None where edges do not tell."""
+    a = torch.fft.rfft2(heat - heat.mean((1, 2), keepdim=True))
+    b = torch.fft.rfft2(light - light.mean((1, 2), keepdim=True))
+    height, width = heat.shape[1:]
+    fits = torch.fft.irfft2(a.conj() * b, s=(height, width)).sum(0)
+    fits = fits / (heat.std() * light.std() * heat.numel())
+    reach = max(3, width // 6)
+    fits = torch.roll(fits, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
+    best = int(fits.argmax())
+    if float(fits.max()) < 0.25 or float(fits.max()) < float(fits[reach, reach]) + 2 * BETTER:
+        return None
+    return torch.tensor([best % fits.shape[1] - reach, best // fits.shape[1] - reach], dtype=torch.float64)
+
+
+CHECK = Check("pairing", "whether photos and thermal images belong together, lie on each other and share a clock", find)

@@ -1,0 +1,57 @@
+"""Times of frames: their order, gaps and repeats."""
+
+from __future__ import annotations
+
+import torch
+
+from heatsplat.doctor.base import Check, Finding, Material, some
+
+GAP = 12.0  # times the usual step; recordings by hand have steps up to 6 times it
+
+
+def find(material: Material) -> list[Finding]:
+    if material.times_s is None or len(material.times_s) < 5:
+        return []
+    times = torch.tensor([float(t) for t in material.times_s], dtype=torch.float64)
+    found = []
+    by_name = sorted(range(len(times)), key=lambda i: material.names[i])
+    back = [material.names[by_name[i + 1]] for i, step in enumerate(times[by_name].diff().tolist()) if step < 0]
+    if 0 < len(back) < 0.2 * len(times):
+        found.append(
+            Finding(
+                "times",
+                0.1,
+                f"Times run backwards at {some(back)} while names go on.",
+                "Check the camera's clock: it was set, or changed its zone, during the recording.",
+                tuple(back),
+            )
+        )
+    steps = times.sort().values.diff()
+    if (same := int((steps == 0).sum())) > 0.05 * len(steps):
+        found.append(
+            Finding(
+                "times",
+                0.02,
+                f"{same} frames have the time of another one.",
+                "Give times with fractions of a second (data.time_csv); methods of time cannot tell these apart.",
+            )
+        )
+    usual = float(steps[steps > 0].median()) if (steps > 0).any() else 0.0
+    gaps = [i for i, step in enumerate(steps.tolist()) if usual and step > GAP * usual]
+    if gaps:
+        at = times.argsort()
+        longest = max(gaps, key=lambda i: float(steps[i]))
+        found.append(
+            Finding(
+                "times",
+                0.03,
+                f"{len(gaps)} gap(s) in the record; the longest, of {float(steps[longest]):.4g} s (usual: {usual:.3g} s), "
+                f"comes before {material.names[int(at[longest + 1])]}.",
+                "What happened within a gap is a guess; check that no frames were lost.",
+                tuple(material.names[int(at[i + 1])] for i in gaps),
+            )
+        )
+    return found
+
+
+CHECK = Check("times", "order of times against names, repeats and gaps", find)

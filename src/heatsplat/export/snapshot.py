@@ -1,0 +1,274 @@
+"""What the Gaussians of a trained scene are, as rendered, and what they emit over time: all that an export needs of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.export.basis import TimeBasis, constant_basis, time_basis
+from heatsplat.physics.units import kelvin
+from heatsplat.renderers.base import ALPHA_MIN
+from heatsplat.shots import at_time, first_free_id
+
+TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
+TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
+VIEWS = 6  # training cameras over which what depends on the view is averaged
+TIMES = 257  # samples of a quantity over time at most
+TRUTH_TIMES = 65  # the same of the truth, which costs much more to ask for
+TABLE = 257  # entries of a table of temperatures
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One quantity of the Gaussians over time, in the units in which splats are blended.
+
+    Args:
+        name: "camera" (what they send to a camera), "surface" (their temperature, without what lies in between) or
+            "truth" (of a synthetic scene).
+        label: for people.
+        basis: its values.
+        worst: largest error of the basis in the scene's unit.
+        clipped: values count as 0 below 0 and as 1 above 1. The basis holds them as they were before: clipping bends
+            curves, and bent ones need more of them.
+    """
+
+    name: str
+    label: str
+    basis: TimeBasis
+    worst: float
+    clipped: bool = False
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The Gaussians that can be seen, and what is known of them. Geometry is that of the middle of the record.
+
+    Args:
+        means [N, 3], quats [N, 4] wxyz, scales [N, 3], opacities [N]: as rendered; float32.
+        layers: what they emit; the first one is "camera".
+        background: blended behind all.
+        table: [257] temperatures (in ``unit``) of blended values evenly from ``table_ends[0]`` to ``table_ends[1]``.
+        unit: "°C", or empty where image values are no temperatures.
+        limits: values that an image can show, in ``unit``.
+        colours: [N, 3] of the visible image in [0, 1], or None; ``colour_opacities`` [N] are theirs.
+        attributes: what the model learned, name -> [N], in the middle of the record.
+        left_out: sentences about what the snapshot does not hold.
+        start_s, end_s: span of time that it covers, all splits; None without times.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    layers: list[Layer]
+    background: float
+    table: Tensor
+    table_ends: tuple[float, float]
+    unit: str
+    limits: tuple[float, float]
+    colours: Tensor | None
+    colour_opacities: Tensor | None
+    attributes: dict[str, Tensor]
+    left_out: list[str]
+    start_s: float | None
+    end_s: float | None
+
+
+@torch.no_grad()
+def snapshot(module: Any) -> Snapshot:
+    """Takes one of a training module (``training.module.SplatTraining``) with its scene.
+
+    What the Gaussians send may depend on where it is seen from. Then it is the mean over training cameras, and
+    ``left_out`` says how far single cameras are from it.
+    """
+    scene: SceneData = module.scene
+    span = _span(scene)
+    middle = None if span is None else 0.5 * (min(scene.train.times_s) + max(scene.train.times_s))
+    first = scene.train.frames[0]
+    own_id = first_free_id(scene)
+
+    def seen_at(frame: Frame, time_s: float | None) -> Frame:
+        frame = replace(frame, frame_id=own_id)
+        return frame if time_s is None else at_time(scene, frame, time_s)
+
+    means, quats, scales, opacities = module.shapes(seen_at(first, middle))
+    kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
+    channels = module.thermal.modality_channels[0]
+
+    def emitted(frame: Frame) -> Tensor:
+        return module.emissions(module.splats, frame)[kept]
+
+    def blended(values: Tensor) -> Tensor:
+        """Blended values [N] of image values [N, C]."""
+        return module.composite.encode(values, channels)[:, :channels].mean(1)
+
+    cameras = [scene.train.frames[i] for i in evenly_spread(len(scene.train), VIEWS)]
+    looks = torch.stack([emitted(seen_at(frame, middle)) for frame in cameras])
+    to_unit, unit = _scale(scene, module.modality)
+    spread = (looks[..., :channels] - looks[..., :channels].mean(0)).mean(-1) * to_unit
+    tolerance = TOLERANCE_C if unit else TOLERANCE_UNIT
+    left_out = []
+    if spread.abs().max() > tolerance / 5:
+        left_out.append(
+            f"What a Gaussian sends depends on the view: shown is the mean over {len(cameras)} training cameras, from which "
+            f"single ones differ by {spread.square().mean().sqrt():.2g} {unit} (root mean square)."
+        )
+    else:
+        cameras = cameras[:1]
+    moved = _displacement(module, seen_at, first, span, kept)
+    if moved > 0:
+        left_out.append(
+            f"The model moves its Gaussians over time, by up to {moved:.2g} of the scene's extent: shown are their places in "
+            "the middle of the record."
+        )
+
+    def camera(time_s: float | None) -> Tensor:
+        return blended(torch.stack([emitted(seen_at(frame, time_s)) for frame in cameras]).mean(0))
+
+    slope = _slope(blended, to_unit, channels)
+    surface = _surface(module, blended, kept) if span is not None else None
+    clipped = surface is not None and _alike(lambda time: surface(time).clamp(0, 1), camera, span, tolerance / slope)
+    sent = surface if clipped else camera
+    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope), clipped=clipped)]
+    if surface is not None and not clipped and not _alike(surface, camera, span, tolerance / slope):
+        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope))
+    if scene.truth is not None and span is not None and scene.thermal_range is not None:
+        truth = _truth(scene, means[kept].cpu(), blended)
+        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, TRUTH_TIMES))
+    ends = _ends(layers, module.background[0].item())
+    table = _table(module, scene, ends, channels)
+    colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
+    attributes = {} if middle is None else module.attributes(seen_at(first, middle))
+    return Snapshot(
+        means[kept].float().cpu(),
+        torch.nn.functional.normalize(quats[kept].float(), dim=1).cpu(),
+        scales[kept].float().cpu(),
+        opacities[0, kept].float().cpu(),
+        layers,
+        module.background[0].item(),
+        table,
+        ends,
+        unit,
+        (scene.thermal_range.min_c, scene.thermal_range.max_c) if unit else (0.0, 1.0),
+        colours,
+        colour_opacities,
+        {name: values[kept].float().cpu() for name, values in attributes.items()},
+        left_out,
+        None if span is None else span[0],
+        None if span is None else span[1],
+    )
+
+
+def _span(scene: SceneData) -> tuple[float, float] | None:
+    """First and last moment of all views; None without times or where all are the same."""
+    if "time" not in scene.metadata:
+        return None
+    times = [time for views in (scene.train, scene.val, scene.test) for time in views.times_s if time is not None]
+    return (min(times), max(times)) if max(times) > min(times) else None
+
+
+def _scale(scene: SceneData, modality: str) -> tuple[float, str]:
+    """What an image value of 1 is in the unit of the scene, and that unit."""
+    if scene.thermal_range is None or modality != "thermal":
+        return 1.0, ""
+    return scene.thermal_range.span_k, "°C"
+
+
+def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -> float:
+    """Largest change of the image, in the scene's unit, for one of a blended value."""
+    values = torch.linspace(0, 1, TABLE, dtype=torch.float64)
+    steps = blended(values[:, None].expand(-1, channels)).diff()
+    return to_unit / (TABLE - 1) / steps.min().item()
+
+
+def _alike(one: Callable, other: Callable, span: tuple[float, float], tolerance: float) -> bool:
+    """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
+    moments = (span[0] + share * (span[1] - span[0]) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
+    return all((one(moment) - other(moment)).abs().max() <= 0.1 * tolerance for moment in moments)
+
+
+def _layer(
+    name: str,
+    label: str,
+    values_at: Callable,
+    span: tuple[float, float] | None,
+    tolerance: float,
+    slope: float,
+    most_times: int = TIMES,
+) -> Layer:
+    if span is None:
+        basis = constant_basis(values_at(None).cpu())
+    else:
+        basis = time_basis(values_at, *span, tolerance / slope, most_times)
+    return Layer(name, label, basis, basis.worst * slope)
+
+
+def _surface(module: Any, blended: Callable, kept: Tensor) -> Callable[[float], Tensor] | None:
+    """Blended values of the temperature of the surface, where the model tells one."""
+    scene = module.scene
+    if scene.thermal_range is None or module.modality != "thermal" or "time" not in scene.metadata:
+        return None
+    if module.thermal.temperature(module.splats, scene.record[0]) is None:
+        return None
+    lowest, span = kelvin(scene.thermal_range.min_c), scene.thermal_range.span_k
+
+    def surface(time_s: float) -> Tensor:
+        units = (module.thermal.temperature(module.splats, time_s)[kept] - lowest) / span
+        return blended(units[:, None])
+
+    return surface
+
+
+def _truth(scene: SceneData, points: Tensor, blended: Callable) -> Callable[[float], Tensor]:
+    def truth(time_s: float) -> Tensor:
+        celsius = scene.truth(points, torch.tensor([time_s], dtype=torch.float64))[:, :1]
+        return blended(scene.thermal_range.to_unit(celsius).float())
+
+    return truth
+
+
+def _ends(layers: list[Layer], background: float) -> tuple[float, float]:
+    """Range of blended values that a pixel of any layer can have."""
+    low, high = min(0.0, background), max(1.0, background)
+    for layer in layers:
+        basis = layer.basis
+        reach = (basis.coefficients.abs() @ basis.curves.abs()).amax(1) if basis.rank else torch.zeros(1)
+        low = min(low, (basis.offsets - reach).min().item())
+        high = max(high, (basis.offsets + reach).max().item())
+    return low, high
+
+
+def _table(module: Any, scene: SceneData, ends: tuple[float, float], channels: int) -> Tensor:
+    values = torch.linspace(*ends, TABLE, dtype=torch.float64)[:, None].expand(-1, channels)
+    shown = module.composite.decode(values, channels)[:, 0]
+    celsius = scene.thermal_range if _scale(scene, module.modality)[1] else None
+    return (shown if celsius is None else celsius.to_celsius(shown)).float()
+
+
+def _colours(module: Any, emitted: Tensor, opacities: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Colours [N, 3] of the visible image and their opacities [N], where the model has them."""
+    thermal, start = module.thermal, 0
+    for place, (name, count) in enumerate(
+        zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
+    ):
+        if count == 3 and (name == "rgb" or place == 0):
+            own = opacities[0 if thermal.shared_opacity else place]
+            return emitted[:, start : start + 3].clamp(0, 1).float().cpu(), own.float().cpu()
+        start += count
+    return None, None
+
+
+def _displacement(
+    module: Any, seen_at: Callable, first: Frame, span: tuple[float, float] | None, kept: Tensor
+) -> float:
+    """How far a Gaussian moves over the span at most, in extents of the scene."""
+    if span is None:
+        return 0.0
+    places = [module.shapes(seen_at(first, moment))[0][kept] for moment in span]
+    moved = (places[1] - places[0]).norm(dim=1)
+    return float(moved.max()) / module.scene.extent if len(moved) else 0.0

@@ -1,0 +1,1 @@
+"""The page viewer.html: a trained scene in one file that a browser opens without a server."""

@@ -1,0 +1,45 @@
+"""Writes viewer.html: the page's own files and a scene, in one."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import zlib
+from pathlib import Path
+from typing import Any
+
+from heatsplat.export.snapshot import snapshot
+from heatsplat.io.results import write_atomically
+from heatsplat.viewer.payload import payload
+
+FILE = "viewer.html"
+SOURCES = Path(__file__).resolve().parent / "page"
+SCRIPTS = ("payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "viewer.js")
+
+
+def write_viewer(module: Any, path: Path) -> Path:
+    """The path of the page that was written: a trained scene that a browser opens from a file, offline.
+
+    Args:
+        module: a training module with its scene (``training.module.SplatTraining``).
+        path: of the file.
+    """
+    header, block = payload(module, snapshot(module))
+    write_atomically(path, page(header, block))
+    return path
+
+
+def page(header: dict[str, Any], block: bytes) -> str:
+    """The page of a header and its arrays (``viewer.payload``)."""
+    scripts = "\n".join((SOURCES / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    parts = {
+        "title": html.escape(f"{header['scene']} · {header['method']}"),
+        "style": (SOURCES / "viewer.css").read_text(encoding="utf-8"),
+        "header": json.dumps(header, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "block": base64.b64encode(zlib.compress(block, 6)).decode("ascii"),
+        "scripts": f'"use strict";\n{scripts}',
+    }
+    template = (SOURCES / "viewer.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)

@@ -1,0 +1,787 @@
+// The page: what is shown, how one moves, and what the controls do.
+
+const $ = (id) => document.getElementById(id);
+const COLOURS = ["#ff9e4a", "#6cb6ff", "#7bd88f", "#f07ab8", "#c9a2ff", "#e8d44d", "#5fd3d0", "#ff7b72"];
+const CHART_TIMES = 121, BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
+
+class Viewer {
+  constructor(payload) {
+    this.told = payload.told;
+    this.splats = new Splats(payload);
+    this.drawing = new Drawing($("canvas"));
+    this.scene = this.drawing.load(this.splats);
+    this.run = null;  // a second one: {told, scene, sorter}
+    this.sorter = new Sorter(this.splats, (ids) => {
+      this.drawing.order(this.scene, ids);
+      this.request();
+    });
+    this.maps = Object.fromEntries(Object.entries(this.told.maps).map(([name, place]) => {
+      const gl = this.drawing.gl, colours = payload.array(place);
+      return [name, { colours, texture: this.drawing.texture(gl.RGB8, 256, 1, gl.RGB, gl.UNSIGNED_BYTE, colours, true) }];
+    }));
+    this.cameras = this.told.cameras.map((entry) => ({ ...entry, camera: Camera.of(entry), recorded: payload.array(entry.recorded),
+      size: entry.recorded.shape, added: entry.added ? payload.array(entry.added) : null, rgb: entry.rgb ? payload.array(entry.rgb) : null,
+      step: entry.added ? entry.added.step : 0 }));
+    this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, at: 0,
+      time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
+    this.probes = [];
+    this.camera = this.cameras[0].camera;
+    this.target = this.told.centre;
+    this.quality = 1;
+    this.errors = [];
+    this.stale = { values: true, order: true };
+    this.build();
+    this.listen();
+    this.goTo(0);
+    this.fit();
+    for (const point of this.told.probes) if (this.probes.length < 3) this.pinPoint(point);
+    this.request();
+  }
+
+  // What is there ---------------------------------------------------------------------------------------------------
+
+  get layer() {
+    return this.splats.layer(this.state.quantity);
+  }
+
+  get attribute() {
+    return this.splats.attributes.find((one) => `learned ${one.name}` === this.state.quantity) || null;
+  }
+
+  get unit() {
+    return this.attribute ? this.attribute.unit : this.told.unit;
+  }
+
+  get range() {
+    return this.state.ranges[this.rangeName] || [0, 1];
+  }
+
+  get rangeName() {
+    return this.differing ? `difference ${this.state.other}` : this.attribute ? this.state.quantity : "values";
+  }
+
+  get differing() {
+    return this.state.other !== "nothing" && this.state.other !== "visible" && this.state.how === "difference" && this.layer !== null;
+  }
+
+  get mapName() {
+    return this.differing ? DIFFERENCES : this.state.map;
+  }
+
+  // Where the image of the camera lies on the canvas, in its pixels.
+  get view() {
+    const { width, height } = $("canvas");
+    const scale = Math.min(width / this.camera.width, height / this.camera.height);
+    return { camera: this.camera, scale, left: (width - scale * this.camera.width) / 2, top: (height - scale * this.camera.height) / 2 };
+  }
+
+  build() {
+    const option = (select, value, text) => select.append(new Option(text, value));
+    const noun = this.told.unit ? "temperature" : "image value";
+    for (const layer of this.splats.layers) {
+      const alone = layer.name === "camera" && !this.splats.layer("surface");
+      option($("quantity"), layer.name, alone ? noun : layer.name === "truth" ? `true ${noun}` : `${noun} ${layer.label}`);
+    }
+    for (const one of this.splats.attributes) option($("quantity"), `learned ${one.name}`, `learned: ${one.label}`);
+    if (this.splats.colours) option($("quantity"), "visible", "visible light");
+    option($("other"), "nothing", "nothing");
+    if (this.told.span) option($("other"), "time", "another time");
+    for (const layer of this.splats.layers) option($("other"), layer.name, layer.label);
+    if (this.splats.colours) option($("other"), "visible", "visible light");
+    option($("other"), "recorded", "recorded image");
+    if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "with the camera's own part");
+    for (const name of Object.keys(this.maps)) if (name !== DIFFERENCES) option($("map"), name, name);
+    $("timeBar").hidden = !this.told.span;
+    if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
+    this.cameras.forEach((one, i) => $("cameras").append(this.thumbnail(one, i)));
+    const worst = Math.max(...this.splats.layers.map((layer) => layer.worst));
+    const ranks = this.splats.layers.map((layer) => `${layer.coefficients.length} for ${layer.name}`).join(", ");
+    const unit = this.told.unit || "image values", small = (value) => Number(value.toPrecision(2));
+    const notes = [];
+    if (this.told.span) {
+      notes.push(`Time: each Gaussian's curve is a sum of shared ones (${ranks}). Worst error of any Gaussian found: ${small(worst)} ${unit} `
+        + `(aim: ${this.told.tolerance}), at every sample and ${this.splats.layers[0].checks} moments between.`);
+      notes.push(`Beyond the record: ${this.told.beyondRecord}.`);
+    }
+    notes.push(...this.told.leftOut);
+    if (this.told.effects.length) notes.push(`Effects in the model: ${this.told.effects.join(", ").replaceAll("_", " ")}.`);
+    notes.push(`Blended in ${this.drawing.precision}. Probes are computed in double precision, from the pixel of the camera they were pinned in.`);
+    $("notes").replaceChildren(...notes.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+    $("facts").textContent = `${this.splats.count.toLocaleString("en")} Gaussians`;
+    const dark = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
+    document.documentElement.dataset.theme = dark;
+    if (innerWidth <= 760) this.fold(true);
+  }
+
+  thumbnail(one, i) {
+    const button = document.createElement("button"), canvas = document.createElement("canvas");
+    const [height, width] = one.size;
+    Object.assign(canvas, { width, height });
+    const context = canvas.getContext("2d"), image = context.createImageData(width, height), { colours } = this.maps.inferno;
+    let low = Infinity, high = -Infinity;
+    for (const level of one.recorded) if (level !== 65535) [low, high] = [Math.min(low, level), Math.max(high, level)];
+    one.recorded.forEach((level, j) => {
+      const k = 3 * Math.round((Math.min(level, high) - low) / Math.max(high - low, 1) * 255);
+      image.data.set(one.rgb ? [...one.rgb.subarray(3 * j, 3 * j + 3), 255] : [...colours.subarray(k, k + 3), 255], 4 * j);
+    });
+    if (one.rgb) for (let j = 0; j < one.recorded.length; j++) {  // heat on the left, light on the right
+      if (j % width >= width / 2) continue;
+      const k = 3 * Math.round((Math.min(one.recorded[j], high) - low) / Math.max(high - low, 1) * 255);
+      image.data.set([...colours.subarray(k, k + 3), 255], 4 * j);
+    }
+    context.putImageData(image, 0, 0);
+    button.title = one.time === null ? one.name : `${one.name}, ${this.clock(one.time)}`;
+    button.setAttribute("aria-label", `Camera ${i + 1}: ${button.title}`);
+    button.onclick = () => this.goTo(i, true);
+    button.append(canvas);
+    return button;
+  }
+
+  clock(time) {
+    if (!this.told.span) return "";
+    const [divisor, word] = timeScale(this.told.span[1] - this.told.span[0]);
+    return `${(time / divisor).toFixed(divisor === 1 ? 1 : 2)} ${word}`;
+  }
+
+  say(text) {
+    $("message").textContent = text;
+    clearTimeout(this.silence);
+    this.silence = setTimeout(() => { $("message").textContent = ""; }, 3500);
+  }
+
+  // Moving ----------------------------------------------------------------------------------------------------------
+
+  look(camera) {
+    this.camera = camera;
+    this.state.at = null;
+    this.stale.order = true;
+    this.request();
+  }
+
+  goTo(i, withTime = false) {
+    const count = this.cameras.length, place = (i % count + count) % count, one = this.cameras[place];
+    this.look(one.camera);
+    this.state.at = place;
+    this.lastCamera = place;
+    if (withTime && one.time !== null) this.setTime(one.time);
+    const pixel = this.splats.weightsAt(one.camera, one.camera.width / 2, one.camera.height / 2);
+    if (pixel.left < 0.5) this.target = one.camera.point(one.camera.width / 2, one.camera.height / 2, pixel.depth);
+    [...$("cameras").children].forEach((button, j) => button.setAttribute("aria-current", String(j === place)));
+  }
+
+  get pace() {
+    const away = length(plus(this.camera.centre, this.target, -1));
+    return 0.04 * (this.state.walk ? Math.min(away, this.told.size) : away);
+  }
+
+  turn(yaw, pitch) {
+    const { walk } = this.state;
+    const sign = walk ? -1 : 1;
+    this.look(this.camera.rotated(-yaw * sign, pitch * sign, this.told.up, walk ? null : this.target));
+  }
+
+  move(right, down, forward) {
+    const before = this.camera;
+    this.look(before.moved(right * this.pace, down * this.pace, forward * this.pace));
+    if (right || down) this.target = plus(plus(this.target, before.right, right * this.pace), before.down, down * this.pace);
+  }
+
+  nearer(steps) {
+    if (this.state.walk) return this.move(0, 0, steps);
+    const away = plus(this.camera.centre, this.target, -1);
+    const factor = Math.exp(-0.08 * steps);
+    if (length(away) * factor < 0.002 * this.told.size) return undefined;
+    return this.look(this.camera.posed(this.camera.right, this.camera.down, this.camera.forward, plus(this.target, away, factor)));
+  }
+
+  // Time ------------------------------------------------------------------------------------------------------------
+
+  setTime(time) {
+    if (!this.told.span) return;
+    this.state.time = Math.min(Math.max(time, this.told.span[0]), this.told.span[1]);
+    this.stale.values = true;
+    this.request();
+  }
+
+  stepTime(steps) {
+    if (this.told.span) this.setTime(this.state.time + steps * (this.told.span[1] - this.told.span[0]) / 200);
+  }
+
+  play(on) {
+    if (!this.told.span) return;
+    this.state.playing = on;
+    this.clockStart = null;
+    if (on && this.state.time >= this.told.span[1]) this.setTime(this.told.span[0]);
+    $("play").textContent = on ? "❚❚" : "▶";
+    $("play").setAttribute("aria-label", on ? "Pause" : "Play");
+    this.request();
+  }
+
+  // Drawing ---------------------------------------------------------------------------------------------------------
+
+  request() {
+    this.pending ||= requestAnimationFrame((now) => {
+      this.pending = null;
+      try {
+        this.frame(now);
+      } catch (error) {
+        this.errors.push(String(error));
+        throw error;
+      }
+    });
+  }
+
+  frame(now) {
+    const since = now - (this.lastFrame || now);
+    this.lastFrame = now;
+    if (this.state.playing && this.clockStart !== null) {
+      const [start, end] = this.told.span;
+      const next = this.state.time + (now - this.clockStart) / 1000 * (end - start) / Number($("speed").value);
+      this.setTime(next > end ? start : next);
+    }
+    if (this.state.playing) this.clockStart = now;
+    if (since > 0 && since < 400 && (this.state.playing || this.dragging)) {
+      this.pacing = this.pacing ? 0.9 * this.pacing + 0.1 * since : since;
+      $("facts").textContent = `${this.splats.count.toLocaleString("en")} Gaussians · ${Math.round(1000 / this.pacing)} frames/s`;
+      if (this.pacing > PLAY_LIMIT_MS && this.quality > 0.5) this.quality = Math.max(0.5, this.quality - 0.1);
+    }
+    this.resize();
+    if (this.stale.order) {
+      this.sorter.sort(this.camera);
+      if (this.run) this.run.sorter.sort(this.camera);
+    }
+    if (this.stale.values) this.fillValues();
+    this.stale = { values: false, order: false };
+    this.paint();
+    this.overlay();
+    if (this.state.playing) this.request();
+    clearTimeout(this.rest);
+    this.rest = setTimeout(() => this.settle(), this.state.playing ? 600 : 180);
+  }
+
+  // Once nothing moves: full size, the histogram.
+  settle() {
+    if (!this.state.playing && !this.dragging && this.quality < 1) {
+      this.quality = 1;
+      this.request();
+      return;
+    }
+    this.histogram();
+  }
+
+  resize() {
+    const canvas = $("canvas"), ratio = Math.min(devicePixelRatio, 2) * this.quality;
+    const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  }
+
+  fillValues() {
+    const { splats, scene } = this, { other, time, otherTime } = this.state;
+    const layer = this.layer;
+    if (this.attribute) splats.fillAttribute(this.attribute, scene.filled, 0, 2);
+    else if (layer) splats.fill(layer, time, scene.filled, 0, 2);
+    const beside = splats.layer(other);
+    if (other === "time" && layer) splats.fill(layer, otherTime, scene.filled, 1, 2);
+    else if (beside) splats.fill(beside, time, scene.filled, 1, 2);
+    this.drawing.update(scene);
+    if (this.run && other === "run") {
+      const second = this.run.scene.splats;
+      second.fill(second.layer(this.state.quantity) || second.layers[0], time, this.run.scene.filled, 0, 2);
+      this.drawing.update(this.run.scene);
+    }
+  }
+
+  paint() {
+    const { drawing, scene, state, view, told } = this, { width } = $("canvas");
+    const other = this.layer || state.quantity === "visible" ? state.other : "nothing";
+    const picture = this.pictureBeside(other);
+    const textures = { table: scene.table, map: this.maps[state.map].texture, differences: this.maps[DIFFERENCES].texture, picture };
+    textures.first = drawing.blend(scene, view, "first").texture;
+    if (other === "visible" || state.quantity === "visible") textures.visible = drawing.blend(scene, view, "visible", true).texture;
+    if (other === "run" && this.run) {
+      textures.second = drawing.blend(this.run.scene, view, "second").texture;
+      textures.secondTable = this.run.scene.table;
+    }
+    const same = other === "time" || this.splats.layer(other) !== null;
+    const kinds = { nothing: 0, run: 2, visible: 3, recorded: 4, sensor: 5 };
+    const colour = getComputedStyle(document.documentElement).getPropertyValue("--paper").trim();
+    const paper = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16) / 255);
+    const behind = (one) => (one.background - one.tableEnds[0]) / (one.tableEnds[1] - one.tableEnds[0]);
+    const attribute = this.attribute;
+    drawing.show(textures, {
+      ints: {
+        kind: state.quantity === "visible" ? 2 : attribute ? 1 : 0,
+        other: same ? 1 : kinds[other],
+        difference: this.differing,
+        clampFirst: state.quantity === "camera",
+        clampSecond: other === "camera" || (other === "time" && state.quantity === "camera"),
+      },
+      floats: {
+        range: this.differing ? [0, 1] : this.range,
+        spread: this.differing ? this.range : [-1, 1],
+        limits: told.limits,
+        learned: attribute ? [attribute.low, attribute.high] : [0, 1],
+        background: [behind(told), this.run ? behind(this.run.told) : 0],
+        paper,
+        frame: [view.left, view.top, view.scale * this.camera.width, view.scale * this.camera.height],
+        split: other !== "nothing" && state.how === "swipe" || other === "visible" ? state.split * width : 1e9,
+      },
+    });
+  }
+
+  // The picture of the training camera where one stands: recorded values, or what the camera adds; where they are known.
+  pictureBeside(other) {
+    if (other !== "recorded" && other !== "sensor") return null;
+    const one = this.state.at === null ? null : this.cameras[this.state.at];
+    const gl = this.drawing.gl, key = `${other} ${this.state.at}`;
+    if (this.pictureKey === key) return this.picture;
+    if (this.picture) gl.deleteTexture(this.picture);
+    this.pictureKey = key;
+    this.picture = null;
+    if (!one || (other === "sensor" && !one.added)) return null;
+    const [low, high] = this.told.limits, [rows, columns] = one.size;
+    const content = new Float32Array(2 * rows * columns);
+    for (let j = 0; j < rows * columns; j++) {
+      const value = other === "sensor" ? one.added[j] * one.step : low + one.recorded[j] / 65534 * (high - low);
+      content.set([value, other === "sensor" || one.recorded[j] !== 65535 ? 1 : 0], 2 * j);
+    }
+    this.picture = this.drawing.texture(gl.RG32F, columns, rows, gl.RG, gl.FLOAT, content);
+    return this.picture;
+  }
+
+  // Value that a pixel of the canvas shows, from what was blended [value, second, -, alpha]; null where next to nothing is.
+  valueOf(blended, j) {
+    const alpha = blended[j + 3], { splats, told } = this;
+    if (alpha < 0.02) return null;
+    if (this.attribute) {
+      const { low, high, log } = this.attribute, value = low + blended[j] / alpha * (high - low);
+      return log ? 10 ** value : value;
+    }
+    const layer = this.layer;
+    if (!layer) return null;
+    const [low, high] = told.tableEnds;
+    const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
+    const first = value(blended[j], layer);
+    const beside = this.state.other === "time" ? layer : splats.layer(this.state.other);
+    return this.differing && beside ? first - value(blended[j + 1], beside) : first;
+  }
+
+  // Values of the picture, to fit colours to and to count.
+  sampled() {
+    const { width, height } = $("canvas");
+    const content = this.drawing.read("first", 0, 0, width, height);
+    if (!content) return [];
+    const second = this.differing && this.state.other === "run" && this.run ? this.drawing.read("second", 0, 0, width, height) : null;
+    const stride = 4 * Math.max(1, Math.round(width * height / 60000)), found = [];
+    for (let j = 0; j < content.length; j += stride) {
+      const value = this.valueOf(content, j);
+      if (value === null) continue;
+      if (!second) found.push(this.attribute?.log ? Math.log10(value) : value);
+      else if (second[j + 3] > 0.05) {
+        const { told, scene } = this.run, [low, high] = told.tableEnds;
+        found.push(value - scene.splats.decoded(second[j + 3] * low + second[j] * (high - low) + (1 - second[j + 3]) * told.background));
+      }
+    }
+    return found;
+  }
+
+  // Colours from the picture: its hundredth lowest and highest value; about zero for a difference.
+  fit() {
+    this.resize();
+    const ranges = this.state.ranges;
+    const values = this.sampled().sort((a, b) => a - b);
+    const share = (q) => values[Math.min(Math.floor(q * values.length), values.length - 1)];
+    if (values.length < 20) {
+      ranges[this.rangeName] ??= this.differing ? [-1, 1] : this.attribute ? [this.attribute.low, this.attribute.high] : [...this.told.limits];
+    } else if (this.differing) {
+      const most = Math.max(Math.abs(share(0.01)), Math.abs(share(0.99)), this.told.unit ? 0.05 : 0.001);
+      ranges[this.rangeName] = [-most, most];
+    } else {
+      const [low, high] = [share(0.01), share(0.99)];
+      ranges[this.rangeName] = high > low ? [low, high] : [low - 0.5, high + 0.5];
+    }
+    this.request();
+  }
+
+  histogram() {
+    const values = this.sampled();
+    if (!this.state.ranges[this.rangeName] || (!this.fitted && values.length > 100)) {
+      this.fitted = true;
+      this.fit();
+    }
+    const [low, high] = this.range, pad = 0.25 * (high - low);
+    const counts = new Array(BINS).fill(0);
+    for (const value of values) {
+      const bin = Math.floor((value - low + pad) / (high - low + 2 * pad) * BINS);
+      if (bin >= 0 && bin < BINS) counts[bin]++;
+    }
+    drawHistogram($("histogram"), counts, low - pad, high + pad, this.range, this.maps[this.mapName].colours);
+    this.settled = true;
+  }
+
+  // Controls follow the state ---------------------------------------------------------------------------------------
+
+  overlay() {
+    const { state, told } = this, canvas = $("canvas"), ratio = canvas.width / canvas.clientWidth || 1;
+    $("quantity").value = state.quantity;
+    $("other").value = state.other;
+    $("map").value = state.map;
+    for (const input of document.querySelectorAll("input[name=how]")) input.checked = input.value === state.how;
+    for (const input of document.querySelectorAll("input[name=move]")) input.checked = (input.value === "walk") === state.walk;
+    $("how").hidden = state.other === "nothing" || state.other === "visible" || this.layer === null;
+    $("otherTimeRow").hidden = state.other !== "time";
+    const swiping = state.other !== "nothing" && this.layer !== null && !this.differing;
+    $("divider").hidden = !swiping;
+    $("divider").style.left = `${100 * state.split}%`;
+    if (told.span) {
+      const beyond = state.time < told.record[0] || state.time > told.record[1];
+      $("time").value = state.time;
+      $("timeText").textContent = this.clock(state.time) + (beyond ? " · beyond the record" : "");
+      $("time").setAttribute("aria-valuetext", $("timeText").textContent);
+      $("otherTime").value = state.otherTime;
+      $("otherTimeText").textContent = this.clock(state.otherTime);
+    }
+    const shown = (value) => this.attribute?.log ? 10 ** value : value;
+    const digits = (value) => Number(shown(value).toPrecision(4)).toString();
+    for (const [id, value] of [["low", this.range[0]], ["high", this.range[1]]]) {
+      if (document.activeElement !== $(id)) $(id).value = digits(value);
+    }
+    $("legend").hidden = state.quantity === "visible";
+    $("barLow").textContent = digits(this.range[0]);
+    $("barHigh").textContent = digits(this.range[1]);
+    const quantity = $("quantity").selectedOptions[0]?.text || "";
+    $("barName").textContent = (this.differing ? `difference to ${$("other").selectedOptions[0].text}` : quantity.replace(/^learned: /, ""))
+      + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
+    drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
+    this.drawMarks(ratio);
+    this.drawProbes();
+  }
+
+  drawMarks(ratio) {
+    const svg = $("marks"), { view } = this;
+    svg.replaceChildren();
+    const place = (point) => {
+      const pixel = this.camera.project(point);
+      return pixel && [(pixel[0] * view.scale + view.left) / ratio, (pixel[1] * view.scale + view.top) / ratio];
+    };
+    if (this.state.at === null) {
+      for (const { camera } of this.cameras) {
+        const size = 0.02 * this.told.size, far = size * camera.intrinsics[0] / camera.width;
+        const corners = [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]].map(([x, y]) => place(camera.point(x, y, far)));
+        const eye = place(camera.centre);
+        if (!eye || corners.some((corner) => !corner)) continue;
+        const path = `M${corners.map((corner) => corner.join()).join("L")}Z` + corners.map((corner) => `M${eye.join()}L${corner.join()}`).join("");
+        node("path", { class: "frustum", d: path }, svg);
+      }
+    }
+    this.probes.forEach((probe) => {
+      const at = place(probe.point);
+      if (!at) return;
+      node("circle", { cx: at[0], cy: at[1], r: 6, fill: probe.colour, stroke: "#fff", "stroke-width": 2 }, svg);
+      node("text", { x: at[0] + 10, y: at[1] + 4 }, svg, probe.name);
+    });
+    if (document.activeElement === $("canvas") && this.keyboard) {
+      const x = $("canvas").clientWidth / 2, y = $("canvas").clientHeight / 2;
+      node("path", { class: "cross", d: `M${x - 12},${y}h8m8,0h8M${x},${y - 12}v8m0,8v8` }, svg);
+    }
+  }
+
+  // Probes ----------------------------------------------------------------------------------------------------------
+
+  // Pixel of the camera's image at a place of the window.
+  pixelAt(clientX, clientY) {
+    const canvas = $("canvas"), box = canvas.getBoundingClientRect(), ratio = canvas.width / box.width, { view } = this;
+    return [((clientX - box.left) * ratio - view.left) / view.scale, ((clientY - box.top) * ratio - view.top) / view.scale];
+  }
+
+  pin(px, py, name) {
+    const pixel = this.splats.weightsAt(this.camera, px, py);
+    if (pixel.left > 0.9) {
+      this.say("Nothing is there to measure.");
+      return null;
+    }
+    if (this.probes.length === COLOURS.length) this.probes.shift();
+    const used = this.probes.map((probe) => probe.colour);
+    this.numbered = (this.numbered || 0) + 1;
+    const probe = { name: name || String(this.numbered), colour: COLOURS.find((one) => !used.includes(one)), pixel, camera: this.camera, px, py,
+      point: this.camera.point(px, py, pixel.depth), dots: [] };
+    const [start, end] = this.told.span || [0, 0];
+    this.chartTimes = Array.from({ length: this.told.span ? CHART_TIMES : 1 }, (_, i) => start + i / (CHART_TIMES - 1) * (end - start));
+    this.probes.push(probe);
+    this.measure(probe);
+    if (this.told.span && !this.splats.layer("truth")) this.gatherDots(probe, 0);
+    this.request();
+    return probe;
+  }
+
+  measure(probe) {
+    const truth = this.splats.layer("truth");
+    const layer = this.layer || this.splats.layers[0];
+    probe.layer = layer;
+    probe.model = this.splats.seriesAt(probe.pixel, layer, this.chartTimes);
+    probe.truth = truth && layer !== truth ? this.splats.seriesAt(probe.pixel, truth, this.chartTimes) : null;
+  }
+
+  // What training images recorded of a probe: from cameras that see the point and nothing before it.
+  gatherDots(probe, i) {
+    if (i >= this.cameras.length || !this.probes.includes(probe)) return this.request();
+    const one = this.cameras[i], seen = one.camera.project(probe.point);
+    if (seen && one.time !== null && seen[0] >= 0 && seen[1] >= 0 && seen[0] < one.width && seen[1] < one.height) {
+      const { depth } = this.splats.weightsAt(one.camera, seen[0], seen[1]);
+      const [rows, columns] = one.size;
+      const level = one.recorded[Math.floor(seen[1] / one.height * rows) * columns + Math.floor(seen[0] / one.width * columns)];
+      const [low, high] = this.told.limits;
+      if (Math.abs(depth - seen[2]) < 0.05 * seen[2] && level !== 65535) probe.dots.push([one.time, low + level / 65534 * (high - low)]);
+    }
+    setTimeout(() => this.gatherDots(probe, i + 1));
+    return undefined;
+  }
+
+  pinPoint(point) {
+    const seen = this.camera.project(point);
+    if (!seen || seen[0] < 0 || seen[1] < 0 || seen[0] > this.camera.width || seen[1] > this.camera.height) return;
+    const pixel = this.splats.weightsAt(this.camera, seen[0], seen[1]);
+    if (pixel.left < 0.5 && Math.abs(pixel.depth - seen[2]) < 0.05 * seen[2]) this.pin(seen[0], seen[1]);
+  }
+
+  drawProbes() {
+    const unit = this.told.unit, list = $("probes");
+    if (this.told.span) drawCurves($("chart"), this.chartTimes || [], this.probes, this.state.time, unit, this.told.record);
+    $("chart").style.display = this.told.span && this.probes.length ? "" : "none";
+    const dots = this.probes.some((probe) => probe.dots.length), truth = this.probes.some((probe) => probe.truth);
+    $("chartNote").textContent = !this.told.span || !this.probes.length ? "" : `Lines: model${truth ? "; dashes: truth" : dots ? "; dots: training images" : ""}.`;
+    const items = this.probes.map((probe) => {
+      const item = document.createElement("li"), swatch = document.createElement("i");
+      const [value] = this.splats.seriesAt(probe.pixel, probe.layer, [this.state.time]);
+      const text = (content) => Object.assign(document.createElement("span"), { textContent: content });
+      swatch.style.background = probe.colour;
+      const close = Object.assign(document.createElement("button"), { textContent: "✕", title: `Take probe ${probe.name} away` });
+      close.setAttribute("aria-label", close.title);
+      close.onclick = () => {
+        this.probes = this.probes.filter((one) => one !== probe);
+        this.request();
+      };
+      item.append(swatch, text(`probe ${probe.name}`), text(unit ? `${value.toFixed(2)} ${unit}` : value.toFixed(4)), close);
+      if (this.splats.attributes.length) {
+        const told = this.splats.attributes.map((one) => `${one.label} ${Number(this.splats.attributeAt(probe.pixel, one).toPrecision(3))} ${one.unit}`.trim());
+        item.append(Object.assign(document.createElement("small"), { textContent: told.join(" · ") }));
+      }
+      return item;
+    });
+    const focused = [...list.querySelectorAll("button")].indexOf(document.activeElement);
+    list.replaceChildren(...items);
+    if (focused >= 0) (list.querySelectorAll("button")[focused] || $("canvas")).focus();
+  }
+
+  hover(clientX, clientY) {
+    const canvas = $("canvas"), box = canvas.getBoundingClientRect(), ratio = canvas.width / box.width;
+    const x = Math.floor((clientX - box.left) * ratio), y = Math.floor((clientY - box.top) * ratio);
+    const readout = $("readout");
+    const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
+    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0) : null;
+    readout.hidden = value === null;
+    if (value === null) return;
+    const number = this.attribute ? Number(value.toPrecision(3)) : value.toFixed(this.unit ? 2 : 4);
+    const mark = this.differing && value > 0 ? "+" : "";
+    readout.textContent = `${mark}${number}${this.unit ? ` ${this.unit}` : ""}`;
+    const left = clientX - box.left, right = left > box.width - 110;
+    readout.style.left = `${left + (right ? -100 : 14)}px`;
+    readout.style.top = `${Math.max(clientY - box.top - 34, 4)}px`;
+  }
+
+  // What people do --------------------------------------------------------------------------------------------------
+
+  choose(changes) {
+    Object.assign(this.state, changes);
+    this.stale.values = true;
+    if (this.state.other === "run" && !this.run) this.state.other = "nothing";
+    if ("other" in changes && (this.state.other === "recorded" || this.state.other === "sensor")) {
+      this.goTo(this.state.at ?? this.lastCamera ?? 0, true);
+      this.say("Known where a training camera stood, at its time: N and P go to the next.");
+    }
+    if (this.layer && this.chartTimes) this.probes.forEach((probe) => this.measure(probe));
+    if (!this.state.ranges[this.rangeName]) {
+      this.state.ranges[this.rangeName] = this.differing ? [-1, 1] : this.attribute ? [this.attribute.low, this.attribute.high] : [...this.told.limits];
+      this.frame(performance.now());
+      this.fit();
+    }
+    this.request();
+  }
+
+  cycle(id, key) {
+    const options = [...$(id).options].map((option) => option.value);
+    this.choose({ [key]: options[(options.indexOf(this.state[key]) + 1) % options.length] });
+    this.say(`${id === "other" ? "beside: " : ""}${[...$(id).options].find((option) => option.value === this.state[key]).text}`);
+  }
+
+  fold(on) {
+    document.body.classList.toggle("folded", on);
+    $("fold").setAttribute("aria-expanded", String(!on));
+    this.request();
+  }
+
+  theme() {
+    const root = document.documentElement;
+    root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+    this.request();
+  }
+
+  async openRun(file) {
+    try {
+      const page = new DOMParser().parseFromString(await file.text(), "text/html");
+      const payload = await readPayload(page);
+      if (payload.told.unit !== this.told.unit) throw new Error(`its values are in ${payload.told.unit || "image values"}, these in ${this.told.unit || "image values"}`);
+      if (this.run) this.run.sorter.stop();
+      const splats = new Splats(payload), scene = this.drawing.load(splats);
+      const sorter = new Sorter(splats, (ids) => {
+        this.drawing.order(scene, ids);
+        this.request();
+      });
+      this.run = { told: payload.told, scene, sorter };
+      sorter.sort(this.camera);
+      $("other").querySelector("[value=run]")?.remove();
+      $("other").append(new Option(`run: ${payload.told.method}, ${payload.told.scene}`, "run"));
+      this.choose({ other: "run" });
+    } catch (error) {
+      this.say(`${file.name} cannot be opened: ${error.message}`);
+    }
+  }
+
+  listen() {
+    const canvas = $("canvas");
+    const pointers = new Map();
+    let moved = 0, pinch = 0;
+    canvas.onpointerdown = (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, event);
+      moved = 0;
+      this.dragging = true;
+      this.keyboard = false;
+    };
+    canvas.onpointermove = (event) => {
+      const before = pointers.get(event.pointerId);
+      if (!before) return this.hover(event.clientX, event.clientY);
+      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+      moved += Math.hypot(dx, dy);
+      pointers.set(event.pointerId, event);
+      if (pointers.size === 2) {
+        const [a, b] = [...pointers.values()], now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+        if (pinch) this.nearer(Math.log(now / pinch) / 0.08);
+        pinch = now;
+      } else if (moved > 3) {
+        if (event.buttons & 2 || event.shiftKey) this.move(-dx * 0.03, -dy * 0.03, 0);
+        else this.turn(dx * 0.006, -dy * 0.006);
+      }
+      return undefined;
+    };
+    const ended = (event) => {
+      const known = pointers.delete(event.pointerId);
+      pinch = 0;
+      this.dragging = pointers.size > 0;
+      if (known && moved <= 3 && event.type === "pointerup" && event.button === 0) this.pin(...this.pixelAt(event.clientX, event.clientY));
+      this.request();
+    };
+    canvas.onpointerup = ended;
+    canvas.onpointercancel = ended;
+    canvas.onpointerleave = () => { $("readout").hidden = true; };
+    canvas.oncontextmenu = (event) => event.preventDefault();
+    canvas.ondblclick = (event) => {
+      const [px, py] = this.pixelAt(event.clientX, event.clientY), pixel = this.splats.weightsAt(this.camera, px, py);
+      if (pixel.left < 0.9) this.target = this.camera.point(px, py, pixel.depth);
+    };
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.nearer(-event.deltaY / (event.deltaMode ? 3 : 60));
+    }, { passive: false });
+    canvas.onfocus = canvas.onblur = () => this.request();
+    const slide = (event) => {
+      const box = canvas.getBoundingClientRect();
+      this.state.split = Math.min(Math.max((event.clientX - box.left) / box.width, 0.02), 0.98);
+      this.request();
+    };
+    $("divider").onpointerdown = (event) => {
+      $("divider").setPointerCapture(event.pointerId);
+      $("divider").onpointermove = slide;
+    };
+    $("divider").onpointerup = $("divider").onpointercancel = () => { $("divider").onpointermove = null; };
+
+    $("quantity").onchange = () => this.choose({ quantity: $("quantity").value });
+    $("other").onchange = () => this.choose({ other: $("other").value });
+    for (const input of document.querySelectorAll("input[name=how]")) input.onchange = () => this.choose({ how: input.value });
+    for (const input of document.querySelectorAll("input[name=move]")) input.onchange = () => this.choose({ walk: input.value === "walk" });
+    $("map").onchange = () => this.choose({ map: $("map").value });
+    $("auto").onclick = () => this.fit();
+    const ends = () => {
+      const of = (id) => this.attribute?.log ? Math.log10(Number($(id).value)) : Number($(id).value);
+      const [low, high] = [of("low"), of("high")];
+      if (!(low < high)) return this.say("The lower end of the colours must be below the upper one.");
+      this.state.ranges[this.rangeName] = [low, high];
+      return this.request();
+    };
+    $("low").onchange = $("high").onchange = ends;
+    $("time").oninput = () => this.setTime(Number($("time").value));
+    $("otherTime").oninput = () => this.choose({ otherTime: Number($("otherTime").value) });
+    $("play").onclick = () => this.play(!this.state.playing);
+    $("theme").onclick = () => this.theme();
+    $("help").onclick = () => $("keys").showModal();
+    $("fold").onclick = () => this.fold(!document.body.classList.contains("folded"));
+    $("run").onchange = () => $("run").files[0] && this.openRun($("run").files[0]);
+    document.body.ondragover = (event) => event.preventDefault();
+    document.body.ondrop = (event) => {
+      event.preventDefault();
+      if (event.dataTransfer.files[0]) this.openRun(event.dataTransfer.files[0]);
+    };
+    new ResizeObserver(() => this.request()).observe($("stage"));
+    document.addEventListener("keydown", (event) => this.pressed(event));
+  }
+
+  pressed(event) {
+    const { target, key } = event;
+    if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
+    const typing = target.matches("input[type=number], select");
+    const own = target.matches("input, button, select") ? new Set(["Enter", " ", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"]) : new Set();
+    if (typing || own.has(key)) return;
+    const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
+    const actions = {
+      ArrowLeft: () => this.turn(turn, 0), ArrowRight: () => this.turn(-turn, 0),
+      ArrowUp: () => this.turn(0, -turn), ArrowDown: () => this.turn(0, turn),
+      w: () => this.move(0, 0, far), s: () => this.move(0, 0, -far), a: () => this.move(-far, 0, 0), d: () => this.move(far, 0, 0),
+      q: () => this.move(0, far, 0), e: () => this.move(0, -far, 0),
+      "+": () => this.nearer(2), "=": () => this.nearer(2), "-": () => this.nearer(-2), _: () => this.nearer(-2),
+      " ": () => this.play(!this.state.playing),
+      ",": () => this.stepTime(-1), ".": () => this.stepTime(1), "<": () => this.stepTime(-10), ">": () => this.stepTime(10),
+      ";": () => this.stepTime(-10), ":": () => this.stepTime(10),
+      n: () => this.goTo((this.lastCamera ?? -1) + 1, true), p: () => this.goTo((this.lastCamera ?? 1) - 1, true),
+      Enter: () => this.pin(...this.middle()),
+      Delete: () => this.probes.pop() && this.request(), Backspace: () => this.probes.pop() && this.request(),
+      v: () => this.cycle("quantity", "quantity"), b: () => this.cycle("other", "other"),
+      f: () => this.choose({ how: this.state.how === "swipe" ? "difference" : "swipe" }),
+      "[": () => this.choose({ split: Math.max(this.state.split - 0.04, 0.02) }),
+      "]": () => this.choose({ split: Math.min(this.state.split + 0.04, 0.98) }),
+      c: () => this.cycle("map", "map"), r: () => this.fit(),
+      o: () => {
+        this.choose({ walk: !this.state.walk });
+        this.say(this.state.walk ? "walk" : "orbit");
+      },
+      t: () => this.theme(), h: () => $("keys").showModal(), "?": () => $("keys").showModal(),
+      "\\": () => this.fold(!document.body.classList.contains("folded")),
+    };
+    const action = actions[key.length === 1 ? key.toLowerCase() : key];
+    if (!action) return;
+    event.preventDefault();
+    this.keyboard = true;
+    action();
+  }
+
+  middle() {
+    const { view } = this, { width, height } = $("canvas");
+    return [(width / 2 - view.left) / view.scale, (height / 2 - view.top) / view.scale];
+  }
+}
+
+readPayload(document)
+  .then((payload) => { window.viewer = new Viewer(payload); })
+  .catch((error) => {
+    window.viewerFailed = String(error.stack || error);
+    $("message").textContent = error.message;
+  });

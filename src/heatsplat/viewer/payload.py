@@ -1,0 +1,196 @@
+"""A trained scene as one block of arrays and a header that says where each of them lies, for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.export.basis import steps_of
+from heatsplat.export.snapshot import TOLERANCE_C, TOLERANCE_UNIT, Layer, Snapshot
+
+COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
+CAMERAS = 36  # training cameras that are in the page, with their images
+THUMBNAIL = 144  # pixels of the longer side of an image
+UNKNOWN = 65535  # of a thumbnail's pixel that is masked
+LEVELS = 65534  # steps between the ends of a range in 16 bits
+ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
+LOG_RATIO = 100.0  # an attribute above 0 whose ends are further apart than this is stored as its logarithm
+SUFFIXES = {  # of names of attributes
+    "_k_per_kw_m2": "K m²/kW",
+    "_kj_m2_k": "kJ/(m² K)",
+    "_w_m2_k": "W/(m² K)",
+    "_w_m2": "W/m²",
+    "_h": "h",
+    "_s": "s",
+    "_k": "K",
+    "_c": "°C",
+}
+
+
+class Block:
+    """Arrays one after the other, each at a multiple of eight bytes."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, values: Any, kind: str) -> dict[str, Any]:
+        """Where an array lies: its type ("f4", "f8", "i2", "u2", "u1"), shape and first byte. Little-endian."""
+        array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+        content = np.ascontiguousarray(array, dtype=f"<{kind}").tobytes()
+        place = {"type": kind, "shape": list(array.shape), "offset": self._size}
+        content += bytes(-len(content) % 8)
+        self._parts.append(content)
+        self._size += len(content)
+        return place
+
+    @property
+    def content(self) -> bytes:
+        return b"".join(self._parts)
+
+
+def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
+    """The header and the block of a scene.
+
+    Args:
+        module: the training module; of it come cameras, images, the settings of the renderer and names.
+        seen: its Gaussians (``export.snapshot``).
+    """
+    scene: SceneData = module.scene
+    block = Block()
+    down = torch.stack([frame.camera.viewmat[1, :3] for frame in scene.train.frames]).mean(0)
+    centre, size = scene.bulk
+    renderer = module.renderer
+    header = {
+        "format": 1,
+        "scene": scene.name,
+        "method": module.config.get("name") or type(module.thermal).__name__,
+        "unit": seen.unit,
+        "limits": list(seen.limits),
+        "count": len(seen.means),
+        "means": block.add(seen.means, "f4"),
+        "quats": block.add((seen.quats * 32767).round(), "i2"),
+        "scales": block.add(seen.scales, "f4"),
+        "opacities": block.add(seen.opacities, "f4"),
+        "background": seen.background,
+        "table": block.add(seen.table, "f4"),
+        "tableEnds": list(seen.table_ends),
+        "layers": [_layer(layer, block) for layer in seen.layers],
+        "tolerance": TOLERANCE_C if seen.unit else TOLERANCE_UNIT,
+        "colours": None if seen.colours is None else block.add((seen.colours * 255).round(), "u1"),
+        "colourOpacities": None if seen.colour_opacities is None else block.add(seen.colour_opacities, "f4"),
+        "attributes": [_attribute(name, values, block) for name, values in seen.attributes.items()],
+        "span": None if seen.start_s is None else [seen.start_s, seen.end_s],
+        "record": None if seen.start_s is None else [min(scene.train.times_s), max(scene.train.times_s)],
+        "leftOut": seen.left_out,
+        "beyondRecord": module.thermal.beyond_record,
+        "renderer": {
+            "eps2d": renderer.eps2d,
+            "antialiased": renderer.antialiased,
+            "near": renderer.near,
+            "far": renderer.far,
+        },
+        "centre": centre.tolist(),
+        "size": size,
+        "up": (-down / down.norm().clamp_min(1e-12)).tolist(),
+        "cameras": _cameras(module, seen, block),
+        "probes": [] if scene.probes is None else scene.probes.tolist(),
+        "effects": sorted(module.thermal.effects() | module.sensor.effects()),
+        "maps": {name: block.add(_colours(name), "u1") for name in COLORMAPS},
+    }
+    return header, block.content
+
+
+def _colours(name: str) -> np.ndarray:
+    return matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
+
+
+def _layer(layer: Layer, block: Block) -> dict[str, Any]:
+    """Coefficients lie curve by curve, in 16-bit steps."""
+    stored = [steps_of(column) for column in layer.basis.coefficients.unbind(1)]
+    basis = layer.basis
+    return {
+        "name": layer.name,
+        "label": layer.label,
+        "worst": layer.worst,
+        "clipped": layer.clipped,
+        "checks": basis.checks,
+        "offsets": block.add(basis.offsets, "f4"),
+        "coefficients": [block.add(steps, "i2") | {"step": size} for steps, size in stored],
+        "curves": block.add(basis.curves, "f4"),
+        "times": block.add(basis.times_s, "f8"),
+    }
+
+
+def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:
+    """16 bits between the quantiles of ATTRIBUTE_SHARE; NaN is the lowest value."""
+    known = values[values.isfinite()].double().numpy()
+    low, high = np.quantile(known, ATTRIBUTE_SHARE).tolist() if len(known) else (0.0, 1.0)
+    logarithmic = low > 0 and high / low > LOG_RATIO
+    if logarithmic:
+        values, low, high = values.clamp_min(1e-30).log10(), math.log10(low), math.log10(high)
+    span = high - low if high > low else 1.0
+    share = ((values.double() - low) / span).nan_to_num(0.0).clamp(0, 1)
+    suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
+    return {
+        "name": name,
+        "label": name.removesuffix(suffix).replace("_", " "),
+        "unit": SUFFIXES.get(suffix, ""),
+        "low": low,
+        "high": low + span,
+        "log": logarithmic,
+        "values": block.add((share * LEVELS).round(), "u2"),
+    }
+
+
+def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
+    """Training cameras with small images: what was recorded, what the sensor of the model adds, what the eye saw."""
+    scene = module.scene
+    told = []
+    for i in evenly_spread(len(scene.train), CAMERAS):
+        view = scene.train[i]
+        camera, frame = view.camera, view.frame
+        low, high = seen.limits
+        shrink = max(1.0, max(camera.width, camera.height) / THUMBNAIL)
+        size = max(1, round(camera.height / shrink)), max(1, round(camera.width / shrink))
+        entry: dict[str, Any] = {
+            "name": frame.name,
+            "time": frame.time_s,
+            "width": camera.width,
+            "height": camera.height,
+            "intrinsics": [camera.K[0, 0].item(), camera.K[1, 1].item(), camera.K[0, 2].item(), camera.K[1, 2].item()],
+            "viewmat": camera.viewmat[:3].flatten().tolist(),
+        }
+        share = _small(view.image(module.modality).float().mean(-1), size).clamp(0, 1)
+        levels = (share * LEVELS).round().to(torch.int32)
+        if view.mask is not None:
+            levels[_small(view.mask.float(), size) < 0.999] = UNKNOWN
+        entry["recorded"] = block.add(levels, "u2")
+        if module.sensor.parts:
+            entry["added"] = _added(module, frame, size, high - low, block)
+        if view.rgb is not None:
+            entry["rgb"] = block.add((_small(view.rgb.float(), size).clamp(0, 1) * 255).round(), "u1")
+        told.append(entry)
+    return told
+
+
+def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> Mapping[str, Any]:
+    """What the sensor adds to the clean image of a frame, in the scene's unit."""
+    images = module.predict_all(frame)
+    difference = (images[module.modality] - images["clean"]).mean(-1).cpu() * span
+    steps, step = steps_of(_small(difference, size).flatten())
+    return block.add(steps.view(size), "i2") | {"step": step}
+
+
+def _small(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """An image [H, W] or [H, W, C] as means over the pixels of a coarser grid."""
+    planes = image.unsqueeze(-1) if image.ndim == 2 else image
+    small = torch.nn.functional.interpolate(planes.permute(2, 0, 1)[None], size=size, mode="area")[0]
+    return small.permute(1, 2, 0).squeeze(-1) if image.ndim == 2 else small.permute(1, 2, 0)

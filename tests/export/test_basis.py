@@ -1,0 +1,63 @@
+"""A basis of time: its error is what it says, at any moment, for smooth curves, kinks and steps."""
+
+import math
+
+import pytest
+import torch
+
+from heatsplat.export.basis import constant_basis, rounded, steps_of, time_basis
+
+COUNT = 200
+
+
+def bodies(seed: int = 0):
+    """Values of bodies that relax at rates of their own and are heated at two frequencies."""
+    generator = torch.Generator().manual_seed(seed)
+    rates = torch.logspace(-2, 1, COUNT)
+    start, gains = torch.rand(COUNT, generator=generator), 0.1 * torch.randn(COUNT, 2, generator=generator)
+
+    def values_at(time: float) -> torch.Tensor:
+        return start * torch.exp(-rates * time) + gains[:, 0] * math.sin(3 * time) + gains[:, 1] * math.cos(7 * time)
+
+    return values_at
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+def test_the_worst_error_is_below_what_was_asked_and_is_told(tolerance):
+    values_at = bodies()
+    basis = time_basis(values_at, 0.0, 4.0, tolerance)
+    assert 0 < basis.worst <= tolerance
+    errors = [(basis.at(time) - values_at(time)).abs().max().item() for time in torch.linspace(0, 4, 321).tolist()]
+    assert max(errors) <= 1.5 * tolerance  # moments at which it never looked
+    assert max(errors) > 0.1 * tolerance  # and it is no larger than it must be
+    assert basis.rank < 16
+
+
+def test_a_kink_gets_samples_and_a_flat_stretch_does_not():
+    basis = time_basis(lambda time: torch.full((3,), max(time - 0.7, 0.0)), 0.0, 1.0, 1e-4)
+    assert basis.rank == 1
+    near = ((basis.times_s - 0.7).abs() < 0.02).sum()
+    assert near >= 4 and len(basis.times_s) < 60
+    assert basis.at(0.7).abs().max() < 1e-4
+
+
+def test_what_does_not_change_has_no_curve():
+    values = torch.rand(5)
+    for basis in (time_basis(lambda time: values, 0.0, 9.0, 0.01), constant_basis(values)):
+        assert (basis.rank, basis.worst) == (0, 0.0)
+        assert torch.equal(basis.at(3.0), values) and torch.equal(basis.at(None), values)
+
+
+def test_too_few_samples_or_curves_are_told_as_an_error():
+    values_at = bodies()
+    assert time_basis(values_at, 0.0, 4.0, 1e-4, most_curves=2).worst > 1e-3
+    assert time_basis(values_at, 0.0, 4.0, 1e-6, most_times=40).worst > 1e-6
+
+
+def test_coefficients_are_already_what_sixteen_bits_hold():
+    basis = time_basis(bodies(), 0.0, 4.0, 1e-3)
+    for column in basis.coefficients.unbind(1):
+        assert torch.allclose(rounded(column), column, rtol=1e-6, atol=0)
+    steps, size = steps_of(torch.tensor([0.0, -1.0, 0.5]))
+    assert steps.tolist() == [0, -32767, 16384] and size == pytest.approx(1 / 32767)
+    assert steps_of(torch.zeros(2))[0].tolist() == [0, 0]

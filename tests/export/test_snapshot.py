@@ -1,0 +1,78 @@
+"""What an export takes of a scene is what the renderer would show of it."""
+
+import pytest
+import torch
+from running import TINY
+
+from heatsplat.composition import compose
+from heatsplat.export.snapshot import snapshot
+from heatsplat.runs.run import begin
+
+TOLERANCE = 0.05
+
+
+def started(folder, *overrides):
+    """A module at its first step, on a tiny scene."""
+    run = begin(compose([*TINY, "max_steps=10", *overrides]), folder)
+    run.module.attach(run.data.scene)
+    return run.module
+
+
+def shown(layer, time_s):
+    values = layer.basis.at(time_s)
+    return values.clamp(0, 1) if layer.clipped else values
+
+
+@pytest.mark.parametrize("composite", ["temperature", "stefan_boltzmann"])
+def test_emission_over_time_is_that_of_the_model(tmp_path, composite):
+    module = started(tmp_path, "method=etgs", "thermal.frequencies=4", f"composite={composite}")
+    seen, scene = snapshot(module), module.scene
+    camera = seen.layers[0]
+    assert camera.name == "camera" and camera.worst <= TOLERANCE and seen.unit == "°C"
+    low, high = seen.table_ends
+    for frame in scene.train.frames[:: len(scene.train) // 4]:
+        expected = scene.thermal_range.to_celsius(module.emissions(module.splats, frame)[:, 0])
+        place = (shown(camera, frame.time_s) - low) / (high - low) * (len(seen.table) - 1)
+        below = place.long().clamp(0, len(seen.table) - 2)
+        found = seen.table[below] + (place - below) * (seen.table[below + 1] - seen.table[below])
+        assert (found - expected.clamp(*seen.limits)).abs().max() <= 1.2 * TOLERANCE
+
+
+def test_the_truth_of_a_synthetic_scene_is_a_layer(tmp_path):
+    module = started(tmp_path, "method=etgs", "thermal.frequencies=0")
+    seen, scene = snapshot(module), module.scene
+    truth = seen.layers[-1]
+    time = scene.train.frames[7].time_s
+    expected = scene.truth(seen.means, torch.tensor([time], dtype=torch.float64))[:, 0]
+    found = scene.thermal_range.to_celsius(truth.basis.at(time))
+    assert truth.name == "truth" and (found - expected).abs().max() < 2 * TOLERANCE
+
+
+def test_a_static_scene_has_one_moment_and_what_cannot_be_seen_is_left_out(tmp_path):
+    module = started(tmp_path, "method=3dgs", "data.scene=static")
+    with torch.no_grad():
+        module.splats.raw["opacity_logits"][:5] = -20.0
+    seen = snapshot(module)
+    assert len(seen.means) == len(module.splats) - 5
+    assert seen.layers[0].basis.rank == 0 and seen.left_out == []
+
+
+def test_what_depends_on_the_view_is_said(tmp_path):
+    module = started(
+        tmp_path, "method=3dgs", "data.scene=static", "thermal.sh_degree=2", "thermal.sh_degree_interval=1"
+    )
+    module.thermal.on_step(9)
+    with torch.no_grad():
+        module.splats.raw["sh_rest"].normal_(0, 0.1, generator=torch.Generator().manual_seed(0))
+    (said,) = snapshot(module).left_out
+    assert "depends on the view" in said and "°C" in said
+
+
+def test_visible_light_comes_with_its_own_opacity(tmp_path):
+    module = started(tmp_path, "method=ravigs")
+    with torch.no_grad():
+        module.splats.raw["opacity_logits"][:, 1] -= 1.0
+    seen = snapshot(module)
+    assert seen.colours.shape == (len(seen.means), 3) and 0 <= seen.colours.min() <= seen.colours.max() <= 1
+    assert (seen.colour_opacities < seen.opacities).all()
+    assert seen.attributes.keys() >= {"emissivity"}

@@ -1,0 +1,50 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heatsplat.contracts import SceneError
+from heatsplat.physics.radiometry import Conditions
+from heatsplat.preparation.conditions import Given, Uncertainty
+from heatsplat.preparation.frame import Frame
+
+FROM_FILE = Conditions(emissivity=0.95, reflected_k=280.0, distance_m=5.0)
+FRAME = Frame(
+    "a", Path("a.tiff"), 0, lambda: np.zeros((1, 1), np.float32), conditions=FROM_FILE, sources={"emissivity": "file"}
+)
+
+
+def test_what_is_given_goes_before_what_the_file_says():
+    settled = Given(distance_m=75.0, air_c=10.0, humidity_percent=80.0).settled(FRAME)
+    c = settled.conditions
+    assert (c.distance_m, c.air_k, c.humidity, c.emissivity, c.reflected_k) == (75.0, 283.15, 0.8, 0.95, 280.0)
+    assert settled.sources == {"emissivity": "file", "distance_m": "given", "air_k": "given", "humidity": "given"}
+    assert Given().settled(FRAME).conditions == FROM_FILE
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"emissivity": 0.0}, "conditions.emissivity=0.0 must lie between 0.001 and 1"),
+        ({"emissivity": 95}, "conditions.emissivity=95"),
+        ({"humidity_percent": 120}, "conditions.humidity_percent=120 must lie between 0 and 100"),
+        ({"air_c": -300}, "conditions.air_c"),
+    ],
+)
+def test_what_cannot_be_is_refused(wrong, said):
+    with pytest.raises(SceneError, match=said):
+        Given(**wrong)
+
+
+def test_air_for_which_the_formula_has_no_answer_is_refused():
+    with pytest.raises(SceneError, match="a.tiff: at 90000 m of air with 90 % humidity .*conditions.distance_m"):
+        Given(distance_m=90_000, humidity_percent=90, air_c=30).settled(FRAME)
+
+
+def test_uncertainties_come_in_the_units_of_the_conditions():
+    found = Uncertainty(distance_percent=20.0, humidity_percent=5.0).standard(FROM_FILE)
+    assert found["distance_m"] == 1.0 and found["humidity"] == 0.05 and found["camera"] == 1.0
+    assert found["window_transmission"] == found["window_k"] == 0  # there is none
+    assert Uncertainty().standard(Conditions(window_transmission=0.9))["window_k"] == 3.0
+    with pytest.raises(SceneError, match="uncertainty.air_c"):
+        Uncertainty(air_c=-1.0)

@@ -1,0 +1,132 @@
+"""Correction pixel by pixel against a scene whose temperature, distances and angles are known."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from recordings import write_flir
+
+from heatsplat.contracts import Camera, Frame, SceneError, ThermalRange, View
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.geometry.sight_lines import cosines, distances, rays
+from heatsplat.io.tiff import read_temperature
+from heatsplat.physics.radiometry import (
+    BandResponse,
+    Conditions,
+    PlanckResponse,
+    directional_emissivity,
+    measured_signal,
+    surface_temperature,
+)
+from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.correction import correct_scene, corrected, preparation_of
+from heatsplat.preparation.prepare import prepare
+
+CAMERA = Camera(
+    torch.eye(4, dtype=torch.float64),
+    torch.tensor([[38.0, 0, 20.0], [0, 38.0, 16.0], [0, 0, 1]], dtype=torch.float64),
+    40,
+    32,
+)
+# A floor 10 units below that is seen at a slant, and a free sky above the horizon.
+DOWN = torch.tensor([0.0, 0.95, 0.31], dtype=torch.float64)
+ALONG = rays(CAMERA) @ DOWN
+DEPTH = torch.where(ALONG > 0.1, 10.0 / ALONG.clamp(min=1e-9), torch.inf)
+TRUE_K = 300.0 + 20.0 * torch.sin(torch.arange(40, dtype=torch.float64) / 5).expand(32, 40)
+METRES = 4.0  # a unit
+AIR = Conditions(emissivity=0.94, reflected_k=265.0, distance_m=60.0, air_k=285.0, humidity=0.8)
+RESPONSES = [PlanckResponse(16000.0, 1430.0, 1.0, -7000, 0.012), BandResponse()]
+
+
+def filmed(response, index):
+    """What a camera measures of the floor."""
+    metres = (distances(CAMERA, DEPTH) * METRES).nan_to_num(posinf=60.0)
+    emissivity = 0.94
+    if index is not None:
+        emissivity = directional_emissivity(0.94, cosines(CAMERA, DEPTH).nan_to_num(1.0).clamp(min=0.17), index)
+    return measured_signal(TRUE_K, response, replace(AIR, distance_m=metres, emissivity=emissivity))
+
+
+@pytest.mark.parametrize("response", RESPONSES, ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize("index", [None, 1.5])
+@pytest.mark.parametrize("prepared", [True, False])
+def test_true_temperatures_come_back_where_one_distance_is_wrong_by_kelvins(response, index, prepared):
+    done = AIR if prepared else Conditions()
+    trained_on = surface_temperature(filmed(response, index), response, done) - 273.15
+    found = corrected(trained_on, CAMERA, DEPTH, METRES, response, done, AIR, index)
+    truth = TRUE_K - 273.15
+    assert (found.celsius - truth).abs().max() < 1e-6
+    floor = DEPTH.isfinite()
+    assert (found.one - truth)[floor].abs().max() > (0.3 if index is None else 1.0)
+    if index is not None:
+        assert (found.distance_only - truth)[floor].abs().max() > 0.1
+    assert found.distance_m[~floor].isnan().all() and (~floor).any()
+
+
+def scene():
+    """Three views of the floor, as a trained scene has them."""
+    celsius = surface_temperature(filmed(BandResponse(), 1.5), BandResponse(), Conditions()) - 273.15
+    span = ThermalRange(0.0, 60.0)
+    image = span.to_unit(celsius).float()[..., None]
+    views = [View(Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i), thermal=image) for i in range(3)]
+    points = torch.rand(30, 3)
+    return SimpleNamespace(
+        name="floor", thermal_range=span, train=views[:2], test=views[2:], points=points, point_colors=None
+    )
+
+
+def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
+    given = Given(
+        emissivity=0.94, reflected_c=265.0 - 273.15, distance_m=60.0, air_c=285.0 - 273.15, humidity_percent=80
+    )
+    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path / "new", given, BandResponse(), 1.5, METRES)
+    image = read_temperature(tmp_path / "new" / "images" / "1.tiff")
+    np.testing.assert_allclose(image, TRUE_K.numpy() - 273.15, atol=1e-3)  # the images were float32
+    text = page.read_text()
+    assert "against one distance of 60.0 m" in text and "| both |" in text
+    assert (tmp_path / "new" / "report" / "correction.png").stat().st_size > 1000
+    module = Colmap(root=str(tmp_path / "new"))
+    module.setup()
+    frames = [*module.scene.train.frames, *module.scene.test.frames]
+    assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
+    torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
+
+
+def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
+    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
+    far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())
+    assert f"against one distance of {far:.1f} m" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"metres": None}, "correct.metres_per_unit"),
+        ({"index": 0.9}, "correct.refractive_index must be above 1"),
+        ({"thermal_range": None}, "floor has no temperatures"),
+        ({"depth": torch.full((32, 40), torch.inf)}, "shows no surface"),
+    ],
+)
+def test_what_cannot_be_corrected_is_refused_with_the_remedy(tmp_path, change, said):
+    floor = scene()
+    floor.thermal_range = change.get("thermal_range", floor.thermal_range)
+    depth = change.get("depth", DEPTH)
+    with pytest.raises(SceneError, match=said):
+        correct_scene(
+            floor, lambda frame: depth, [], tmp_path, Given(), BandResponse(), change.get("index"),
+            change.get("metres", METRES),
+        )  # fmt: skip
+
+
+def test_what_a_preparation_did_is_found_again(tmp_path):
+    prepare(str(write_flir(tmp_path / "files", 2)), tmp_path / "scene", conditions={}, uncertainty={}, counts={})
+    response, done = preparation_of("IR_0000.tiff", [tmp_path / "elsewhere", tmp_path / "scene"])
+    assert isinstance(response, PlanckResponse) and done.emissivity == pytest.approx(0.95)
+    assert preparation_of("other.tiff", [tmp_path / "scene"]) == (None, Conditions())
+    record = tmp_path / "scene" / "images" / "IR_0000.json"
+    record.write_text(json.dumps({"conditions": 3}))
+    with pytest.raises(SceneError, match="IR_0000.json is no record of a preparation"):
+        preparation_of("IR_0000.tiff", [tmp_path / "scene"])

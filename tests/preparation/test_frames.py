@@ -1,0 +1,153 @@
+import math
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from camera_files import fff, raw_for, temperatures
+from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
+
+from heatsplat.contracts import SceneError
+from heatsplat.preparation.frames import Reading, read_frames, read_recording
+from heatsplat.preparation.meaning import Meaning
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real recordings are not at ../shared/data")
+FLOATS = temperatures().astype(np.float32)
+
+
+def test_frames_of_flir_come_in_the_order_of_their_times_with_all_that_their_files_say(tmp_path):
+    frames = read_frames(write_flir(tmp_path))
+    assert [frame.time for frame in frames] == [START + timedelta(seconds=2 * i) for i in range(4)]
+    assert [frame.name for frame in frames] == ["IR_0000", "IR_0003", "IR_0002", "IR_0001"]
+    first = frames[0]
+    assert first.conditions.emissivity == pytest.approx(STATED["emissivity"])
+    assert first.position.latitude_deg == 51.0 and first.camera.model == "Test Cam 640"
+    assert first.sources["humidity"] == "file"
+    assert (first.temperature() > temperatures(0) + 0.1).any()  # the conditions of the file count
+
+
+def test_sequences_have_a_frame_each(tmp_path):
+    frames = read_frames(write_sequence(tmp_path / "flight.seq").parent)
+    assert [frame.name for frame in frames] == [f"flight_{i:06d}" for i in range(4)]
+    np.testing.assert_array_equal(frames[2].load(), raw_for(temperatures(2)))
+
+
+def test_a_recording_that_was_cut_short_says_so(tmp_path):
+    path = write_sequence(tmp_path / "flight.seq")
+    path.write_bytes(path.read_bytes()[:-10])
+    found = read_recording(tmp_path)
+    assert len(found.frames) == 3 and any("after its last whole frame" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("image", "meaning", "expected"),
+    [
+        (FLOATS, Meaning(), FLOATS),
+        (FLOATS + 273.15, Meaning(offset_c=-273.15), FLOATS),
+        (((FLOATS + 273.15) * 100).astype(np.uint16), Meaning(), FLOATS),
+        (((FLOATS + 273.15) * 64).astype(np.uint16), Meaning(scale=1 / 64), FLOATS),
+        ((FLOATS * 5).astype(np.uint8), Meaning(bounds_c=[0.0, 51.0]), FLOATS),
+    ],
+    ids=["celsius", "kelvin", "kelvin x 100", "1/64 K", "greys"],
+)
+@pytest.mark.parametrize("ending", ["tiff", "png"])
+def test_images_are_temperatures(tmp_path, image, meaning, expected, ending):
+    if image.dtype == np.float32 and ending == "png":
+        return
+    write_images(tmp_path, {f"a.{ending}": image})
+    (frame,) = read_frames(tmp_path, Reading(meaning))
+    np.testing.assert_allclose(frame.temperature(), expected, atol=0.21 if image.dtype == np.uint8 else 0.02)
+
+
+def test_photos_belong_to_the_frames_of_their_exposure(tmp_path):
+    write_images(tmp_path, {"DJI_20240101120000_0007_T.tiff": FLOATS, "DJI_20240101120003_0008_T.tiff": FLOATS})
+    photo = np.zeros((8, 8, 3), np.uint8)
+    write_images(tmp_path / "rgb", {"DJI_20240101120001_0007_V.jpg": photo})
+    first, second = read_frames(tmp_path)
+    assert first.rgb == tmp_path / "rgb" / "DJI_20240101120001_0007_V.jpg" and second.rgb is None
+    assert first.time == datetime(2024, 1, 1, 12)
+
+
+def test_a_zone_is_given_to_times_that_have_none(tmp_path):
+    write_images(tmp_path, {"DJI_20240701120000_0007_T.tiff": FLOATS})
+    (frame,) = read_frames(tmp_path, Reading(zone="Europe/Berlin"))
+    assert frame.time.astimezone(UTC) == datetime(2024, 7, 1, 10, tzinfo=UTC)
+    with pytest.raises(SceneError, match="zone=Mars is no time zone"):
+        read_frames(tmp_path, Reading(zone="Mars"))
+
+
+def test_a_table_goes_before_the_files(tmp_path):
+    write_images(tmp_path / "frames", {"a.tiff": FLOATS, "b.tiff": FLOATS})
+    table = tmp_path / "table.csv"
+    table.write_text("file;when;lat;lon\na;2024-07-01T10:00:05Z;50,5;7,5\nb.tiff;2024-07-01T10:00:00Z;50,6;7,5\n")
+    columns = {"name": "file", "time": "when", "latitude_deg": "lat", "longitude_deg": "lon"}
+    frames = read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
+    assert [frame.name for frame in frames] == ["b", "a"]
+    assert frames[1].position.latitude_deg == 50.5
+    with pytest.raises(SceneError, match="has no column 'image'"):
+        read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"name": "image"}))
+    table.write_text("file;when;lat;lon\na;yesterday;50,5;7,5\n")
+    with pytest.raises(SceneError, match="line 2: 'yesterday' in column when is no date-time"):
+        read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
+
+
+def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
+    with pytest.raises(SceneError, match="nothing is no folder"):
+        read_frames(tmp_path / "nothing")
+    with pytest.raises(SceneError, match="holds no thermal image"):
+        read_frames(write_images(tmp_path / "empty", {}))
+    y, x = np.mgrid[:16, :16].astype(np.uint8)
+    palette = cv2.applyColorMap((y * 16 + x), cv2.COLORMAP_INFERNO)
+    with pytest.raises(SceneError, match="coloured pictures alone .such as a.png.: colours of a palette"):
+        read_frames(write_images(tmp_path / "colours", {"a.png": palette}))
+    with pytest.raises(SceneError, match="floating-point images .* and .* 16-bit images .*one kind each"):
+        read_frames(write_images(tmp_path / "mixed", {"a.tiff": FLOATS, "b.png": (FLOATS * 100).astype(np.uint16)}))
+    with pytest.raises(SceneError, match="a.png and .*a.tif would both become"):
+        both = {"a.png": (FLOATS * 5).astype(np.uint8), "a.tif": (FLOATS * 5).astype(np.uint8)}
+        read_frames(write_images(tmp_path / "twice", both), Reading(Meaning(bounds_c=[0, 51])))
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "c.png").write_bytes(b"\x89PNG broken")
+    with pytest.raises(SceneError, match=r"c\.png is corrupt"):
+        read_frames(tmp_path / "broken")
+
+
+def test_greys_that_were_stored_as_colours_are_greys(tmp_path):
+    grey = (FLOATS * 5).astype(np.uint8)
+    write_images(tmp_path, {"a.png": cv2.merge([grey, grey, grey])})
+    (frame,) = read_frames(tmp_path, Reading(Meaning(bounds_c=[0.0, 51.0])))
+    np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.21)
+
+
+def test_the_photo_inside_a_file_is_offered(tmp_path):
+    photo = cv2.imencode(".jpg", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(flir_frame(0, picture=photo))
+    (tmp_path / "b.fff").write_bytes(fff(raw_for(temperatures())))
+    frames = {frame.name: frame for frame in read_frames(tmp_path)}
+    assert frames["a"].picture() == photo and frames["b"].picture is None
+
+
+@needs_data
+def test_real_files_give_the_temperatures_that_are_stated_for_them(tmp_path):
+    """PROVENANCE: FLIR ONE about -10 .. 27 °C; M3T within 23.6 .. 52.9 °C; ThermoScenes' greys between their bounds."""
+    from dataclasses import replace
+
+    from heatsplat.physics.radiometry import Conditions
+
+    (tmp_path / "one.jpg").write_bytes((DATA / "flir" / "IMG_0620.JPG").read_bytes())
+    (one,) = read_frames(tmp_path)
+    apparent = replace(one, conditions=Conditions()).temperature()
+    assert apparent.min() == pytest.approx(-10, abs=0.5) and apparent.max() == pytest.approx(27, abs=0.6)
+    assert one.camera.model == "FLIR ONE Pro (gen 3)" and one.position.altitude_m == pytest.approx(394.29)
+    flight = read_frames(DATA / "m3t_heath" / "raw_rjpeg")
+    assert [frame.camera.model for frame in flight] == ["M3T", "M3T"]
+    assert flight[0].attitude.pitch_deg == -89.9 and flight[0].position.above_takeoff_m == 75.002
+    for frame in flight:
+        apparent = replace(frame, conditions=Conditions()).temperature()
+        assert apparent.min() >= 23.6 and apparent.max() <= 52.9
+        assert frame.time.tzinfo is not None
+    repeats = read_frames(DATA / "flir" / "static_repeats")
+    assert len(repeats) == 24
+    found = repeats[0].temperature()
+    assert 18.9 <= found.min() < found.max() <= 33.17 and not math.isnan(found.mean())

@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.preparation.meaning import Meaning
+
+HERE = Path("image.png")
+
+
+def celsius(calibration, values):
+    return (calibration.apparent_k(torch.tensor(values, dtype=torch.float64)) - 273.15).tolist()
+
+
+def test_kelvin_times_100_is_recognised_and_nothing_else_is_guessed():
+    room = np.linspace(28315, 31315, 100).reshape(10, 10).astype(np.uint16)
+    calibration, note = Meaning().of_counts(room, HERE)
+    assert celsius(calibration, [29315.0]) == pytest.approx([20.0])
+    assert "kelvin x 100" in note
+    for other in (room // 4, np.linspace(0, 65535, 100).astype(np.uint16), room * 0 + 19000):
+        with pytest.raises(SceneError, match="image.png holds 16-bit counts .*counts.scale"):
+            Meaning().of_counts(other, HERE)
+
+
+def test_what_is_said_goes_before_what_is_guessed():
+    sample = np.full((2, 2), 20000, np.uint16)
+    assert celsius(Meaning(scale=1 / 64).of_counts(sample, HERE)[0], [19200.0]) == pytest.approx([26.85])
+    assert celsius(Meaning(scale=0.1, offset_c=-50.0).of_counts(sample, HERE)[0], [700.0]) == pytest.approx([20.0])
+    planck = Meaning(planck=[17945.85, 1435.0, 1.0, -2539, 0.0125])
+    assert 5 < celsius(planck.of_counts(sample, HERE)[0], [11441.0])[0] < 20  # a FLIR ONE out of doors
+
+
+def test_floats_are_celsius_unless_they_may_be_kelvin():
+    assert celsius(Meaning().of_floats(np.full((2, 2), 20.0, np.float32), HERE)[0], [21.5]) == pytest.approx([21.5])
+    with pytest.raises(SceneError, match="kelvin, or a furnace"):
+        Meaning().of_floats(np.full((2, 2), 295.0, np.float32), HERE)
+    said = Meaning(offset_c=-273.15).of_floats(np.full((2, 2), 295.0, np.float32), HERE)[0]
+    assert celsius(said, [293.15]) == pytest.approx([20.0])
+
+
+def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
+    assert Meaning().of_greys(tmp_path)[0] is None
+    assert celsius(Meaning(bounds_c=[10, 40]).of_greys(tmp_path)[0], [0.0, 255.0]) == pytest.approx([10.0, 40.0])
+    (tmp_path / "images").mkdir()
+    (tmp_path / "temperature_bounds.json").write_text('{"absolute_min_temperature": 0, "absolute_max_temperature": 51}')
+    found, note = Meaning().of_greys(tmp_path / "images")
+    assert celsius(found, [100.0]) == pytest.approx([20.0]) and "temperature_bounds.json" in note
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"planck": [1.0, 2.0]}, "counts.planck"),
+        ({"scale": -1.0}, "counts.scale"),
+        ({"bounds_c": [1.0]}, "bounds_c"),
+        ({"band_um": [14.0, 8.0]}, "band_um"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(wrong, said):
+    with pytest.raises(SceneError, match=said):
+        Meaning(**wrong)

@@ -1,0 +1,89 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import succeeds
+from recordings import write_flir, write_images, write_sequence
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.io.tiff import read_temperature
+from heatsplat.preparation.frames import read_frames
+from heatsplat.preparation.prepare import prepare
+from heatsplat.preparation.report import Section
+
+ROOT = Path(__file__).resolve().parents[2]
+PINHOLE = ("PINHOLE", (38.0, 38.0, 20.0, 16.0), 40, 32)
+PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
+
+
+def poses(frames, target):
+    """Stands in for a search: cameras side by side that look ahead."""
+    cameras = {}
+    for i, frame in enumerate(frames):
+        cameras[f"{frame.name}.tiff"] = np.eye(4)
+        cameras[f"{frame.name}.tiff"][:3, 3] = [0.1 * i, 0.0, 4.0]
+    seen = np.random.default_rng(1).uniform(-0.5, 0.5, (30, 3))
+    write_model(target / "sparse" / "0", cameras, [PINHOLE], seen, np.full((len(seen), 3), 128))
+    return Section("Poses", [f"{len(frames)} of {len(frames)}"])
+
+
+def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_and_times(tmp_path):
+    source, target = write_flir(tmp_path / "files", 9), tmp_path / "scene"
+    page = prepare(str(source), target, **PLAIN, poses=poses)
+    assert page == target / "report.md"
+    text = page.read_text()
+    assert "9 frames of 40x32 pixels" in text and "## Radiometry" in text and text.rstrip().endswith("9 of 9")
+    module = Colmap(root=str(target))
+    module.setup()
+    views = [*module.scene.train, *module.scene.test]
+    assert sorted(view.time_s for view in views) == [2.0 * i for i in range(-1, 8)]  # 0 is the first training frame
+    assert module.scene.notes["time_source"] == "frames.csv"
+    frame = next(f for f in read_frames(source) if f.time.second == 2)
+    view = next(view for view in views if view.frame.name == f"{frame.name}.tiff")
+    shown = module.scene.thermal_range.to_celsius(view.thermal[..., 0])
+    np.testing.assert_allclose(shown, frame.temperature(), atol=2e-3)
+
+
+def test_conditions_that_are_given_change_the_temperatures(tmp_path):
+    source = write_flir(tmp_path / "files", 2)
+    prepare(str(source), tmp_path / "a", **PLAIN)
+    prepare(str(source), tmp_path / "b", **{**PLAIN, "conditions": {"emissivity": 1.0, "distance_m": 0.0}})
+    a, b = (read_temperature(tmp_path / name / "images" / "IR_0000.tiff") for name in "ab")
+    assert np.abs(a - b).max() > 0.5
+
+
+def test_a_sequence_needs_no_more_than_a_frame_at_a_time(tmp_path):
+    prepare(str(write_sequence(tmp_path / "files" / "flight.seq").parent), tmp_path / "scene", **PLAIN)
+    assert len(list((tmp_path / "scene" / "images").glob("*.tiff"))) == 4
+
+
+def test_a_target_within_the_source_is_refused(tmp_path):
+    source = write_flir(tmp_path / "files", 2)
+    for target in (source, source / "scene"):
+        with pytest.raises(SceneError, match="give a folder outside of it"):
+            prepare(str(source), target, **PLAIN)
+
+
+def test_the_doctor_comes_first_and_sees_the_source(tmp_path):
+    seen = []
+
+    def doctor(folder):
+        seen.append(folder)
+        return Section("Findings", ["none"])
+
+    source = write_flir(tmp_path / "files", 2)
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, doctor=doctor)
+    assert seen == [source] and page.read_text().index("## Findings") < page.read_text().index("## The recording")
+
+
+def test_the_command_prepares_and_goes_on(tmp_path):
+    write_images(tmp_path / "files", {f"{i}.tiff": np.full((8, 8), 20.0 + i, np.float32) for i in range(3)})
+    command = [str(ROOT / "src" / "prepare.py"), "source=files", "target=scene", "conditions.emissivity=0.9"]
+    assert "3 frames, 3 of them written now" in succeeds(command, tmp_path)
+    assert "3 frames, 0 of them written now" in succeeds(command, tmp_path)
+    record = json.loads((tmp_path / "scene" / "images" / "1.json").read_text())
+    assert record["conditions"]["emissivity"] == {"value": 0.9, "from": "given", "standard_uncertainty": 0.02}
+    assert "give the folder" in succeeds([*command[:1], "source=files"], tmp_path, 1)

@@ -1,0 +1,68 @@
+import cv2
+import numpy as np
+import pytest
+from recordings import write_flir, write_images
+
+from heatsplat.preparation import report
+from heatsplat.preparation.conditions import Given, Uncertainty
+from heatsplat.preparation.frames import Reading, read_frames
+from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.writer import Writer
+
+
+def prepared(frames, target):
+    writer = Writer(target, Uncertainty(), keep_counts=False)
+    return [writer.write(frame)[0] for frame in frames]
+
+
+def test_conditions_stand_with_what_they_change_and_what_they_leave_unsure(tmp_path):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    records = prepared(frames, tmp_path / "scene")
+    section = report.radiometry(frames, records, Uncertainty())
+    text = "\n".join(section.lines)
+    assert "| emissivity | 0.95 | file |" in text and "| distance | 20 m | file |" in text
+    assert "**all, expanded (k = 2, 95 %)**" in text
+    middle = records[2]["uncertainty_c"]["combined"]
+    assert section.values["combined_c"][1] == pytest.approx(middle, rel=1e-2)
+
+
+def test_doubtful_statements_of_files_are_asked_about(tmp_path):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    records = prepared(frames, tmp_path / "scene")
+    window = [Given(window_transmission=0.8).settled(f) for f in frames]
+    of_file = [type(f)(**{**vars(f), "sources": {**f.sources, "window_transmission": "file"}}) for f in window]
+    asked = "If there was none, set conditions.window_transmission=1"
+    assert asked in "\n".join(report.radiometry(of_file, records, Uncertainty()).lines)
+    assert asked not in "\n".join(report.radiometry(window, records, Uncertainty()).lines)
+
+
+def test_pictures_show_steps_that_all_pixels_share(tmp_path):
+    image = np.tile(np.linspace(10, 20, 40, dtype=np.float32), (32, 1))
+    frames = read_frames(write_images(tmp_path / "files", {f"{i}.tiff": image + 3.0 * (i > 4) for i in range(9)}))
+    records = prepared(frames, tmp_path / "scene")
+    section = report.pictures(tmp_path / "scene", frames, records)
+    assert section.values["largest_step"] == pytest.approx(3.0, abs=1e-3)
+    for name in ("histograms", "over_time"):
+        picture = cv2.imread(str(tmp_path / "scene" / "report" / f"{name}.png"))
+        assert picture.shape[0] > 300 and picture.std() > 10
+        assert f"report/{name}.png" in "\n".join(section.lines)
+
+
+def test_greys_have_no_radiometry(tmp_path):
+    frames = read_frames(write_images(tmp_path / "files", {"a.png": np.arange(64, dtype=np.uint8).reshape(8, 8)}))
+    records = prepared(frames, tmp_path / "scene")
+    assert report.radiometry(frames, records, Uncertainty()) is None
+    assert "greys" not in "\n".join(report.recording(frames, records, []).lines)
+    assert report.pictures(tmp_path / "scene", frames, records).values["largest_step"] == 0
+
+
+def test_frames_of_one_temperature_have_a_histogram(tmp_path):
+    same = {f"{i}.tiff": np.full((8, 8), 20.0, np.float32) for i in range(2)}
+    frames = read_frames(write_images(tmp_path / "files", same), Reading(Meaning()))
+    section = report.pictures(tmp_path / "scene", frames, prepared(frames, tmp_path / "scene"))
+    assert section.values["median_span"] == 0
+
+
+def test_the_page_has_its_sections_in_order(tmp_path):
+    page = report.write_report(tmp_path / "scene", [report.Section("One", ["a"]), report.Section("Two", ["b"])])
+    assert page.read_text().index("## One") < page.read_text().index("## Two")

@@ -1,0 +1,184 @@
+"""viewer.html in a real browser: it loads, what it says agrees with the renderer, and the keyboard alone suffices."""
+
+import numpy as np
+import pytest
+from running import run
+from viewer.browser import open_browser, opened, wait_until
+
+from heatsplat.contracts import evenly_spread
+from heatsplat.runs.run import load
+from heatsplat.viewer.page import FILE
+
+pytest.importorskip("selenium", reason="selenium is not installed (pip install -e '.[dev]')")
+
+TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "threads=1", "optim.length_power=0")
+SETTINGS = ("method=etgs", "max_steps=120", "thermal.frequencies=6")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer") / "run"
+    run(folder, *TINY, *SETTINGS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    return load(folder / "checkpoints" / "last.ckpt")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    browser = open_browser()
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def page(browser, folder):
+    return opened(browser, folder / FILE)
+
+
+def pixels(page) -> np.ndarray:
+    """What the canvas shows, RGB of every eighth pixel or so."""
+    script = """viewer.frame(performance.now()); const gl = viewer.drawing.gl, c = gl.canvas;
+    const found = new Uint8Array(4 * c.width * c.height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, c.width, c.height, gl.RGBA, gl.UNSIGNED_BYTE, found);
+    return Array.from({length: Math.floor(found.length / 268)}, (_, i) => [0, 1, 2].map((k) => found[268 * i + k]));"""
+    return np.array(page.execute_script(script), dtype=float)
+
+
+def keys(page, *pressed):
+    page.execute_script("document.getElementById('canvas').focus()")
+    page.switch_to.active_element.send_keys(*pressed)
+
+
+def test_it_is_one_file_that_asks_for_nothing_else(folder):
+    text = (folder / FILE).read_text(encoding="utf-8")
+    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "") and "https://" not in text
+    assert "{{" not in text and "src=" not in text
+    assert (folder / FILE).stat().st_size < 3e6
+
+
+def test_it_loads_without_an_error_and_shows_the_scene(page):
+    assert page.execute_script("return viewer.errors") == []
+    assert [entry for entry in page.get_log("browser") if entry["level"] == "SEVERE"] == []
+    assert pixels(page).std(axis=0).max() > 20
+    assert "Gaussians" in page.find_element("id", "facts").text
+    assert "Worst error" in page.find_element("id", "notes").get_attribute("textContent")
+
+
+def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trained):
+    """A click where the centre of a pixel lies, against ``src/render.py``'s image; the cursor's value too."""
+    scene = trained.scene
+    place = 1
+    frame = scene.train.frames[evenly_spread(len(scene.train), 36)[place]]
+    start, end = min(scene.train.times_s), max(scene.train.times_s)
+    page.execute_script(f"viewer.probes = []; viewer.goTo({place}); viewer.frame(performance.now())")
+    height, width = frame.camera.height, frame.camera.width
+    points = [(int(width * x), int(height * y)) for x in (0.15, 0.35, 0.5, 0.65, 0.85) for y in (0.4, 0.7)]
+    click = """const [x, y] = arguments, v = viewer.view, c = document.getElementById('canvas'), box = c.getBoundingClientRect();
+    const ratio = c.width / box.width, at = {clientX: box.left + (x * v.scale + v.left) / ratio,
+      clientY: box.top + (y * v.scale + v.top) / ratio, pointerId: 1, button: 0, bubbles: true};
+    c.setPointerCapture = () => {};
+    viewer.probes = [];
+    c.dispatchEvent(new PointerEvent('pointerdown', at));
+    c.dispatchEvent(new PointerEvent('pointerup', at));
+    const probe = viewer.probes[0];
+    return probe && viewer.splats.seriesAt(probe.pixel, probe.layer, arguments[2]);"""
+    cursor = """const [x, y] = arguments, v = viewer.view;
+    const cx = Math.floor(x * v.scale + v.left), cy = Math.floor(y * v.scale + v.top);
+    return viewer.valueOf(viewer.drawing.read('first', cx, cy, 1, 1), 0);"""
+    times = [start, 0.4 * start + 0.6 * end, end]
+    found = [page.execute_script(click, x + 0.5, y + 0.5, times) for x, y in points]
+    for i, time_s in enumerate(times):
+        image = trained.render(frame, time_s, unseen="keep")
+        expected = [image[y, x].item() for x, y in points]
+        assert np.ptp(expected) > 1.0  # degrees: the points are not all alike
+        assert [values[i] for values in found] == pytest.approx(expected, abs=0.1)
+    page.execute_script(f"viewer.setTime({times[1]})")
+    page.execute_script(
+        "return new Promise((done) => setTimeout(done, 100)).then(() => viewer.frame(performance.now()))"
+    )
+    image = trained.render(frame, times[1], unseen="keep")
+    shown = [page.execute_script(cursor, x + 0.5, y + 0.5) for x, y in points]
+    smooth = [i for i, (x, y) in enumerate(points) if np.ptp(image[y - 1 : y + 2, x - 1 : x + 2].numpy()) < 1.0]
+    assert len(smooth) >= 4
+    for i in smooth:  # the cursor's pixel is the canvas's
+        x, y = points[i]
+        assert shown[i] == pytest.approx(image[y, x].item(), abs=0.3)
+
+
+def test_the_slider_changes_the_picture(page):
+    before = pixels(page)
+    slider = page.find_element("id", "time")
+    page.execute_script("arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider)
+    assert np.abs(pixels(page) - before).mean() > 2
+    assert page.find_element("id", "timeText").text
+
+
+def test_the_keyboard_alone_suffices(page):
+    state = lambda: page.execute_script(  # noqa: E731
+        "return [viewer.camera.centre.join(), viewer.state.time, viewer.state.other, viewer.state.map, viewer.probes.length,"
+        " document.documentElement.dataset.theme, viewer.state.playing, viewer.lastCamera, viewer.state.walk]"
+    )
+    page.execute_script("document.getElementById('canvas').focus(); viewer.probes = []")
+    seen = [state()]
+    steps = [
+        ("\ue012", 0), ("w", 0), (".", 1), ("b", 2), ("c", 3), ("\ue007", 4), ("t", 5), ("n", 7), ("o", 8),
+    ]  # fmt: skip
+    for key, changes in steps:
+        keys(page, key)
+        seen.append(state())
+        assert seen[-1][changes] != seen[-2][changes], key
+    keys(page, " ")
+    wait_until(page, "viewer.state.playing")
+    keys(page, " ")
+    assert state()[6] is False
+    keys(page, "h")
+    assert wait_until(page, "document.getElementById('keys').open")
+    page.switch_to.active_element.send_keys("\ue00c")  # Escape
+    assert wait_until(page, "!document.getElementById('keys').open")
+    reached = set()
+    for _ in range(40):
+        page.switch_to.active_element.send_keys("\ue004")  # Tab
+        reached.add(page.execute_script("return document.activeElement.id"))
+    assert {"canvas", "quantity", "other", "map", "low", "high", "auto", "run", "time", "play", "speed"} <= reached
+    assert page.execute_script("return viewer.errors") == []
+
+
+def test_everything_beside_it_draws(page):
+    others = page.execute_script("return [...document.getElementById('other').options].map((one) => one.value)")
+    assert {"nothing", "time", "truth", "recorded"} <= set(others)
+    page.execute_script("viewer.goTo(0, true)")
+    for other in others[1:]:
+        page.execute_script(f"viewer.choose({{other: '{other}', how: 'difference'}})")
+        difference = pixels(page)
+        page.execute_script("viewer.choose({how: 'swipe'})")
+        assert np.abs(pixels(page) - difference).mean() > 1, other
+    assert page.execute_script("return viewer.errors") == []
+
+
+def test_a_second_run_is_itself(page, folder):
+    page.find_element("id", "run").send_keys(str(folder / FILE))
+    wait_until(page, "viewer.run && viewer.run.scene.ready")
+    page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
+    values = np.array(page.execute_script("return viewer.sampled()"))
+    assert len(values) > 1000 and np.abs(values).max() < 0.01
+
+
+def test_narrow_screens_have_everything_too(folder):
+    browser = open_browser(500, 800)
+    try:
+        opened(browser, folder / FILE)
+        assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+        for name in ("canvas", "play", "time", "fold"):
+            box = browser.find_element("id", name).rect
+            width = browser.execute_script("return innerWidth")
+            assert box["width"] > 20 and box["x"] >= 0 and box["x"] + box["width"] <= width + 1, name
+        browser.find_element("id", "fold").click()
+        panel = browser.find_element("id", "panel")
+        assert panel.is_displayed() and browser.find_element("id", "quantity").is_displayed()
+    finally:
+        browser.quit()

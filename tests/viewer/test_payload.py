@@ -1,0 +1,58 @@
+"""The header and the arrays of a page, read back."""
+
+import base64
+import json
+import re
+import zlib
+
+import numpy as np
+import pytest
+import torch
+
+from heatsplat.viewer.page import page
+from heatsplat.viewer.payload import Block, _attribute, _small
+
+
+def back(block: bytes, place: dict) -> np.ndarray:
+    kind = np.dtype(f"<{place['type']}")
+    return np.frombuffer(block, kind, int(np.prod(place["shape"])), place["offset"]).reshape(place["shape"])
+
+
+def test_arrays_come_back_and_lie_where_any_type_may_start():
+    block = Block()
+    stored = [
+        (np.arange(3), "u1"),
+        (np.array([[0.5, -2.0]]), "f8"),
+        (torch.tensor([7.5]), "f4"),
+        (np.array([-3, 9]), "i2"),
+    ]
+    places = [block.add(values, kind) for values, kind in stored]
+    for (values, _), place in zip(stored, places, strict=True):
+        assert place["offset"] % 8 == 0
+        assert back(block.content, place).tolist() == np.asarray(values).tolist()
+
+
+def test_attributes_keep_their_values_and_name_their_unit():
+    block, values = Block(), torch.logspace(-2, 3, 1001)
+    told = _attribute("time_constant_h", values, block)
+    assert (told["label"], told["unit"], told["log"]) == ("time constant", "h", True)
+    found = 10 ** (told["low"] + back(block.content, told["values"]) / 65534 * (told["high"] - told["low"]))
+    assert found[2:-2] == pytest.approx(values.numpy()[2:-2], rel=1e-3)
+    plain = _attribute("wind_share", torch.linspace(0.2, 0.4, 50), Block())
+    assert (plain["unit"], plain["log"]) == ("", False)
+    assert _attribute("nothing", torch.full((4,), torch.nan), Block())["high"] == 1.0
+
+
+def test_small_images_are_means():
+    image = torch.arange(16.0).view(4, 4)
+    assert _small(image, (2, 2)).tolist() == [[2.5, 4.5], [10.5, 12.5]]
+    assert _small(image[..., None].expand(-1, -1, 3), (2, 2)).shape == (2, 2, 3)
+
+
+def test_a_page_holds_what_it_was_given_whatever_a_scene_is_called():
+    header = {"scene": "</script><b>", "method": "etgs"}
+    text = page(header, b"12345678")
+    found = re.search(r'id="header">(.*?)</script>', text, re.S)[1]
+    assert json.loads(found) == header and "<b>" not in text
+    packed = re.search(r'id="block">(.*?)</script>', text, re.S)[1]
+    assert zlib.decompress(base64.b64decode(packed)) == b"12345678"
