@@ -269,7 +269,7 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         time_s: seconds from the start of the record.
     """
     when = torch.tensor([time_s], dtype=torch.float64)
-    haze, gloss = scene.preset.haze, scene.preset.gloss
+    haze = scene.preset.haze
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
