@@ -81,6 +81,7 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)  # it would fill the screen
         search = Search(self, frames, target)
         search.copies()
         search.find_features()
