@@ -52,7 +52,7 @@ def find(material: Material) -> list[Finding]:
             min(1.0, max(px, 1.0) * slope / material.contrast) + 0.5 * float(1.0 - share[wrong].median()),
             f"In {len(bad)} of {len(wrong)} frames that were looked at, seven in ten points lie {px:.1f} pixels and more "
             f"from where the poses say, and {100 * float(share[wrong].median()):.0f} % are where they should be ({some(bad)}).",
-            "Check that names of images and poses belong together and that the lens is that of these images; else find poses "
+            "Check that names of images and poses belong together, and that no image is turned; else find poses "
             "anew: python src/prepare.py source=... target=...",
             bad,
         )
