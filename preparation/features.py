@@ -49,7 +49,7 @@ class Sift(Features):
         options = pycolmap.FeatureExtractionOptions(num_threads=1)
         options.sift.max_num_features, options.sift.peak_threshold = self.most, self.peak
         pycolmap.extract_features(
-            database, images, [name], pycolmap.CameraMode.PER_FOLDER, reader, options, pycolmap.Device.cpu
+            database, images, [name], pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
         )
 
     def match(self, database: Path, pairs: Sequence[tuple[str, str]], file: Path, seed: int) -> None:
@@ -76,7 +76,7 @@ class Aliked(Features):
     most: int = 2048
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
-        pycolmap.import_images(database, images, pycolmap.CameraMode.PER_FOLDER, [name], reader)
+        pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, [name], reader)
         grey = cv2.imread(str(images / name), cv2.IMREAD_GRAYSCALE)
         image = torch.from_numpy(grey).float()[None, None] / 255.0
         with torch.no_grad():

@@ -57,7 +57,7 @@ def test_two_frames_and_photos_that_are_missing_are_refused(tmp_path):
         search_of(tmp_path, 2)
     (tmp_path / "b").mkdir()
     with pytest.raises(SceneError, match="no photo"):
-        search_of(tmp_path / "b", 4, on="rgb")
+        search_of(tmp_path / "b", 4, by="rgb")
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ CLIPPED = 0.005  # share of pixels beyond the bounds
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
+MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
 
 
 def find(material: Material) -> list[Finding]:
@@ -68,7 +69,9 @@ def find(material: Material) -> list[Finding]:
 
 
 def _plateau(values: torch.Tensor) -> float:
-    return float((values == values.max()).double().mean()) if len(values) else 0.0
+    """Share of the pixels that have the largest value; 0 where so few do that chance explains it."""
+    count = int((values == values.max()).sum()) if len(values) else 0
+    return count / len(values) if count >= MIN_PLATEAU else 0.0
 
 
 CHECK = Check("bounds", "whether pixels fit their bounds, and whether images saturate", find)

@@ -13,6 +13,8 @@ MIN_FRAMES = 5
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
 OFF = 0.025  # of the width: how far photos may lie beside thermal images
+# Seconds, and share of the usual step between frames, by which clocks may differ; EXIF often has whole seconds.
+CLOCK_S, WHOLE_S, CLOCK_STEP = 0.2, 1.0, 0.1
 
 
 def find(material: Material) -> list[Finding]:
@@ -79,7 +81,8 @@ def _clock(material: Material) -> Finding | None:
     )
     usual = float(torch.tensor(sorted(material.times_s), dtype=torch.float64).diff().median())
     offset = float(apart.median())
-    if abs(offset) < max(0.5 * usual, 0.2):
+    whole = not any(time % 1.0 for time in (*material.times_s, *material.rgb_times_s))
+    if abs(offset) <= max(CLOCK_STEP * usual, WHOLE_S if whole else CLOCK_S):
         return None
     return Finding(
         "pairing",

@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from heatsplat.doctor.base import Check, Finding, Material, some
 
-BLURRED = 0.55  # of the sharpness of the frames around
+BLURRED = 0.7  # of the sharpness of the frames around
 CLEAR = 8.0  # contrast in noise from which sharpness can be told
 
 
