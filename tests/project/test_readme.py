@@ -152,7 +152,7 @@ def test_make_targets_exist():
     assert [target for target in re.findall(r"`?make (\w+)`?", TEXT) if f"make {target} " not in known] == []
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "study"])
+@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "export", "study"])
 def test_console_commands_are_installed(name):
     programs = [one for one in entry_points(group="console_scripts") if one.name == f"heatsplat-{name}"]
     if not programs:

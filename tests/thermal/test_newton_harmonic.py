@@ -358,7 +358,7 @@ def test_in_si_units_sources_are_counted_in_degrees_per_second():
 
     assert gains("ridge", penalty_units="si").l2 == pytest.approx(1e-5 / 64)
     assert gains("group", penalty_units="si").group == pytest.approx(1e-5 / 8)
-    with pytest.raises(SceneError, match="penalty_units=scene"):
+    with pytest.raises(SceneError, match="penalty_units=image"):
         gains("group", penalty_units="si", scene_data=scene(thermal_range=None))
 
 
@@ -433,7 +433,7 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
         ({"clip": "soft"}, "clip must be one of"),
         ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
         ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
-        ({"penalty_units": "kelvin"}, "penalty_units must be one of scene, si"),
+        ({"penalty_units": "kelvin"}, "penalty_units must be one of image, si"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )
