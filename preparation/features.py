@@ -125,12 +125,13 @@ class Aliked(Features):
         try:
             from kornia.feature import ALIKED, LightGlue
         except ImportError as error:
-            raise ImportError("poses/features=aliked needs kornia 0.9 or newer: pip install -U kornia") from error
+            raise ImportError("poses.features of ALIKED needs kornia 0.9 or newer: pip install -U kornia") from error
         folder = Path(torch.hub.get_dir()) / "checkpoints"  # where both look before they would ask the network
         if missing := [name for name in WEIGHTS if not (folder / name).is_file()]:
             raise SceneError(
                 f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {folder} (from the "
-                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses.features=sift"
+                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use "
+                "poses.features._target_=heatsplat.preparation.features.Sift"
             )
         return ALIKED.from_pretrained("aliked-n16", max_num_keypoints=self.most), LightGlue("aliked").eval()
 

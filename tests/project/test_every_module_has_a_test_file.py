@@ -78,7 +78,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 119  # modules; lower it when some go
+LONGEST = 130  # modules; lower it when some go
 
 
 def modules() -> list[str]:
