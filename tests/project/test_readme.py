@@ -122,6 +122,8 @@ def test_python_commands_run(command, trained, data, tmp_path):
         assert (tmp_path / "prepared" / "report.md").exists()
     elif "simplify.py" in command:
         assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+    elif "export.py" in command:
+        assert len(list((tmp_path / "done").glob("*.ply"))) == 1
     elif "view.py" in command:
         assert (tmp_path / "done" / "viewer.html").exists()
     else:

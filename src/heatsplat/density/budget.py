@@ -23,9 +23,7 @@ CURVES: dict[str, Callable[[float], float]] = {
     "concave": lambda x: 2 * x - x * x,
 }
 SCORES = ("error", "edge", "absgrad", "uniform")
-BLUR = (
-    1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; noise has weaker ones
-)
+BLUR = 1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; noise has weaker ones
 BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
 DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
 

@@ -27,6 +27,7 @@ PENALTIES = ("group", "ridge")
 REDUCTIONS = ("sum", "mean_over_gaussians")
 UNITS = ("image", "si")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
+SLOWEST = 100.0  # spans: time constants beyond this are shown as this
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
 
@@ -263,6 +264,18 @@ class NewtonHarmonic(ThermalModel):
             ids,
             splats.places("source_gains") if source else None,
         )
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Time constant C/h in seconds, at most ``SLOWEST`` spans, which no record tells from more; and with a source and a
+        range of temperatures the root mean square of the heating A/C, B/C, in °C per hour."""
+        values = {"time_constant_s": self.clock.span_s / query.rows(self._rate(splats)).clamp(min=1.0 / SLOWEST)}
+        if self.omega.numel() > 0 and self.range.bounds is not None:
+            ids = torch.arange(len(splats), device=self.omega.device) if query.ids is None else query.ids
+            rms = (splats["source_gains"].square().sum((1, 2)) / 2).sqrt()
+            heating = splats.dense("source_gains", rms, ids) * (3600.0 * self.range.bounds.span_k / self.clock.span_s)
+            factor = self._gain_factor(splats)
+            values["source_c_per_h"] = heating if factor is None else heating * factor[ids]
+        return values
 
     def effects(self) -> dict[str, dict]:
         ambient = "learned" if isinstance(self.ambient, nn.Parameter) else "fixed"
