@@ -105,7 +105,7 @@ def test_python_commands_run(command, trained, data, tmp_path):
         if "ablation=" in command:  # one seed
             words += ["hydra.sweeper.params={seed:'0'}"]
     elif "prepare.py" in command:
-        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared"]
+        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared", "poses=none"]  # of two frames
     elif "render.py" in command:
         words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
     else:
