@@ -93,10 +93,10 @@ SHARED = {  # what a method has of others
     "ravigs": (GAUSSIANS, ADAPTIVE, BOTH_PHOTOMETRIC),
     "srgs": (GAUSSIANS, ADAPTIVE, COLOUR),
     "supirgs": (GAUSSIANS, ADAPTIVE, COLOUR),
-    "thermal3dgs": (GAUSSIANS, ADAPTIVE),
+    "thermal3dgs": (GAUSSIANS, ADAPTIVE, DEFORMING_FIELD),
     "thermalgs": (GAUSSIANS, FROZEN, PHOTOMETRIC),
     "thermogs": (GAUSSIANS, FROZEN),
-    "ti3dgs": (GAUSSIANS, ADAPTIVE),
+    "ti3dgs": (GAUSSIANS, ADAPTIVE, DEFORMING_FIELD),
 }
 OWN = {
     "3dgs_ir": {
@@ -249,7 +249,6 @@ OWN = {
         f"{SUPIRGS_HF}.schedule.end": (0.95, "HF 65-95 %"),
     },
     "thermal3dgs": {
-        **DEFORMING_FIELD,
         "loss.terms.corner.term.weight": ("published", "train.py"),
         "sensor.parts.conduction.width": (1, "1x1 convolutions of one channel"),
         "sensor.parts.conduction.norm": ("columns", "F.normalize without a batch"),
@@ -289,7 +288,6 @@ OWN = {
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
     "ti3dgs": {
-        **DEFORMING_FIELD,
         "thermal.frames_per_cycle": (None, "Eq. 9"),
         "thermal.applies_to": ("harmonics", "Eq. 12"),
         "thermal.gauge": (0.0, "none"),
