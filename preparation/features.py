@@ -16,7 +16,6 @@ import torch
 
 from heatsplat.contracts import SceneError
 
-
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 
 
@@ -49,14 +48,20 @@ class Sift(Features):
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
         options = pycolmap.FeatureExtractionOptions(num_threads=1)
         options.sift.max_num_features, options.sift.peak_threshold = self.most, self.peak
-        pycolmap.extract_features(database, images, [name], pycolmap.CameraMode.PER_FOLDER, reader, options, pycolmap.Device.cpu)
+        pycolmap.extract_features(
+            database, images, [name], pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
+        )
 
     def match(self, database: Path, pairs: Sequence[tuple[str, str]], file: Path, seed: int) -> None:
         file.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         options = pycolmap.FeatureMatchingOptions(num_threads=1)
         options.sift.max_ratio = self.ratio
         pycolmap.match_image_pairs(
-            database, options, pycolmap.ImportedPairingOptions(match_list_path=file), verification(seed), pycolmap.Device.cpu
+            database,
+            options,
+            pycolmap.ImportedPairingOptions(match_list_path=file),
+            verification(seed),
+            pycolmap.Device.cpu,
         )
 
 
@@ -71,13 +76,18 @@ class Aliked(Features):
     most: int = 2048
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
-        pycolmap.import_images(database, images, pycolmap.CameraMode.PER_FOLDER, [name], reader)
+        pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, [name], reader)
         grey = cv2.imread(str(images / name), cv2.IMREAD_GRAYSCALE)
         image = torch.from_numpy(grey).float()[None, None] / 255.0
         with torch.no_grad():
             found = self._networks[0](image)[0]
         keypoints = found.keypoints.numpy() + 0.5  # kornia counts from the centre of the first pixel
-        np.savez(_descriptors(database, name), keypoints=found.keypoints.numpy(), descriptors=found.descriptors.numpy(), size=grey.shape)
+        np.savez(
+            _descriptors(database, name),
+            keypoints=found.keypoints.numpy(),
+            descriptors=found.descriptors.numpy(),
+            size=grey.shape,
+        )
         with pycolmap.Database.open(database) as opened:
             opened.write_keypoints(opened.read_image_with_name(name).image_id, keypoints.astype(np.float32))
 
@@ -99,7 +109,11 @@ class Aliked(Features):
         if min(len(one["keypoints"]), len(other["keypoints"])) < 2:
             return np.zeros((0, 2), np.uint32)
         sides = [
-            {"keypoints": s["keypoints"][None], "descriptors": s["descriptors"][None], "image_size": s["size"].flip(0)[None].float()}
+            {
+                "keypoints": s["keypoints"][None],
+                "descriptors": s["descriptors"][None],
+                "image_size": s["size"].flip(0)[None].float(),
+            }
             for s in (one, other)
         ]
         with torch.no_grad():
@@ -111,12 +125,13 @@ class Aliked(Features):
         try:
             from kornia.feature import ALIKED, LightGlue
         except ImportError as error:
-            raise ImportError("poses/features=aliked needs kornia 0.9 or newer: pip install -U kornia") from error
+            raise ImportError("poses.features of ALIKED needs kornia 0.9 or newer: pip install -U kornia") from error
         folder = Path(torch.hub.get_dir()) / "checkpoints"  # where both look before they would ask the network
         if missing := [name for name in WEIGHTS if not (folder / name).is_file()]:
             raise SceneError(
                 f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {folder} (from the "
-                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses.features=sift"
+                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use "
+                "poses.features._target_=heatsplat.preparation.features.Sift"
             )
         return ALIKED.from_pretrained("aliked-n16", max_num_keypoints=self.most), LightGlue("aliked").eval()
 

@@ -40,7 +40,7 @@ class FindPoses:
     scale and orientation are the reconstruction's own. One thread and one seed: the same frames give the same bits.
 
     Args:
-        on: "thermal" frames, or "rgb": the photos that belong to them; where the thermal camera stands beside the visible
+        by: "thermal" frames, or "rgb": the photos that belong to them; where the thermal camera stands beside the visible
             one is then calibrated on the way, from the thermal features.
         features: what finds and matches features.
         camera_model: of COLMAP, for each camera: SIMPLE_RADIAL, RADIAL, OPENCV, ...
@@ -58,7 +58,7 @@ class FindPoses:
     """
 
     features: Features
-    on: str = "thermal"
+    by: str = "thermal"
     camera_model: str = "SIMPLE_RADIAL"
     focal_px: float | None = None
     pixel_um: float = 12.0
@@ -72,7 +72,7 @@ class FindPoses:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_option("poses.on", self.on, SOURCES, SceneError)
+        check_option("poses.by", self.by, SOURCES, SceneError)
         check_option("poses.refine_focal", self.refine_focal, ("auto", True, False), SceneError)
 
     def __call__(self, frames: list[Frame], target: Path) -> Section:
@@ -81,6 +81,7 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)  # it would fill the screen
         search = Search(self, frames, target)
         search.copies()
         search.find_features()
@@ -95,13 +96,15 @@ class Search:
     def __init__(self, options: FindPoses, frames: Sequence[Frame], target: Path) -> None:
         self.options, self.target, self.work = options, target, target / WORK
         if len(frames) < 3:
-            raise SceneError(f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed")
+            raise SceneError(
+                f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed"
+            )
         index = ImageIndex(target / "images")
         self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
-        if options.on == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
+        if options.by == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
             raise SceneError(
-                f"poses.on=rgb: {len(lacking)} of {len(frames)} frames have no photo, such as {lacking[0]}; "
-                "give the folder of photos, or find poses.on=thermal"
+                f"poses=rgb: {len(lacking)} of {len(frames)} frames have no photo, such as {lacking[0]}; "
+                "give the folder of photos, or find poses=thermal"
             )
         self.copy_of = {name: f"thermal/{Path(name).with_suffix('.png').as_posix()}" for name in self.frames}
         self.name_of = {copy: name for name, copy in self.copy_of.items()}
@@ -116,7 +119,7 @@ class Search:
             stretch = Stretch([frame.pixels for frame in self.frames.values()], self.options.clip)
             for name in _progress(todo, "stretching"):
                 _write_png(images / self.copy_of[name], stretch(self.frames[name].pixels()))
-        if self.options.on == "rgb":
+        if self.options.by == "rgb":
             for name in _progress(list(self.frames), "copying photos"):
                 copy = images / self._photo(name)
                 if not copy.is_file():
@@ -126,14 +129,16 @@ class Search:
         """Features of all copies, in the database."""
         cameras = {"thermal/": self._thermal_focal()}
         names = list(self.name_of)
-        if self.options.on == "rgb":
+        if self.options.by == "rgb":
             cameras["rgb/"] = None
             names += [self._photo(name) for name in self.frames]
         reader = pycolmap.ImageReaderOptions(camera_model=self.options.camera_model)
         missing = set(names)
         if self.database.is_file():
             with pycolmap.Database.open(self.database) as database:
-                missing -= {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
+                missing -= {
+                    image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)
+                }
         todo = [name for name in names if name in missing]
         for name in _progress(todo, "finding features"):
             reader.existing_camera_id = self._camera_of(name)
@@ -143,7 +148,7 @@ class Search:
         with pycolmap.Database.open(self.database) as database:
             self._set_cameras(database, cameras)
             self._write_priors(database)
-            if self.options.on == "rgb":
+            if self.options.by == "rgb":
                 cameras = [
                     pycolmap.RigConfigCamera(ref_sensor=True, image_prefix="rgb/"),
                     pycolmap.RigConfigCamera(image_prefix="thermal/", cam_from_rig=pycolmap.Rigid3d()),
@@ -153,7 +158,7 @@ class Search:
     def match(self) -> None:
         """Matches of all pairs that may overlap, verified."""
         pairs = [(self.copy_of[a], self.copy_of[b]) for a, b in self.pairs()]
-        if self.options.on == "rgb":
+        if self.options.by == "rgb":
             pairs += [(self._photo(a), self._photo(b)) for a, b in self.pairs()]
         blocks = [pairs[i : i + PAIRS_AT_ONCE] for i in range(0, len(pairs), PAIRS_AT_ONCE)]
         for block in _progress(blocks, f"matching {len(pairs)} pairs"):
@@ -175,7 +180,9 @@ class Search:
         if places is not None:
             apart = np.linalg.norm(places[:, None] - places[None], axis=2)
             for i, row in enumerate(apart):
-                found |= {(min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j}
+                found |= {
+                    (min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j
+                }
         return [(names[i], names[j]) for i, j in sorted(found)]
 
     def map(self) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
@@ -188,7 +195,7 @@ class Search:
         refine = self.options.refine_focal
         options.ba_refine_focal_length = self._thermal_focal() is None if refine == "auto" else refine
         options.mapper.abs_pose_refine_focal_length = options.ba_refine_focal_length
-        if self.options.on == "rgb":
+        if self.options.by == "rgb":
             options.ba_refine_focal_length = True
         options.use_prior_position = self.origin is not None
         options.use_robust_loss_on_prior_position = True
@@ -240,13 +247,15 @@ class Search:
             )
         else:
             lines.append("World: scale and orientation of the reconstruction; no GPS that would tell them.")
-        if self.options.on == "rgb":
+        if self.options.by == "rgb":
             rig = next(iter(model.rigs.values()))
             sensor = camera.sensor_id
             pose = rig.sensor_from_rig(sensor)
             values["thermal_from_rgb"] = np.asarray(pose.matrix()).round(6).tolist()
             where = ", ".join(f"{x:.4g}" for x in pose.inverse().translation)
-            lines.append(f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward).")
+            lines.append(
+                f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward)."
+            )
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
         return Section("Poses", lines, values)
 
@@ -324,8 +333,12 @@ class Search:
         database.clear_pose_priors()
         for image in database.read_all_images():
             name = self.name_of.get(image.name)
-            if self.options.on == "rgb":
-                name = self.name_of.get(image.name.replace("rgb/", "thermal/", 1)) if image.name.startswith("rgb/") else None
+            if self.options.by == "rgb":
+                name = (
+                    self.name_of.get(image.name.replace("rgb/", "thermal/", 1))
+                    if image.name.startswith("rgb/")
+                    else None
+                )
             fix = None if name is None else _fix(self.frames[name])
             if fix is None:
                 continue
@@ -371,7 +384,9 @@ class Search:
             if features[copy] < FEW_FEATURES:
                 reason = f"only {features[copy]} features: too little contrast, or blurred"
             elif not partners[copy]:
-                reason = f"{features[copy]} features, but no other frame shows enough of them: no overlap, or changed heat"
+                reason = (
+                    f"{features[copy]} features, but no other frame shows enough of them: no overlap, or changed heat"
+                )
             elif copy in elsewhere:
                 reason = f"belongs to a group of {elsewhere[copy]} frames that nothing connects to the others"
             else:
@@ -385,7 +400,7 @@ class Search:
         return (
             f"no cameras could be found: frames have {np.median(thermal):.0f} features (median) and overlap with "
             f"{np.median([partners[copy] for copy in self.name_of]):.0f} others. More overlap between frames helps, and "
-            "photos of a camera beside (poses.on=rgb); or bring a sparse model or transforms.json of another tool"
+            "photos of a camera beside (poses=rgb); or bring a sparse model or transforms.json of another tool"
         )
 
 
@@ -451,4 +466,3 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
     return iter(track(items, what, transient=True)) if items else iter(())
-

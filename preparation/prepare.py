@@ -45,8 +45,9 @@ def prepare(
 ) -> Path:
     """Makes of a camera's files a scene that trains, and returns the path of its report.
 
-    The folder then has images/ (float32 TIFF in °C, each with a .json of all that is known of it), frames.csv (times, places),
-    temperature_bounds.json, report.md, and what ``poses`` adds. Nothing in ``source`` is changed.
+    The folder then has images/ (float32 TIFF in °C, each with a .json of all that is known of it), masks/ where pixels are
+    dead, frames.csv (times, places), temperature_bounds.json, report.md, and what ``poses`` adds. Nothing in ``source`` is
+    changed.
 
     Args:
         source: folder of the camera's files.
@@ -84,10 +85,12 @@ def prepare(
         records.append(record)
         fresh += written
     writer.finish(frames, records)
+    dead = writer.mask_dead_pixels(frames)
     log.info("%d frames, %d of them written now, the others were there", len(frames), fresh)
     frames = [replace(f, rgb=writer.photo_of(f)) if writer.photo_of(f).exists() else f for f in frames]
+    notes = [*found.notes, *([f"{dead} pixels of the detector are dead; masks/ leaves them out"] if dead else [])]
     parts = [
-        report.recording(frames, records, found.notes),
+        report.recording(frames, records, notes),
         report.radiometry(frames, records, uncertain),
         report.pictures(target, frames, records),
     ]

@@ -34,7 +34,10 @@ class Stretch:
     """
 
     def __init__(
-        self, loads: Sequence[Callable[[], np.ndarray]], clip: float = 3.0, percentiles: tuple[float, float] = (0.5, 99.5)
+        self,
+        loads: Sequence[Callable[[], np.ndarray]],
+        clip: float = 3.0,
+        percentiles: tuple[float, float] = (0.5, 99.5),
     ) -> None:
         sample = [loads[i]() for i in evenly_spread(len(loads), SAMPLE_FRAMES)]
         same = [frame for frame in sample if frame.shape == sample[0].shape]

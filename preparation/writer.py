@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, evenly_spread
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES
@@ -27,6 +27,7 @@ from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import write_csv
 from heatsplat.io.tiff import write_temperature
+from heatsplat.physics.defects import dead_pixels
 from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, measured_signal, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
@@ -34,6 +35,7 @@ from heatsplat.preparation.frame import Frame
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
 PARTIAL = ".partial"  # folder of what is being written
+DEAD_FRAMES = 8  # frames that dead pixels are judged from
 
 
 class Writer:
@@ -133,6 +135,18 @@ class Writer:
             parts = uncertainty_at(median, frame.calibration, frame.conditions, standard)
             record["uncertainty_c"] = {"at_c": median} | {n: x if np.isfinite(x) else None for n, x in parts.items()}
         return record
+
+    def mask_dead_pixels(self, frames: Sequence[Frame]) -> int:
+        """How many pixels of the detector are dead; masks/ leaves them out of every image (white counts)."""
+        few = [frames[i].pixels().astype(np.float32) for i in evenly_spread(len(frames), DEAD_FRAMES)]
+        if any(pixels.shape != few[0].shape for pixels in few):
+            return 0
+        dead = dead_pixels(torch.from_numpy(np.stack(few))).numpy()
+        if dead.any():
+            mask = cv2.imencode(".png", np.where(dead, 0, 255).astype(np.uint8))[1]
+            for frame in frames:
+                self._replace(self.target / "masks" / f"{self.image_of(frame).name}.png", mask)
+        return int(dead.sum())
 
     def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:
         """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""

@@ -15,7 +15,15 @@ from torch import Tensor
 
 from heatsplat.datamodules.formats.geodesy import latitude_longitude
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.synthetic_scene.film import Recording, Size, pixel_centres, expose, film, own_threads, pixel_rays
+from heatsplat.datamodules.synthetic_scene.film import (
+    Recording,
+    Size,
+    expose,
+    film,
+    own_threads,
+    pixel_centres,
+    pixel_rays,
+)
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.geometry.projection import look_at
 from heatsplat.physics.units import KELVIN_AT_0_C
@@ -58,8 +66,8 @@ class Field:
 def write_camera(recording: Recording, folder: Path, field: Field = Field(), seed: int = 0) -> None:  # noqa: B008
     """A folder ``thermal`` of 16-bit TIFF (1/100 K), and ``rgb`` of JPEG where there is a visible camera.
 
-    EXIF of each has its time with zone, camera, focal length, and where there is GPS its position. Names begin with T and
-    V and end alike.
+    EXIF of each has its time with zone, camera, focal length, and where there is GPS its position. Names end with _T
+    and _V.
     """
     count, height, width = recording.celsius.shape
     celsius = recording.celsius.astype(np.float64) + sawtooth(count, field)[:, None, None]
@@ -71,18 +79,20 @@ def write_camera(recording: Recording, folder: Path, field: Field = Field(), see
         counts = np.rint((celsius[frame] + KELVIN_AT_0_C) * COUNTS_PER_KELVIN).astype(np.uint16)
         when = field.start + timedelta(seconds=float(time_s))
         about = _exif(when, "Thermal 12", focal_mm, None if positions is None else positions[frame])
-        _saved(Image.fromarray(counts), folder / "thermal" / f"T{frame:04d}.tiff", exif=about)
+        _saved(Image.fromarray(counts), folder / "thermal" / f"frame_{frame:04d}_T.tiff", exif=about)
     if not field.rgb:
         return
     lens, rig = rgb_lens(recording.lens), rgb_from_thermal(field)
     rays = pixel_rays(lens, pixel_centres(lens))
     with own_threads():
         for frame, time_s in enumerate(recording.times_s):
-            _, color = expose(recording.scene, lens, rays, rig @ torch.from_numpy(recording.viewmats[frame]), float(time_s))
+            _, color = expose(
+                recording.scene, lens, rays, rig @ torch.from_numpy(recording.viewmats[frame]), float(time_s)
+            )
             when = field.start + timedelta(seconds=float(time_s) + field.rgb_clock_s)
             about = _exif(when, "Visible", lens.fx * PIXEL_MM, None if positions is None else positions[frame])
             pixels = (color.clamp(0, 1) * 255.0).round().to(torch.uint8).numpy()
-            _saved(Image.fromarray(pixels), folder / "rgb" / f"V{frame:04d}.jpg", exif=about, quality=95)
+            _saved(Image.fromarray(pixels), folder / "rgb" / f"frame_{frame:04d}_V.jpg", exif=about, quality=95)
 
 
 def sawtooth(frames: int, field: Field) -> np.ndarray:
@@ -113,7 +123,9 @@ def rgb_from_thermal(field: Field) -> Tensor:
     return pose
 
 
-def flight(size: Size, hour: float = 14.0, duration_s: float = 240.0, seed: int = 0, **camera: float | Sequence[float]) -> Recording:
+def flight(
+    size: Size, hour: float = 14.0, duration_s: float = 240.0, seed: int = 0, **camera: float | Sequence[float]
+) -> Recording:
     """The synthetic yard as a drone films it in one go: once and a half around it, from two heights.
 
     Args:

@@ -52,7 +52,6 @@ BODIES = {
 SHOWERS = ((18.5, 19.5, 2.0), (38.0, 38.7, 3.0), (70.0, 74.0, 1.5), (113.0, 114.0, 4.0), (140.0, 141.5, 2.0))
 """Start and end in hours of the record, and millimetres an hour."""
 MOST_DAYS = 7
-MIRRORING = 1e-3  # of light that a surface reflects; below, its mirror image is left out
 
 
 @dataclass(frozen=True)
@@ -120,30 +119,20 @@ class OutdoorTrueScene(OutdoorScene):
             found[:, column] = (kelvin[heat.patches] * heat.weights).sum(1) - KELVIN_AT_0_C
         return torch.where(heat.weights.sum(1, keepdim=True) > 0, found, self.preset.ambient_c)
 
-    def apparent(self, celsius: Tensor, points: Tensor, which: Tensor, sight: Tensor, time_s: float) -> Tensor:
-        """What a camera takes for the temperature [n]: emission, and the sky or a neighbour in the mirror."""
-        reflects = 1.0 - self.emissivity[which]
-        here = (reflects > MIRRORING).nonzero()[:, 0]
-        normals = self.normals(points[here], which[here])
-        onwards = sight[here] - 2.0 * (sight[here] * normals).sum(1, keepdim=True) * normals
-        met, others = self.beyond(points[here] + 1e-6 * normals, onwards)
-        when = torch.tensor([time_s], dtype=torch.float64)
-        around = STEFAN_BOLTZMANN * (self.celsius(self.heat_at(met, others), when)[:, 0] + KELVIN_AT_0_C) ** 4
-        around = torch.where(others < 0, self._sky_radiance(onwards[:, 2], time_s), around)
-        own = STEFAN_BOLTZMANN * (celsius + KELVIN_AT_0_C) ** 4
-        own[here] = (1 - reflects[here]) * own[here] + reflects[here] * around
-        return (own / STEFAN_BOLTZMANN) ** 0.25 - KELVIN_AT_0_C
+    def facing(self, points: Tensor, which: Tensor, directions: Tensor, when: Tensor) -> Tensor:
+        """As ``Scene.facing``; the sky is as warm as its radiance there says."""
+        sky = self._sky_celsius(directions[:, 2], float(when))
+        return torch.where(which < 0, sky, super().facing(points, which, directions, when))
 
-    def _sky_radiance(self, sine: Tensor, time_s: float) -> Tensor:
-        """π times the sky's radiance [n] in W/m² at a height above the horizon: a layer of air seen through its slant.
+    def _sky_celsius(self, sine: Tensor, time_s: float) -> Tensor:
+        """Temperature [n] of a black body as bright as the sky at a height above the horizon: air seen through its slant.
 
         Its optical depth is that at which the hemisphere has the long waves of the sky (diffusivity factor 1.66).
         """
         air = float(np.interp(time_s, self.sky.times_s, self.sky.air_k))
         waves = float(np.interp(time_s, self.sky.times_s, self.sky.long_waves_w_m2))
-        black = STEFAN_BOLTZMANN * air**4
-        depth = -math.log(max(1.0 - waves / black, 1e-6)) / 1.66
-        return black * (1.0 - torch.exp(-depth / sine.clamp(min=0.02)))
+        depth = -math.log(max(1.0 - waves / (STEFAN_BOLTZMANN * air**4), 1e-6)) / 1.66
+        return air * (1.0 - torch.exp(-depth / sine.clamp(min=0.02))) ** 0.25 - KELVIN_AT_0_C
 
     def how_solved(self) -> str:
         return (

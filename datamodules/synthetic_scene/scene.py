@@ -194,9 +194,13 @@ class Scene:
         normals = self.normals(on, surface)
         mirrored = sight[bright] - 2.0 * dot(sight[bright], normals)[:, None] * normals
         met, met_surface = self.first_hits(on + _OFF_SURFACE_M * normals, mirrored)
-        facing = self.celsius(self.heat_at(met, met_surface), when)[:, 0]
+        facing = self.facing(met, met_surface, mirrored, when)
         own, others = (_BAND.radiance(kelvin(t)) for t in (celsius[bright], facing))
         return _BAND.temperature(torch.lerp(others, own, self.emissivity[surface])) - KELVIN_AT_0_C
+
+    def facing(self, points: Tensor, which: Tensor, directions: Tensor, when: Tensor) -> Tensor:
+        """How warm mirrored rays [n, 3] find what they first meet, or the surroundings, in °C [n]; as ``first_hits`` has it."""
+        return self.celsius(self.heat_at(points, which), when)[:, 0]
 
     def grey_bodies(self, points: Tensor) -> dict[str, Tensor]:
         """Emissivity and reflectance [n] of the surface nearest to each of ``points`` [n, 3]."""

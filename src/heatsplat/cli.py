@@ -80,6 +80,7 @@ EXAMPLES = {
     "render": ("ckpt=outputs/.../checkpoints/last.ckpt trajectory=orbit time=600",),
     "simplify": ("ckpt=outputs/.../checkpoints/last.ckpt levels_c=[0.02,0.1]",),
     "view": ("ckpt=outputs/.../checkpoints/last.ckpt",),
+    "export": ("ckpt=outputs/.../checkpoints/last.ckpt what=ply time=600",),
     "study": ("study=frontier study.runs=outputs",),
     "prepare": ("source=/data/flight target=/data/my_scene",),
 }
@@ -318,6 +319,30 @@ def view(config: dict[str, Any], output_dir: Path) -> None:
 
 @_command
 @_job
+def export(config: dict[str, Any], output_dir: Path) -> None:
+    """Writes a checkpoint's scene at a moment as a file of another program: splats, points, map, mesh.
+
+    Raises:
+        SceneError: no format is chosen.
+    """
+    from heatsplat.contracts import SceneError
+    from heatsplat.export.files import write_files
+    from heatsplat.runs.run import load
+    from heatsplat.training.session import prepare_machine
+
+    if config.get("what") is None:
+        raise SceneError(f"which format? Give what=..., one of {', '.join(_options('what'))}")
+    prepare_machine(config["threads"])
+    form = build(config["what"])
+    trained = load(
+        config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
+    )
+    for path in write_files(trained.module, form, output_dir, config["time"], config["layer"]):
+        log.info("%s (%.1f MB)", path, path.stat().st_size / 1e6)
+
+
+@_command
+@_job
 def study(config: dict[str, Any], output_dir: Path) -> None:
     """Runs a study; its tables and pictures lie in the run's folder.
 
@@ -351,7 +376,7 @@ def prepare(config: dict[str, Any], output_dir: Path) -> None:
         prepare_machine(config["threads"])
         build(config["examination"], target=None if config["target"] is None else output_dir)
         return
-    if config["target"] is None or (config["source"] is None and config["correct"] is None):
+    if config["target"] is None or (config["source"] is None and config.get("correct") is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
     prepare_machine(config["threads"])
-    build(config["correct"] or config["preparation"], target=output_dir)
+    build(config.get("correct") or config["preparation"], target=output_dir)

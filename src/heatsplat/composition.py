@@ -34,7 +34,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
 
     Args:
         overrides: as the command line has them.
-        name: of the command: train | evaluate | render | simplify | view | study | prepare.
+        name: of the command: train | evaluate | render | simplify | view | export | study | prepare.
     """
     return plain(composed(overrides, name), overrides)
 

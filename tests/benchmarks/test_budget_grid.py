@@ -203,7 +203,7 @@ def test_caps_go_to_density_control(tmp_path, monkeypatch):
     settings = {"train": "train.py", "steps": [250], "caps": [8000], "decays": [1.0], "seeds": [0], "budgets": []}
     settings |= {"overrides": [], "curves": None}
     budget_grid.run(tmp_path / "study", scenes=["ti3dgs/haze"], **settings)
-    assert asked[0][-2:] == ["density.reset_every=null", "density.cap_max=8000"]
+    assert asked[0][-3:] == ["density.reset_every=null", "density.multiple=null", "density.cap_max=8000"]
 
 
 def test_curves_that_are_none_are_told_before_anything_is_trained(tmp_path, monkeypatch):

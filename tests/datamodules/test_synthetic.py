@@ -58,11 +58,13 @@ def tiny(preset: str) -> Synthetic:
     return Synthetic(scene=preset, size="tiny")
 
 
-# Presets whose images show surfaces as warm as they are; the others are in test_flaws.py and test_phenomena.py.
+# Presets whose images show surfaces as warm as they are, with points and texture that the tiny size can show; the others are in
+# test_flaws.py and test_phenomena.py.
 SEEN_AS_THEY_ARE = [
     name
     for name, preset in PRESETS.items()
     if not (preset.haze or preset.flaws or preset.gloss or any(one.emissivity < 1 for one in preset.surfaces))
+    and name not in ("weak_texture", "fine_texture")
 ]
 
 

@@ -14,7 +14,7 @@ CAMERA = Camera(torch.eye(4), torch.eye(3), width=20, height=10)
 
 
 def budget(**options) -> Budget:
-    return Budget(**{"multiple": None} | options)
+    return Budget(**{"multiple": None, "least": 0} | options)
 
 
 def make_cloud(policy, count: int, opacities: list[float] | None = None) -> Cloud:
@@ -96,6 +96,17 @@ def test_b_may_count_in_gaussians_of_the_start():
     for step in range(100):
         refine(policy, cloud, step)
     assert len(cloud) == 250
+
+
+@pytest.mark.parametrize("least, expected", [(90, 90), (10_000, 100)])
+def test_a_start_of_few_gaussians_does_not_decide(least, expected):
+    """One for two pixels of 20x10 at most."""
+    policy = budget(multiple=3, least=least)
+    policy.prepare(noisy_scene(0.02, 3), "thermal")
+    policy.initial_state(7, torch.device("cpu"))
+    assert policy.wanted == expected
+    policy.initial_state(60, torch.device("cpu"))
+    assert policy.wanted == 180
 
 
 def test_a_round_that_begins_anew_fills_up_to_the_same_b():

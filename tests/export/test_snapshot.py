@@ -2,20 +2,11 @@
 
 import pytest
 import torch
-from running import TINY
+from exported import started
 
-from heatsplat.composition import compose
 from heatsplat.export.snapshot import snapshot
-from heatsplat.runs.run import begin
 
 TOLERANCE = 0.05
-
-
-def started(folder, *overrides):
-    """A module at its first step, on a tiny scene."""
-    run = begin(compose([*TINY, "max_steps=10", *overrides]), folder)
-    run.module.attach(run.data.scene)
-    return run.module
 
 
 def shown(layer, time_s):

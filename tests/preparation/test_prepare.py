@@ -81,7 +81,13 @@ def test_the_doctor_comes_first_and_sees_the_source(tmp_path):
 
 def test_the_command_prepares_and_goes_on(tmp_path):
     write_images(tmp_path / "files", {f"{i}.tiff": np.full((8, 8), 20.0 + i, np.float32) for i in range(3)})
-    command = [str(ROOT / "src" / "prepare.py"), "source=files", "target=scene", "conditions.emissivity=0.9"]
+    command = [
+        str(ROOT / "src" / "prepare.py"),
+        "source=files",
+        "target=scene",
+        "conditions.emissivity=0.9",
+        "poses=none",
+    ]
     assert "3 frames, 3 of them written now" in succeeds(command, tmp_path)
     assert "3 frames, 0 of them written now" in succeeds(command, tmp_path)
     record = json.loads((tmp_path / "scene" / "images" / "1.json").read_text())

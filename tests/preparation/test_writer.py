@@ -102,3 +102,15 @@ def test_a_frame_without_any_temperature_is_told_and_breaks_nothing(tmp_path):
     dark = replace(frames[0], load=lambda: np.zeros((32, 40), np.uint16))  # below the calibration
     records, _ = written([dark, *frames[1:]], tmp_path / "scene")
     assert records[0]["quantiles"] is None and records[0]["unknown_pixels"] == 32 * 40
+
+
+def test_dead_pixels_are_masked_in_every_image_and_sound_ones_are_not(tmp_path):
+    scene = np.random.default_rng(0).normal(20.0, 0.05, (4, 24, 32)).astype(np.float32)
+    scene[:, 5, 7], scene[:, 20, 30] = 30.0, 10.0
+    frames = read_frames(write_images(tmp_path / "files", {f"{i}.tiff": image for i, image in enumerate(scene)}))
+    writer = Writer(tmp_path / "scene", Uncertainty(), False)
+    assert writer.mask_dead_pixels(frames) == 2
+    for frame in frames:
+        mask = cv2.imread(str(tmp_path / "scene" / "masks" / f"{frame.name}.tiff.png"), cv2.IMREAD_GRAYSCALE)
+        assert np.argwhere(mask != 255).tolist() == [[5, 7], [20, 30]] and mask.shape == (24, 32)
+    assert writer.mask_dead_pixels(frames[:3]) == 0  # too few to tell

@@ -25,11 +25,22 @@ ALLOWED = {
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat", "viewer"},
-    "export": {"contracts", "physics", "renderers", "shots"},
+    "export": {"contracts", "geometry", "io", "physics", "renderers", "shots"},
     "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},
     "doctor": {"contracts", "effects", "io", "physics"},
-    "runs": {"contracts", "composition", "doctor", "effects", "geometry", "io", "renderers", "shots", "splats", "training"},
+    "runs": {
+        "contracts",
+        "composition",
+        "doctor",
+        "effects",
+        "geometry",
+        "io",
+        "renderers",
+        "shots",
+        "splats",
+        "training",
+    },
     "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
@@ -44,7 +55,7 @@ ALLOWED = {
         "kernels",
     },  # fmt: skip
     "shots": {"contracts", "geometry", "io"},
-    "cli": {"contracts", "composition", "runs", "io", "training", "shots", "studies", "viewer"},
+    "cli": {"contracts", "composition", "export", "runs", "io", "training", "shots", "studies", "viewer"},
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
     "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
 }

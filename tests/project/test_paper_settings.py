@@ -66,6 +66,15 @@ BOTH_PHOTOMETRIC = {
 }
 FROZEN = {key: value for key, value in ADAPTIVE.items() if not key.endswith("stop")}
 
+DEFORMING_FIELD = {  # the network of Thermal3D-GS's code, which TI-3DGS's is read as
+    "thermal.width": (256, "W"),
+    "thermal.depth": (8, "D"),
+    "thermal.skip": (5, "after index 4"),
+    "thermal.positions": ("world", "xyz as it is"),
+    "thermal.time": ("index", "fid / (N - 1)"),
+    "thermal.exponent_max": (None, "no bound"),
+    "thermal.emission.sh_degree": (3, "sh_degree"),
+}
 SHARED = {  # what a method has of others
     "3dgs": (GAUSSIANS, ADAPTIVE, COLOUR, PHOTOMETRIC),
     "3dgs_ir": (GAUSSIANS, ADAPTIVE, BOTH_IMAGES),
@@ -84,10 +93,10 @@ SHARED = {  # what a method has of others
     "ravigs": (GAUSSIANS, ADAPTIVE, BOTH_PHOTOMETRIC),
     "srgs": (GAUSSIANS, ADAPTIVE, COLOUR),
     "supirgs": (GAUSSIANS, ADAPTIVE, COLOUR),
-    "thermal3dgs": (GAUSSIANS, ADAPTIVE),
+    "thermal3dgs": (GAUSSIANS, ADAPTIVE, DEFORMING_FIELD),
     "thermalgs": (GAUSSIANS, FROZEN, PHOTOMETRIC),
     "thermogs": (GAUSSIANS, FROZEN),
-    "ti3dgs": (GAUSSIANS, ADAPTIVE),
+    "ti3dgs": (GAUSSIANS, ADAPTIVE, DEFORMING_FIELD),
 }
 OWN = {
     "3dgs_ir": {
@@ -240,13 +249,6 @@ OWN = {
         f"{SUPIRGS_HF}.schedule.end": (0.95, "HF 65-95 %"),
     },
     "thermal3dgs": {
-        "thermal.width": (256, "W"),
-        "thermal.depth": (8, "D"),
-        "thermal.skip": (5, "after index 4"),
-        "thermal.positions": ("world", "xyz as it is"),
-        "thermal.time": ("index", "fid / (N - 1)"),
-        "thermal.exponent_max": (None, "no bound"),
-        "thermal.emission.sh_degree": (3, "sh_degree"),
         "loss.terms.corner.term.weight": ("published", "train.py"),
         "sensor.parts.conduction.width": (1, "1x1 convolutions of one channel"),
         "sensor.parts.conduction.norm": ("columns", "F.normalize without a batch"),
@@ -286,13 +288,6 @@ OWN = {
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
     "ti3dgs": {
-        "thermal.width": (256, "W"),
-        "thermal.depth": (8, "D"),
-        "thermal.skip": (5, "after index 4"),
-        "thermal.positions": ("world", "xyz as it is"),
-        "thermal.time": ("index", "fid / (N - 1)"),
-        "thermal.exponent_max": (None, "no bound"),
-        "thermal.emission.sh_degree": (3, "sh_degree"),
         "thermal.frames_per_cycle": (None, "Eq. 9"),
         "thermal.applies_to": ("harmonics", "Eq. 12"),
         "thermal.gauge": (0.0, "none"),

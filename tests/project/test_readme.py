@@ -105,7 +105,7 @@ def test_python_commands_run(command, trained, data, tmp_path):
         if "ablation=" in command:  # one seed
             words += ["hydra.sweeper.params={seed:'0'}"]
     elif "prepare.py" in command:
-        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared"]
+        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared", "poses=none"]  # of two frames
     elif "render.py" in command:
         words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
     else:
@@ -122,6 +122,8 @@ def test_python_commands_run(command, trained, data, tmp_path):
         assert (tmp_path / "prepared" / "report.md").exists()
     elif "simplify.py" in command:
         assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+    elif "export.py" in command:
+        assert len(list((tmp_path / "done").glob("*.ply"))) == 1
     elif "view.py" in command:
         assert (tmp_path / "done" / "viewer.html").exists()
     else:
@@ -152,7 +154,7 @@ def test_make_targets_exist():
     assert [target for target in re.findall(r"`?make (\w+)`?", TEXT) if f"make {target} " not in known] == []
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "study"])
+@pytest.mark.parametrize("name", ["train", "evaluate", "render", "simplify", "view", "export", "study"])
 def test_console_commands_are_installed(name):
     programs = [one for one in entry_points(group="console_scripts") if one.name == f"heatsplat-{name}"]
     if not programs:

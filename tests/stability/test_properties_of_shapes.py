@@ -91,9 +91,10 @@ def test_gaussians_of_any_shape_have_a_sound_image(seed, a, b, c, slope, depth):
     assert (found.compensation >= 0).all() and (found.compensation <= 1 + 1e-5).all()
     sum(x.sum() for x in (found.whitening[:, 0], found.whitening[:, 2], found.compensation)).backward()
     assert leaves.grad.isfinite().all()
-    torch.testing.assert_close(found.variances.double(), truth.variances, rtol=2e-5, atol=0)
-    # A width seen from its edge depends on the last digits of the rotation: they are what float32 lacks.
+    # A width seen from its edge or its end depends on the last digits of the rotation: they are what float32 lacks.
     tilt = max(a, b, c) / depth * 500 * 1e-6
+    error = (found.variances.double() - truth.variances).abs()
+    assert (error <= 2e-5 * truth.variances + tilt * truth.variances.sqrt()).all()
     exact = 1 / truth.whitening[:, 0]
     assert ((1 / found.whitening[:, 0].double() - exact).abs() <= 1e-3 * exact + tilt).all()
 

@@ -104,7 +104,9 @@ def test_without_parts_it_is_the_state_itself(state):
     assert [f"state.{name}" for name, _ in alone.named_buffers()] == [n for n, _ in composed.named_buffers()]
     assert operators(composed, splats) == operators(alone, splats)
     assert composed.cost == alone.cost and composed.effects() == alone.effects()
-    assert composed.regularisers(splats) == alone.regularisers(splats) and composed.attributes(splats, query()) == {}
+    assert composed.regularisers(splats) == alone.regularisers(splats)
+    told, expected = composed.attributes(splats, query()), alone.attributes(splats, query())
+    assert list(told) == list(expected) and all(torch.equal(told[name], expected[name]) for name in told)
 
 
 @pytest.mark.parametrize("state", STATES)

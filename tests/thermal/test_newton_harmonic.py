@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.density.ops import Cloud
 from heatsplat.physics.relaxation import temperature
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
@@ -358,7 +359,7 @@ def test_in_si_units_sources_are_counted_in_degrees_per_second():
 
     assert gains("ridge", penalty_units="si").l2 == pytest.approx(1e-5 / 64)
     assert gains("group", penalty_units="si").group == pytest.approx(1e-5 / 8)
-    with pytest.raises(SceneError, match="penalty_units=scene"):
+    with pytest.raises(SceneError, match="penalty_units=image"):
         gains("group", penalty_units="si", scene_data=scene(thermal_range=None))
 
 
@@ -390,6 +391,26 @@ def test_a_step_moves_the_temperature_as_much_whatever_the_number_of_harmonics()
     sizes = [item.initial.shape[2] for item in rates]
     assert sizes[0] < sizes[1] < sizes[2]
     assert [item.lr * size for item, size in zip(rates, sizes, strict=True)] == pytest.approx([0.16] * 3)
+
+
+@pytest.mark.parametrize("param", ["rate", "faithful"])
+def test_what_it_learned_is_told_in_seconds_and_degrees_per_hour(param):
+    """Of a body driven by one wave: dT/dt = -(T - T_a) / tau + a sin(wt), a times the root of a half."""
+    model, splats = ready(param=param, dtype=torch.float64)
+    with torch.no_grad():
+        splats["source_gains"].zero_()
+        splats["source_gains"][2, 0, 1] = 0.4
+        splats["log_rate" if param == "rate" else "log_conductance"][:] = math.log(5.0)
+        splats["log_rate" if param == "rate" else "log_conductance"][1] = -50.0
+        if param == "faithful":
+            splats["log_capacity"][:] = math.log(2.0)
+    told = model.attributes(splats, Query(torch.tensor([2, 1])))
+    capacity, span_s = (2.0 if param == "faithful" else 1.0), model.clock.span_s
+    assert told["time_constant_s"].tolist() == pytest.approx([capacity * span_s / 5.0, 100.0 * span_s])
+    per_span = 0.4 / capacity / 2**0.5 * RANGE.span_k
+    assert told["source_c_per_h"].tolist() == pytest.approx([per_span * 3600.0 / span_s, 0.0])
+    Cloud(splats).drop("source_gains", torch.arange(len(splats)) != 2, {})
+    assert model.attributes(splats, Query(None))["source_c_per_h"].count_nonzero() == 1
 
 
 @pytest.mark.parametrize("log_rate", [math.log(1e-30), -1e4, 1e4])
@@ -433,7 +454,7 @@ def test_a_checkpoint_carries_grid_range_span_and_ambient():
         ({"clip": "soft"}, "clip must be one of"),
         ({"penalty": "lasso"}, "penalty must be one of group, ridge"),
         ({"penalty_reduction": "mean"}, "penalty_reduction must be one of sum, mean_over_gaussians"),
-        ({"penalty_units": "kelvin"}, "penalty_units must be one of scene, si"),
+        ({"penalty_units": "kelvin"}, "penalty_units must be one of image, si"),
         ({"ambient": "guess"}, "ambient must be measured, learned or a number"),
     ],
 )

@@ -22,6 +22,7 @@ from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.radiative import Radiative
 from heatsplat.thermal.reflection import Reflection
 from heatsplat.thermal.static import Static
+from heatsplat.thermal.through_air import ThroughAir
 from heatsplat.thermal.time_mlp import TimeMlp
 from heatsplat.thermal.wrapper import Wrapper
 
@@ -101,6 +102,7 @@ AROUND = {
     "Composed": lambda inner: Composed(inner, {"reflection": Reflection()}),
     "Composed with a companion": lambda inner: Composed(inner, companion=Static(channels=3, modality="rgb")),
     "Radiative": Radiative,
+    "ThroughAir": lambda inner: ThroughAir(inner, Attenuation()),
     "two of them": lambda inner: ImagingField(Conducting(inner, neighbours=2)),
 }
 
@@ -166,7 +168,8 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     clauses = [type(one).inseparable for one in model.modules() if isinstance(one, Wrapper)]  # from the outside in
     assert model.inseparable == next(filter(None, [*clauses, probe.inseparable]))
     assert model.geometry(splats, QUERY) is MOVED
-    assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
+    if not isinstance(model, ThroughAir):  # whose surfaces are warmer than they are seen
+        assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
     model.features(splats, QUERY)
     assert model.regularisers(splats)["probe/term"].grad_fn is not None
     assert list(model.rows_to_drop(splats, 3)) == [DROPPED]

@@ -12,7 +12,7 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
-def open_browser(width: int = 1100, height: int = 720):
+def open_browser(width: int = 800, height: int = 560):
     """A driver of Chromium. Skips the test where browser or driver is missing."""
     from selenium import webdriver
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytorch_lightning as pl
 
 from heatsplat.viewer.page import FILE, write_viewer
+
+log = logging.getLogger("heatsplat")
 
 
 class ViewerPage(pl.Callback):
     """Writes viewer.html at the end of the test: the trained scene in one file, to look at in a browser, offline."""
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        write_viewer(module, module.output_dir / FILE)
+        path = write_viewer(module, module.output_dir / FILE)
+        log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)

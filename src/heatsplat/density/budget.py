@@ -23,9 +23,7 @@ CURVES: dict[str, Callable[[float], float]] = {
     "concave": lambda x: 2 * x - x * x,
 }
 SCORES = ("error", "edge", "absgrad", "uniform")
-BLUR = (
-    1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; those of noise are weaker then
-)
+BLUR = 1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; noise has weaker ones
 BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
 DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
 
@@ -33,7 +31,8 @@ DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and 
 class Budget(DensityControl):
     """Splits where the image is wrong until there are exactly B Gaussians, and removes those that show nothing.
 
-    B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start.
+    B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start. A start of few Gaussians says
+    little of what a scene needs: B is at least ``least``, or one for two pixels of a training image where that is less.
 
     The score of a Gaussian is the error that its pixels have beyond the noise of the camera, weighted by how much of each
     pixel it is, Σ_v Σ_p w max(e - floor noise, 0), over the last ``views`` steps before an event (the sampler shows each
@@ -57,6 +56,7 @@ class Budget(DensityControl):
         every: steps between events.
         cap_max: never more Gaussians than this.
         multiple: B in Gaussians of the start; None: B is ``cap_max``.
+        least: B of images of any size where the start has few Gaussians.
         score: "error", "edge" (the Laplacian of the blurred training images, in place of the error: Improved-GS), "absgrad"
             (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
         curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
@@ -80,6 +80,7 @@ class Budget(DensityControl):
         every: int = 500,
         cap_max: int = 100_000,
         multiple: float | None = 3.0,
+        least: int = 10_000,
         score: str = "error",
         curve: str = "linear",
         views: int = 10,
@@ -95,15 +96,17 @@ class Budget(DensityControl):
         check_option("density.curve", curve, CURVES)
         if min(every, cap_max, views) < 1:
             raise ValueError(f"density.every, cap_max and views must be at least 1, got {every}, {cap_max} and {views}")
-        if multiple is not None and not multiple > 0:
-            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
+        if (multiple is not None and not multiple > 0) or least < 0:
+            raise ValueError(
+                f"density.multiple must be above 0, or null, and least not negative, got {multiple} and {least}"
+            )
         if not 0 < keep <= 1 or min(floor, least_pixels, noise or 0.0) < 0:
             raise ValueError(
                 "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
                 f"got {keep}, {floor}, {noise} and {least_pixels}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
-        self.multiple, self.wanted = multiple, math.inf
+        self.multiple, self.least, self.wanted = multiple, least, math.inf
         self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
         self.absgrad = score == "absgrad"
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
@@ -112,8 +115,10 @@ class Budget(DensityControl):
         self.steps_of_pass = 1
 
     def prepare(self, scene: SceneData, modality: str) -> None:
-        """Takes the number of training views and, unless it is given, their noise (that of the first modality)."""
+        """Takes the number of training views, their pixels and, unless given, their noise (that of the first modality)."""
         self.steps_of_pass = len(scene.train)
+        pixels = min(frame.camera.width * frame.camera.height for frame in scene.train.frames)
+        self.least = min(self.least, pixels // 2)
         if self.noise is None and self.floor > 0:
             self.noise = noise_of_views(scene.train, modality)
             if self.noise <= MIN_NOISE:
@@ -127,7 +132,7 @@ class Budget(DensityControl):
         """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
         "shown" (pixels) and "seen" (views) for removal."""
         if self.multiple is not None:
-            self.wanted = round(self.multiple * count)
+            self.wanted = max(round(self.multiple * count), self.least)
         return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
 
     # When ------------------------------------------------------------------------------------------------------------

@@ -80,7 +80,9 @@ class Material:
     @cached_property
     def contrast(self) -> float:
         """Standard deviation of what the images show."""
-        spread = torch.stack([self.known(f).std() for f in range(len(self.images))]) if len(self.images) else torch.zeros(1)
+        spread = (
+            torch.stack([self.known(f).std() for f in range(len(self.images))]) if len(self.images) else torch.zeros(1)
+        )
         return max(float(spread.median()), self.noise, 1e-9)
 
     @cached_property

@@ -23,7 +23,8 @@ log = logging.getLogger("heatsplat")
 FINDINGS_FILE = "doctor.json"
 
 CHECKS: tuple[Check, ...] = tuple(
-    import_module(f"{checks.__name__}.{name}").CHECK for name in sorted(module.name for module in iter_modules(checks.__path__))
+    import_module(f"{checks.__name__}.{name}").CHECK
+    for name in sorted(module.name for module in iter_modules(checks.__path__))
 )
 
 

@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import evenly_spread
 from heatsplat.effects.observations import MAX_IN_FRONT, Observations
+from heatsplat.geometry.surfaces import on_the_side_of, plane_axes
 
 NEIGHBOURS = 8
 MIN_POINTS = 12  # points below which no surface can be told
@@ -19,10 +20,6 @@ def normals(obs: Observations) -> Tensor | None:
     if tracks is None or obs.still or len(points) < MIN_POINTS:
         return None
     points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
-    near = torch.cdist(tracks.points, points).topk(min(NEIGHBOURS + 1, len(points)), largest=False).indices
-    around = points[near]
-    around = around - around.mean(1, keepdim=True)
-    _, axes = torch.linalg.eigh(around.mT @ around)
-    normal = axes[..., 0]
+    axes, _ = plane_axes(points, tracks.points, NEIGHBOURS + 1)
     seen = functional.normalize((tracks.directions * tracks.weights[..., None]).sum(1), dim=1)
-    return torch.where((normal * seen).sum(1, keepdim=True) < 0, -normal, normal)
+    return on_the_side_of(axes[..., 2], seen)

@@ -19,7 +19,8 @@ TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
 TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
 VIEWS = 6  # training cameras over which what depends on the view is averaged
 TIMES = 257  # samples of a quantity over time at most
-TRUTH_TIMES = 65  # the same of the truth, which costs much more to ask for
+FEW_TIMES = 65  # the same of what costs much to ask for: the truth of a scene, and models for which
+WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
 TABLE = 257  # entries of a table of temperatures
 
 
@@ -105,7 +106,7 @@ def snapshot(module: Any) -> Snapshot:
 
     def blended(values: Tensor) -> Tensor:
         """Blended values [N] of image values [N, C]."""
-        return module.composite.encode(values, channels)[:, :channels].mean(1)
+        return module.composite.encode(values, channels)[:, :channels].mean(1).nan_to_num()
 
     cameras = [scene.train.frames[i] for i in evenly_spread(len(scene.train), VIEWS)]
     looks = torch.stack([emitted(seen_at(frame, middle)) for frame in cameras])
@@ -132,18 +133,19 @@ def snapshot(module: Any) -> Snapshot:
 
     slope = _slope(blended, to_unit, channels)
     surface = _surface(module, blended, kept) if span is not None else None
-    clipped = surface is not None and _alike(lambda time: surface(time).clamp(0, 1), camera, span, tolerance / slope)
+    clipped = surface is not None and _alike(_inside(surface), camera, span, tolerance / slope)
     sent = surface if clipped else camera
-    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope), clipped=clipped)]
-    if surface is not None and not clipped and not _alike(surface, camera, span, tolerance / slope):
-        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope))
+    most = int(min(TIMES, max(FEW_TIMES, WORK / (max(module.thermal.cost, 1) * len(means) * len(cameras)))))
+    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope, most), clipped=clipped)]
+    if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
+        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope, most))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
-        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, TRUTH_TIMES))
+        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, FEW_TIMES))
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
     colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
-    attributes = {} if middle is None else module.attributes(seen_at(first, middle))
+    attributes = module.attributes(seen_at(first, middle))
     return Snapshot(
         means[kept].float().cpu(),
         torch.nn.functional.normalize(quats[kept].float(), dim=1).cpu(),
@@ -186,6 +188,11 @@ def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -
     return to_unit / (TABLE - 1) / steps.min().item()
 
 
+def _inside(values_at: Callable) -> Callable:
+    """A quantity where the image can show it."""
+    return lambda time: values_at(time).clamp(0, 1)
+
+
 def _alike(one: Callable, other: Callable, span: tuple[float, float], tolerance: float) -> bool:
     """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
     moments = (span[0] + share * (span[1] - span[0]) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
@@ -199,7 +206,7 @@ def _layer(
     span: tuple[float, float] | None,
     tolerance: float,
     slope: float,
-    most_times: int = TIMES,
+    most_times: int,
 ) -> Layer:
     if span is None:
         basis = constant_basis(values_at(None).cpu())

@@ -7,8 +7,11 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera
 
-REACH = 2  # pixels to either side over which a slope is taken: depth maps of Gaussians are rough from one to the next
-BREAK = 0.05  # of 1 / depth, which is linear over the image of a plane: what bends more over the reach is an edge
+REACH = (
+    20  # a plane is fitted over the shorter side of the image / REACH to either side: depth maps of Gaussians are rough
+)
+LEAST = 3  # pixels to either side, in small images
+BREAK = 0.05  # of 1 / depth, root mean square from that plane: what bends more has an edge in it
 
 
 def rays(camera: Camera) -> Tensor:
@@ -28,26 +31,36 @@ def distances(camera: Camera, depth: Tensor) -> Tensor:
 def cosines(camera: Camera, depth: Tensor) -> Tensor:
     """Cosine [H, W] of the angle between the line of sight and the surface's normal, in [0, 1]; NaN where it is not known.
 
-    The normal is that of the plane through the points ``REACH`` pixels to the left and right and above and below.
+    One over the depth is linear over the image of a plane, 1/z = n r for the plane n x = 1 and the ray r of a pixel; so the
+    normal n is fitted to it by least squares over a window. Where the window has an edge or an open pixel it is not known.
 
     Args:
         depth: [H, W] camera z, infinite where there is no surface.
     """
-    sight = rays(camera)
-    points = sight * depth.double()[..., None]
     found = torch.full(depth.shape, torch.nan, dtype=torch.float64)
-    if min(depth.shape) <= 2 * REACH:
+    reach = max(LEAST, min(depth.shape) // REACH)
+    if min(depth.shape) <= 2 * reach:
         return found
-    inner, r = slice(REACH, -REACH), REACH
-    right = points[inner, 2 * r :] - points[inner, : -2 * r]
-    down = points[2 * r :, inner] - points[: -2 * r, inner]
-    normal = torch.linalg.cross(right, down)
-    view = torch.nn.functional.normalize(sight[inner, inner], dim=-1)
-    cosine = (torch.nn.functional.normalize(normal, dim=-1) * view).sum(-1).abs()
-    inverse = 1.0 / depth.double()
-    middle = inverse[inner, inner]
-    bend_x = inverse[inner, 2 * r :] + inverse[inner, : -2 * r] - 2 * middle
-    bend_y = inverse[2 * r :, inner] + inverse[: -2 * r, inner] - 2 * middle
-    known = normal.isfinite().all(-1) & (torch.maximum(bend_x.abs(), bend_y.abs()) < BREAK * middle)
-    found[inner, inner] = torch.where(known, cosine.clamp(0.0, 1.0), torch.nan)
+    steps = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    ones, inverse = torch.ones_like(steps), 1.0 / depth.double()
+
+    def sums(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Sums over windows, weighted by rows and columns."""
+        return torch.conv2d(torch.conv2d(image[None, None], rows[None, None, :, None]), columns[None, None, None])[0, 0]
+
+    count, spread = len(steps) ** 2, len(steps) * steps.square().sum()
+    mean = sums(inverse, ones, ones) / count
+    down, right = sums(inverse, steps, ones) / spread, sums(inverse, ones, steps) / spread  # slopes per pixel
+    rest = (
+        sums(inverse.square(), ones, ones) / count - mean.square() - (down.square() + right.square()) * spread / count
+    )
+    inner = (slice(reach, -reach), slice(reach, -reach))
+    sight = rays(camera)[inner]
+    # Slopes by X and Y of the ray (X, Y, 1), and what is left for the 1.
+    normal = torch.stack([right * camera.K[0, 0], down * camera.K[1, 1], mean], dim=-1).double()
+    normal[..., 2] -= (normal[..., :2] * sight[..., :2]).sum(-1)
+    cosine = mean / (normal.norm(dim=-1) * sight.norm(dim=-1))
+    whole = sums(inverse.gt(0).double(), ones, ones) > count - 0.5
+    known = whole & (rest.clamp(min=0.0).sqrt() < BREAK * mean)
+    found[inner] = torch.where(known, cosine.clamp(0.0, 1.0), torch.nan)
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,13 @@ def write_splats(
     sh_rest: Any = None,
     temperature_k: Any = None,
     colormap: str | None = None,
+    attributes: Mapping[str, Any] | None = None,
 ) -> int:
     """Writes Gaussians for viewers of 3DGS and returns how many; those with a zero quaternion, unseen, stay out.
 
     **Convention:** one float32 vertex per Gaussian with x y z nx ny nz, f_dc_0..2, f_rest_* (channel by channel),
-    opacity (logit), scale_0..2 (logarithm), rot_0..3 (wxyz), and ``temperature`` in kelvin where it is given. A viewer
-    shows the colour 0.5 + C0 * f_dc.
+    opacity (logit), scale_0..2 (logarithm), rot_0..3 (wxyz), ``temperature`` in kelvin where it is given, and attributes
+    by their names. A viewer shows the colour 0.5 + C0 * f_dc.
 
     Args:
         path: ends in .ply; its folder is made.
@@ -39,6 +41,7 @@ def write_splats(
         sh_rest: [N, K, C] spherical harmonics of degree 1 and up with C as in ``values``, or None.
         temperature_k: [N] in kelvin, or None.
         colormap: name of a matplotlib map that colours one-channel values, instead of grey; leaves out ``sh_rest``.
+        attributes: further properties by name, each [N]; they may be NaN where they are not known.
 
     Raises:
         ValueError: shapes do not fit, or a value is not finite.
@@ -84,6 +87,13 @@ def write_splats(
     }
     if temperature_k is not None:
         columns[("temperature",)] = arrays["temperature_k"][:, None]
+    for name, values in (attributes or {}).items():
+        values = np.asarray(values, dtype=np.float32)
+        if values.shape != (count,) or any(name in group for group in columns):
+            raise ValueError(
+                f"attribute {name} must have shape [{count}] and a name of its own, got {list(values.shape)}"
+            )
+        columns[(name,)] = values[:, None]
     names = [name for group in columns for name in group]
     seen = np.abs(arrays["quats"]).sum(1) > 0
     vertices = np.concatenate(list(columns.values()), axis=1)[seen].astype("<f4")

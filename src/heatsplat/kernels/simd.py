@@ -696,7 +696,7 @@ def _exp_of_doubles(typing_context, x):
 
 def exp(x):
     """e to the power of x: float32 to 3e-7 for -87 <= x < 88 and 1e-38 below; float64 as the C library has it."""
-    raise NotImplementedError("exp of lanes exists in kernels only")
+    raise TypeError(f"exp takes lanes, which are there inside kernels only, not {type(x).__name__}")
 
 
 @overload(exp)

@@ -25,8 +25,9 @@ log = logging.getLogger(__name__)
 PARAMS = ("rate", "faithful")
 PENALTIES = ("group", "ridge")
 REDUCTIONS = ("sum", "mean_over_gaussians")
-UNITS = ("scene", "si")
+UNITS = ("image", "si")
 INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
+SLOWEST = 100.0  # spans: time constants beyond this are shown as this
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
 
@@ -60,7 +61,7 @@ class NewtonHarmonic(ThermalModel):
         source_penalty: its weight; 0 leaves it out.
         penalty_reduction: over Gaussians, of the squares: "mean_over_gaussians" or "sum" (the paper and the authors' code),
             which grows with their number and, in units of the scene, suppresses the source it should only tame.
-        penalty_units: what A and B are counted in by the penalty: "scene", image units per span, or "si", °C per second
+        penalty_units: what A and B are counted in by the penalty: "image", image units per span, or "si", °C per second
             (the paper's, times C in faithful form).
         gauge_l2: weight of the prior (log C)² in faithful form.
         ambient: "measured" (the scene's, else learned), "learned" (from the measured one, if any) or a number in °C.
@@ -91,7 +92,7 @@ class NewtonHarmonic(ThermalModel):
         penalty: str = "group",
         source_penalty: float = 1e-3,
         penalty_reduction: str = "mean_over_gaussians",
-        penalty_units: str = "scene",
+        penalty_units: str = "image",
         gauge_l2: float = 1e-5,
         ambient: str | float = "measured",
         clip: str = "straight_through",
@@ -139,7 +140,7 @@ class NewtonHarmonic(ThermalModel):
         if scene.thermal_range is None and self.in_si:
             raise SceneError(
                 f"thermal.penalty_units=si counts heat sources in °C per second, but scene '{scene.name}' has no temperature "
-                "range; use thermal.penalty_units=scene"
+                "range; use thermal.penalty_units=image"
             )
         if scene.thermal_range is None:
             log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
@@ -263,6 +264,18 @@ class NewtonHarmonic(ThermalModel):
             ids,
             splats.places("source_gains") if source else None,
         )
+
+    def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
+        """Time constant C/h in seconds, at most ``SLOWEST`` spans, which no record tells from more; and with a source and a
+        range of temperatures the root mean square of the heating A/C, B/C, in °C per hour."""
+        values = {"time_constant_s": self.clock.span_s / query.rows(self._rate(splats)).clamp(min=1.0 / SLOWEST)}
+        if self.omega.numel() > 0 and self.range.bounds is not None:
+            ids = torch.arange(len(splats), device=self.omega.device) if query.ids is None else query.ids
+            rms = (splats["source_gains"].square().sum((1, 2)) / 2).sqrt()
+            heating = splats.dense("source_gains", rms, ids) * (3600.0 * self.range.bounds.span_k / self.clock.span_s)
+            factor = self._gain_factor(splats)
+            values["source_c_per_h"] = heating if factor is None else heating * factor[ids]
+        return values
 
     def effects(self) -> dict[str, dict]:
         ambient = "learned" if isinstance(self.ambient, nn.Parameter) else "fixed"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from heatsplat.doctor.base import Check, Finding, Material
 from heatsplat.doctor.checks.drift import frame_levels
@@ -10,7 +11,9 @@ from heatsplat.doctor.checks.drift import frame_levels
 MIN_POINTS, MIN_FRAMES = 40, 5
 GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
 EXPLAINED = 0.5  # share of what levels leave that gains have to explain
-FULL, MOST = 0.004, 0.9  # frames whose darkest and lightest pixels are black and white, and their share
+ALIKE = 0.8  # correlation of what two halves of the points tell of the gains; a pane changes only what it mirrors
+FULL, MOST = 0.012, 0.9  # how near black and white frames reach that the camera stretched, and the share of such frames
+REACH = 3  # pixels that have to: a dead one alone does not count
 
 
 def find(material: Material) -> list[Finding]:
@@ -48,24 +51,39 @@ def _gains(material: Material) -> float | None:
     points = known.nanmean(dim=1, keepdim=True)
     points = torch.where(used, points - torch.where(used, points, torch.nan).nanmean(dim=0), torch.nan)
     own = known - known.nanmean(dim=0)
-    gain = (own * points).nansum(0) / points.square().nansum(0).clamp_min(1e-12)
+    kept = used.sum(0) >= MIN_POINTS // 2
+    own, points = own[:, kept], points[:, kept]
+    gain = _gain(own, points)
     left, after = (own - points).abs().nanmedian(), (own - gain * points).abs().nanmedian()
-    gain = gain[used.sum(0) >= MIN_POINTS // 2]
     if len(gain) < MIN_FRAMES or float(after) > (1.0 - EXPLAINED) * float(left):
         return None
     # A scene that cools loses contrast smoothly; a camera leaps.
-    middle = 0.5 * (gain[:-2] + gain[2:])
-    leaps = float((gain[1:-1] - middle).std()) / float(gain.mean().abs().clamp_min(1e-9))
-    return leaps if leaps > GAIN else None
+    leaps = float(_leaps(gain).std()) / float(gain.mean().abs().clamp_min(1e-9))
+    if leaps <= GAIN:
+        return None
+    share = (own - gain * points).abs().nanmean(1) / points.abs().nanmean(1).clamp_min(1e-12)
+    upper = share > share.nanmedian()
+    one, other = (_leaps(_gain(own[half], points[half])) for half in (upper, ~upper))
+    return leaps if float(torch.corrcoef(torch.stack([one, other]))[0, 1]) > ALIKE else None
+
+
+def _gain(own: Tensor, points: Tensor) -> Tensor:
+    """Contrast [F] of each frame against that of all, from values and means [P, F] of points; NaN is unseen."""
+    return (own * points).nansum(0) / points.square().nansum(0).clamp_min(1e-12)
+
+
+def _leaps(gain: Tensor) -> Tensor:
+    """What a contrast has beyond the middle of its neighbours."""
+    return gain[1:-1] - 0.5 * (gain[:-2] + gain[2:])
 
 
 def _fills_the_range(material: Material) -> bool:
     full = 0
     for f in range(len(material.images)):
         known = material.known(f)
-        if len(known):
-            low, high = known.quantile(torch.tensor([0.005, 0.995], dtype=known.dtype))
-            full += bool(low <= FULL * 3) and bool(high >= 1 - FULL * 3)
+        if len(known) >= REACH:
+            low, high = known.kthvalue(REACH).values, known.topk(REACH).values[-1]
+            full += bool(low <= FULL) and bool(high >= 1 - FULL)
     return full >= MOST * len(material.images)
 
 

@@ -10,6 +10,7 @@ CLIPPED = 0.005  # share of pixels beyond the bounds
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
+MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
 
 
 def find(material: Material) -> list[Finding]:
@@ -51,13 +52,15 @@ def find(material: Material) -> list[Finding]:
                 )
             )
     flat = [f for f in range(len(material.images)) if _plateau(material.known(f)) > PLATEAU]
-    if len(flat) > 0.1 * len(material.images) and not any(one.check == "bounds" and "cut off" in one.what for one in found):
+    if len(flat) > 0.1 * len(material.images) and not any(
+        one.check == "bounds" and "cut off" in one.what for one in found
+    ):
         share = sum(_plateau(material.known(f)) for f in flat) / len(flat)
         found.append(
             Finding(
                 "saturation",
                 min(1.0, 3.0 * share),
-                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have exactly the largest value.",
+                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have the largest value.",
                 "The detector or the export saturates: record in the high range, or mask what is hotter.",
                 tuple(material.name(f) for f in flat),
             )
@@ -66,7 +69,9 @@ def find(material: Material) -> list[Finding]:
 
 
 def _plateau(values: torch.Tensor) -> float:
-    return float((values == values.max()).double().mean()) if len(values) else 0.0
+    """Share of the pixels that have the largest value; 0 where so few do that chance explains it."""
+    count = int((values == values.max()).sum()) if len(values) else 0
+    return count / len(values) if count >= MIN_PLATEAU else 0.0
 
 
 CHECK = Check("bounds", "whether pixels fit their bounds, and whether images saturate", find)

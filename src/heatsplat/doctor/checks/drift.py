@@ -32,7 +32,7 @@ def find(material: Material) -> list[Finding]:
         Finding(
             "drift",
             before / material.contrast,
-            f"The level of all points wanders from frame to frame by {material.size(float(levels.max() - levels.min()))}{resets}: "
+            f"The level of all points wanders between frames by {material.size(float(levels.max() - levels.min()))}{resets}: "
             f"one point differs between frames by {material.size(before)}, by {material.size(after)} without it.",
             "method=auto simulates it (frame_offset); other methods take sensor=frame_offset.",
             tuple(shutters),

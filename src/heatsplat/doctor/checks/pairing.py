@@ -13,6 +13,8 @@ MIN_FRAMES = 5
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
 OFF = 0.025  # of the width: how far photos may lie beside thermal images
+# Seconds, and share of the usual step between frames, by which clocks may differ; EXIF often has whole seconds.
+CLOCK_S, WHOLE_S, CLOCK_STEP = 0.2, 1.0, 0.1
 
 
 def find(material: Material) -> list[Finding]:
@@ -29,7 +31,11 @@ def find(material: Material) -> list[Finding]:
     fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
-    steps = {k: float(fits.diagonal(k).median() - own[: count - abs(k)].median()) for k in (-3, -2, -1, 1, 2, 3) if abs(k) < count - 2}
+    steps = {
+        k: float(fits.diagonal(k).median() - own[: count - abs(k)].median())
+        for k in (-3, -2, -1, 1, 2, 3)
+        if abs(k) < count - 2
+    }
     step, gain = max(steps.items(), key=lambda item: item[1])
     strangers = float(fits[~torch.eye(count, dtype=torch.bool)].median())
     if gain > BETTER:
@@ -38,7 +44,8 @@ def find(material: Material) -> list[Finding]:
             Finding(
                 "pairing",
                 0.6,
-                f"Thermal images fit the photo {abs(step)} frame(s) {'later' if step > 0 else 'earlier'} better than their own{late}.",
+                f"Thermal images fit the photo {abs(step)} frame(s) {'later' if step > 0 else 'earlier'} better than their "
+                f"own{late}.",
                 "Pair them anew: shift one list, or correct the clock of one camera.",
             )
         )
@@ -69,10 +76,13 @@ def find(material: Material) -> list[Finding]:
 def _clock(material: Material) -> Finding | None:
     if material.rgb_times_s is None or material.times_s is None:
         return None
-    apart = torch.tensor(material.rgb_times_s, dtype=torch.float64) - torch.tensor(material.times_s, dtype=torch.float64)
+    apart = torch.tensor(material.rgb_times_s, dtype=torch.float64) - torch.tensor(
+        material.times_s, dtype=torch.float64
+    )
     usual = float(torch.tensor(sorted(material.times_s), dtype=torch.float64).diff().median())
     offset = float(apart.median())
-    if abs(offset) < max(0.5 * usual, 0.2):
+    whole = not any(time % 1.0 for time in (*material.times_s, *material.rgb_times_s))
+    if abs(offset) <= max(CLOCK_STEP * usual, WHOLE_S if whole else CLOCK_S):
         return None
     return Finding(
         "pairing",

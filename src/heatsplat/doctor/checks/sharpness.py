@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from heatsplat.doctor.base import Check, Finding, Material, some
 
-BLURRED = 0.55  # of the sharpness of the frames around
+BLURRED = 0.7  # of the sharpness of the frames around
 CLEAR = 8.0  # contrast in noise from which sharpness can be told
 
 
@@ -37,7 +37,9 @@ def find(material: Material) -> list[Finding]:
 def _sharpness(image: Tensor, noise: float) -> float:
     """Fine gradients over coarse ones: the strongest hundredth at single pixels, and after a mean over 4."""
     image = image.nan_to_num()
-    fine = (_gradient(image).flatten().square().topk(max(1, image.numel() // 100)).values.mean() - 2 * noise**2).clamp_min(0)
+    fine = (
+        _gradient(image).flatten().square().topk(max(1, image.numel() // 100)).values.mean() - 2 * noise**2
+    ).clamp_min(0)
     coarse = functional.avg_pool2d(image[None, None], 4, stride=1)[0, 0]
     rough = _gradient(coarse).flatten().square().topk(max(1, coarse.numel() // 100)).values.mean()
     return float((fine / rough.clamp_min(1e-18)).sqrt())

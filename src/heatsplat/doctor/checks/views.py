@@ -12,7 +12,12 @@ SOME = 2000  # points that are looked at
 
 
 def find(material: Material) -> list[Finding]:
-    if material.cameras is None or material.points is None or len(material.points) < 20 or len(material.cameras) < MIN_VIEWS:
+    if (
+        material.cameras is None
+        or material.points is None
+        or len(material.points) < 20
+        or len(material.cameras) < MIN_VIEWS
+    ):
         return []
     points = material.points[:: max(1, len(material.points) // SOME)].double()
     seen = torch.zeros(len(points), dtype=torch.int64)
@@ -26,7 +31,8 @@ def find(material: Material) -> list[Finding]:
         Finding(
             "views",
             0.3 * few,
-            f"{100 * few:.0f} % of the points lie in the view of fewer than {MIN_VIEWS} training frames (median {int(seen.median())}).",
+            f"{100 * few:.0f} % of the points lie in the view of fewer than {MIN_VIEWS} training frames "
+            f"(median {int(seen.median())}).",
             "Record more overlap, or hold fewer frames out (data.split); what one view sees has no depth.",
         )
     ]

@@ -89,7 +89,7 @@ class Viewer {
     for (const layer of this.splats.layers) option($("other"), layer.name, layer.label);
     if (this.splats.colours) option($("other"), "visible", "visible light");
     option($("other"), "recorded", "recorded image");
-    if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "with the camera's own part");
+    if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "the model's recording");
     for (const name of Object.keys(this.maps)) if (name !== DIFFERENCES) option($("map"), name, name);
     $("timeBar").hidden = !this.told.span;
     if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
@@ -337,7 +337,7 @@ class Viewer {
     if (this.pictureKey === key) return this.picture;
     if (this.picture) gl.deleteTexture(this.picture);
     this.pictureKey = key;
-    this.picture = null;
+    this.picture = this.pictured = null;
     if (!one || (other === "sensor" && !one.added)) return null;
     const [low, high] = this.told.limits, [rows, columns] = one.size;
     const content = new Float32Array(2 * rows * columns);
@@ -345,12 +345,24 @@ class Viewer {
       const value = other === "sensor" ? one.added[j] * one.step : low + one.recorded[j] / 65534 * (high - low);
       content.set([value, other === "sensor" || one.recorded[j] !== 65535 ? 1 : 0], 2 * j);
     }
+    this.pictured = { content, rows, columns };
     this.picture = this.drawing.texture(gl.RG32F, columns, rows, gl.RG, gl.FLOAT, content);
     return this.picture;
   }
 
-  // Value that a pixel of the canvas shows, from what was blended [value, second, -, alpha]; null where next to nothing is.
-  valueOf(blended, j) {
+  // What the picture of a training camera holds at a place of the canvas, pixels from the top left; null where nothing.
+  picturedAt(x, y) {
+    if (!this.pictured) return null;
+    const { content, rows, columns } = this.pictured, { view } = this;
+    const right = (x + 0.5 - view.left) / view.scale / this.camera.width, down = (y + 0.5 - view.top) / view.scale / this.camera.height;
+    if (right < 0 || down < 0 || right >= 1 || down >= 1) return null;
+    const k = 2 * (Math.floor(down * rows) * columns + Math.floor(right * columns));
+    return content[k + 1] === 1 ? content[k] : null;
+  }
+
+  // Value that the pixel (x, y) of the canvas shows, from what was blended there, [value, second, -, alpha] from the place j on;
+  // null where next to nothing is.
+  valueOf(blended, j, x, y) {
     const alpha = blended[j + 3], { splats, told } = this;
     if (alpha < 0.02) return null;
     if (this.attribute) {
@@ -362,6 +374,11 @@ class Viewer {
     const [low, high] = told.tableEnds;
     const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
     const first = value(blended[j], layer);
+    if (this.differing && (this.state.other === "recorded" || this.state.other === "sensor")) {
+      const seen = this.picturedAt(x, y);
+      if (seen === null) return null;
+      return this.state.other === "recorded" ? first - seen : first - Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
+    }
     const beside = this.state.other === "time" ? layer : splats.layer(this.state.other);
     return this.differing && beside ? first - value(blended[j + 1], beside) : first;
   }
@@ -374,7 +391,7 @@ class Viewer {
     const second = this.differing && this.state.other === "run" && this.run ? this.drawing.read("second", 0, 0, width, height) : null;
     const stride = 4 * Math.max(1, Math.round(width * height / 60000)), found = [];
     for (let j = 0; j < content.length; j += stride) {
-      const value = this.valueOf(content, j);
+      const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width));
       if (value === null) continue;
       if (!second) found.push(this.attribute?.log ? Math.log10(value) : value);
       else if (second[j + 3] > 0.05) {
@@ -578,7 +595,7 @@ class Viewer {
     const x = Math.floor((clientX - box.left) * ratio), y = Math.floor((clientY - box.top) * ratio);
     const readout = $("readout");
     const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
-    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0) : null;
+    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y) : null;
     readout.hidden = value === null;
     if (value === null) return;
     const number = this.attribute ? Number(value.toPrecision(3)) : value.toFixed(this.unit ? 2 : 4);

@@ -1,0 +1,42 @@
+"""Files of a trained scene: one for each moment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from heatsplat.export.formats.base import Format
+from heatsplat.export.moment import moments
+from heatsplat.export.snapshot import snapshot
+
+log = logging.getLogger("heatsplat")
+
+
+def write_files(
+    module: Any, form: Format, folder: Path, times: float | Sequence[float] | None = None, layer: str = "auto"
+) -> list[Path]:
+    """Paths of the files written, ``<scene>_<seconds>s<suffix>``; what they do not hold is warned of.
+
+    Args:
+        module: a training module with its scene (``training.module.SplatTraining``).
+        form: the format.
+        folder: of the files; it is made.
+        times: seconds since the first training frame, one or several; None takes the middle of the record.
+        layer: as in ``export.moment.moments``.
+
+    Raises:
+        SceneError: the scene lacks what was asked for.
+        ImportError: a package of the extra "export" is missing.
+    """
+    seen = snapshot(module)
+    for sentence in seen.left_out:
+        log.warning("%s", sentence)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for moment in moments(module, seen, times, layer):
+        when = "" if moment.time_s is None else f"_{moment.time_s:.6g}s"
+        written.append(folder / f"{module.scene.name}{when}{form.suffix}")
+        form.write(moment, written[-1])
+    return written

@@ -1,0 +1,83 @@
+"""The contract of a format: a moment of a trained scene becomes a file."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.moment import Moment
+from heatsplat.io.pictures import colorize
+
+
+class Format(ABC):
+    """One format is one file with one subclass and one yaml in conf/what/.
+
+    Class attributes:
+        suffix: of its files, with the dot.
+    """
+
+    suffix: str = ""
+
+    @abstractmethod
+    def write(self, moment: Moment, path: Path) -> None:
+        """Writes one file, whose folder is there.
+
+        Raises:
+            SceneError: the scene lacks what the format needs.
+            ImportError: a package of the extra "export" is missing; the message names both.
+        """
+
+
+def optional(package: str, what: str) -> ModuleType:
+    """A package of the extra "export". Raises ImportError, naming the extra, where it is not installed."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        missing = package.partition(".")[0]
+        raise ImportError(f"what={what} needs {missing}: pip install 'heatsplat[export]'") from error
+
+
+def colours_of(moment: Moment, colormap: str | None, range_c: Sequence[float] | None) -> Any:
+    """Colours [N, 3] float32 in [0, 1] of the Gaussians' values, or of the visible image where ``colormap`` is "rgb".
+
+    Args:
+        moment: the Gaussians.
+        colormap: name of a matplotlib map, or "rgb".
+        range_c: values at its ends; None takes those that an image of the scene can show.
+
+    Raises:
+        SceneError: the model has no colours, there is no such map, or the range is none.
+    """
+    if colormap == "rgb":
+        if moment.seen.colours is None:
+            raise SceneError("what.colormap=rgb: this method has no colours; give the name of a matplotlib map")
+        return moment.seen.colours.numpy()
+    low, high = checked_range(range_c or moment.seen.limits)
+    try:
+        colours = colorize(moment.values[:, None], low, high, colormap)
+    except (KeyError, ValueError) as error:
+        raise SceneError(f"what.colormap={colormap} is no map of matplotlib (and not rgb): {error}") from error
+    return colours[:, 0].astype(np.float32) / 255
+
+
+def checked_range(range_c: Sequence[float]) -> tuple[float, float]:
+    """Two increasing numbers. Raises SceneError where they are not."""
+    if len(range_c) != 2 or not range_c[0] < range_c[1]:
+        raise SceneError(f"what.range_c must be two increasing numbers, got {list(range_c)}")
+    return float(range_c[0]), float(range_c[1])
+
+
+def extra_columns(moment: Moment) -> dict[str, Tensor]:
+    """What the Gaussians carry beside temperature, by name, each [N]; names in letters, digits and underscores."""
+    return {
+        "".join(letter if letter.isalnum() else "_" for letter in name): values
+        for name, values in moment.seen.attributes.items()
+    }

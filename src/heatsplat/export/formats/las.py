@@ -1,0 +1,74 @@
+"""LAS and LAZ point clouds: a point at the centre of each Gaussian, with what it carries as extra dimensions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.formats.base import Format, colours_of, extra_columns, optional
+from heatsplat.export.moment import Moment
+from heatsplat.export.place import place_of
+
+LONGEST_NAME = 32  # bytes of an extra dimension's name (LAS 1.4)
+STEPS = 2**30  # of a coordinate, stored as a whole number of 32 bits
+
+
+class Las(Format):
+    """LAS 1.4, point format 7.
+
+    Args:
+        compressed: LAZ.
+        least_opacity: Gaussians below are no surface and are left out, in [0, 1].
+        colormap: colours of the points, as in ``formats.ply``.
+        range_c: °C at the ends of the map; None takes the scene's range.
+        gps: table of camera positions (``export.place``), or None.
+    """
+
+    def __init__(
+        self,
+        compressed: bool = True,
+        least_opacity: float = 0.3,
+        colormap: str = "inferno",
+        range_c: Sequence[float] | None = None,
+        gps: str | None = None,
+    ) -> None:
+        self.suffix = ".laz" if compressed else ".las"
+        self.least_opacity, self.colormap, self.range_c, self.gps = least_opacity, colormap, range_c, gps
+
+    def write(self, moment: Moment, path: Path) -> None:
+        laspy = optional("laspy", "las")
+        if path.suffix == ".laz":
+            optional("lazrs", "las")
+        place = place_of(moment.module.scene, self.gps)
+        kept = (moment.seen.opacities >= self.least_opacity).numpy()
+        if not kept.any():
+            raise SceneError(f"what.least_opacity={self.least_opacity}: no Gaussian is as opaque")
+        points = place(moment.seen.means.double()).numpy()[kept]
+        header = laspy.LasHeader(point_format=7, version="1.4")
+        header.offsets = np.floor(points.min(0))
+        spread = float((points.max(0) - points.min(0)).max())
+        header.scales = np.full(3, max(1e-4, 10.0 ** math.ceil(math.log10(max(spread, 1e-9) / STEPS))))
+        columns = {moment.quantity: moment.values, "opacity": moment.seen.opacities}
+        columns |= {f"scale_{i}": moment.seen.scales[:, i] * place.scale for i in range(3)}
+        columns |= extra_columns(moment)
+        names = [name[:LONGEST_NAME] for name in columns]
+        header.add_extra_dims(
+            [
+                laspy.ExtraBytesParams(name, "f4", description=moment.seen.unit.replace("°", "deg ") if i == 0 else "")
+                for i, name in enumerate(names)
+            ]
+        )
+        if place.crs is not None:
+            wkt = optional("rasterio.crs", "las").CRS.from_user_input(place.crs).to_wkt()
+            header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+            header.global_encoding.wkt = True
+        data = laspy.LasData(header)
+        data.x, data.y, data.z = points.T
+        data.red, data.green, data.blue = (colours_of(moment, self.colormap, self.range_c)[kept].T * 65535).astype("u2")
+        for name, values in zip(names, columns.values(), strict=True):
+            data[name] = values.numpy()[kept]
+        data.write(str(path))

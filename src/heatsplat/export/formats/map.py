@@ -1,0 +1,155 @@
+"""Orthographic map as GeoTIFF: temperature from above, and what the model learned."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.export.formats.base import Format, extra_columns, optional
+from heatsplat.export.moment import Moment
+from heatsplat.export.place import Place, place_of
+from heatsplat.geometry.coverage import OPEN, covered, surface_depth
+from heatsplat.shots import sightings
+
+log = logging.getLogger("heatsplat")
+
+AWAY = 1000.0  # half widths of the map from which it is seen: what stands h high is displaced by h / 1000 at its edge
+LARGEST = 8192  # pixels of a side
+MARGIN = 0.02  # of the longer side, around the scene's points
+
+
+class Map(Format):
+    """A map seen from straight above, through the splat renderer with a camera of long focal length far away.
+
+    Bands, float32, NaN where there is no surface or no training view saw it: temperature and each
+    attribute, as means over what a pixel shows.
+
+    Args:
+        resolution: width of a pixel in metres (units of the scene where it has no scale); None takes that of the training
+            images.
+        bounds: [west, south, east, north] in the map's coordinates; None takes the box of 99 % of the scene's points.
+        gps: table of camera positions (``export.place``), or None: then the map has no CRS.
+        above: [x, y, z] direction in the world from which the map is seen; None finds it (``export.place``).
+        unseen: "nan", or "keep" for what the model makes of places that no training view saw.
+    """
+
+    suffix = ".tif"
+
+    def __init__(
+        self,
+        resolution: float | None = None,
+        bounds: Sequence[float] | None = None,
+        gps: str | None = None,
+        above: Sequence[float] | None = None,
+        unseen: str = "nan",
+    ) -> None:
+        if resolution is not None and not resolution > 0:
+            raise SceneError(f"what.resolution must be above 0, got {resolution}")
+        if bounds is not None and not (len(bounds) == 4 and bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+            raise SceneError(f"what.bounds must be [west, south, east, north], got {list(bounds)}")
+        if unseen not in ("nan", "keep"):
+            raise SceneError(f"what.unseen must be nan or keep, got '{unseen}'")
+        if above is not None and (len(above) != 3 or not any(above) or gps is not None):
+            raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
+        self.resolution, self.bounds, self.gps, self.unseen = resolution, bounds, gps, unseen
+        self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
+
+    def write(self, moment: Moment, path: Path) -> None:
+        rasterio = optional("rasterio", "map")
+        from_origin = optional("rasterio.transform", "map").from_origin
+        scene = moment.module.scene
+        place = place_of(scene, self.gps, self.above)
+        west, north, pixel, width, height = self._grid(scene, place)
+        camera = _from_above(scene, place, west, north, pixel, width, height)
+        bands = self._bands(moment, camera)
+        log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
+        with rasterio.open(
+            path,
+            "w",
+            driver="GTiff",
+            width=width,
+            height=height,
+            count=len(bands),
+            dtype="float32",
+            crs=place.crs,
+            transform=from_origin(west, north, pixel, pixel),
+            nodata=float("nan"),
+            compress="deflate",
+            predictor=3,
+        ) as file:
+            for number, (name, band) in enumerate(bands.items(), start=1):
+                file.write(band.astype(np.float32), number)
+                file.set_band_description(number, name)
+            file.update_tags(layer=moment.layer.name, lengths=place.unit, time_s=str(moment.time_s))
+
+    def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
+        """West and north edge, width of a pixel, columns and rows."""
+        points = place(scene.points)[:, :2]
+        pixel = self.resolution
+        if pixel is None:
+            middle = scene.bulk[0].double()
+            cameras = [frame.camera for frame in scene.train.frames]
+            pixel = place.scale * float(np.median([(c.center - middle).norm() / c.K[0, 0] for c in cameras]))
+            pixel = float(f"{pixel:.2g}")
+        if self.bounds is None:
+            low, high = (torch.quantile(points, share, dim=0) for share in (0.005, 0.995))
+            around = MARGIN * float((high - low).max())
+            west, south, east, north = *(low - around).tolist(), *(high + around).tolist()
+        else:
+            west, south, east, north = map(float, self.bounds)
+        width, height = (max(1, round((end - start) / pixel)) for start, end in ((west, east), (south, north)))
+        if max(width, height) > LARGEST:
+            raise SceneError(
+                f"the map would have {width} x {height} pixels of {pixel:g} {place.unit}, more than {LARGEST}: give a coarser "
+                "what.resolution, or smaller what.bounds"
+            )
+        return west, north, pixel, width, height
+
+    def _bands(self, moment: Moment, camera: Camera) -> dict[str, np.ndarray]:
+        seen, module = moment.seen, moment.module
+        told = extra_columns(moment)
+        columns = torch.stack([moment.blended, *told.values()], dim=1)
+        with torch.no_grad():
+            output = module.renderer(
+                seen.means, seen.quats, seen.scales, seen.opacities[None], columns.nan_to_num(), camera, None,
+                (columns.shape[1],), depth=True,
+            )  # fmt: skip
+        alpha = output.alpha[0, ..., None]
+        means = (output.features / alpha).where(alpha >= OPEN, torch.nan)
+        if self.unseen == "nan":
+            scene = module.scene
+            depth = surface_depth(output.depth, output.alpha[0])
+            known = covered(camera, depth, sightings(scene, lambda frame: _depth(module, frame)))
+            means = means.where(known[..., None], torch.nan)
+        unit = seen.unit.replace("°", "deg ")
+        bands = {f"{moment.quantity} [{unit}]" if unit else moment.quantity: moment.of_blended(means[..., 0]).numpy()}
+        return bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
+
+
+def _from_above(
+    scene: SceneData, place: Place, west: float, north: float, pixel: float, width: int, height: int
+) -> Camera:
+    """A camera straight above the middle of the map whose pixels, at the height of the scene's points, are the map's."""
+    ground = float(place(scene.points)[:, 2].median())
+    away = AWAY * 0.5 * pixel * max(width, height)
+    eye = torch.tensor([west + 0.5 * pixel * width, north - 0.5 * pixel * height, ground + away], dtype=torch.float64)
+    scale, rotation, shift = place.similarity
+    turned = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)) @ rotation  # x east, y south, z down
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = turned
+    viewmat[:3, 3] = -turned @ (rotation.T @ (eye - shift) / scale)
+    focal = away / pixel
+    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float64)
+    return Camera(viewmat, K, width, height)
+
+
+@torch.no_grad()
+def _depth(module: object, frame: Frame) -> Tensor:
+    output = module.render(frame, depth=True)
+    return surface_depth(output.depth, output.alpha[0]).cpu()

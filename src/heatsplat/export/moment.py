@@ -1,0 +1,90 @@
+"""The Gaussians of a snapshot at one moment, with their temperature: what a file of another program holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import SceneError, check_option
+from heatsplat.export.snapshot import Layer, Snapshot
+
+LAYERS = ("auto", "camera", "surface", "truth")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Gaussians [N] at a moment.
+
+    Args:
+        seen: the snapshot: geometry, attributes, and the layers over time.
+        layer: which of its layers this is.
+        time_s: seconds since the first training frame; None where nothing changes.
+        blended: [N] values of the layer as renderers blend them.
+        values: [N] the same in the unit of the scene: °C, or image values where these are no temperatures.
+        module: the training module, for formats that render.
+    """
+
+    seen: Snapshot
+    layer: Layer
+    time_s: float | None
+    blended: Tensor
+    values: Tensor
+    module: Any
+
+    @property
+    def quantity(self) -> str:
+        """What the values are: "temperature", or "value" where images hold none."""
+        return "temperature" if self.seen.unit else "value"
+
+    def of_blended(self, blended: Tensor) -> Tensor:
+        """Values in the scene's unit of blended ones, any shape; NaN stays."""
+        low, high = self.seen.table_ends
+        place = ((blended - low) / (high - low)).nan_to_num().clamp(0, 1) * (len(self.seen.table) - 1)
+        below = place.long().clamp(max=len(self.seen.table) - 2)
+        share = place - below
+        found = self.seen.table[below] * (1 - share) + self.seen.table[below + 1] * share
+        return found.where(blended.isfinite(), torch.nan)
+
+
+def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, layer: str = "auto") -> list[Moment]:
+    """The Gaussians at each of some moments.
+
+    Args:
+        module: a training module with its scene.
+        seen: its snapshot.
+        times: seconds since the first training frame, one or several; None takes the middle of the training record.
+        layer: "camera", "surface" or "truth" (``Layer.name``); "auto" is the surface where the model tells its temperature
+            apart from what a camera gets, and the camera elsewhere.
+
+    Raises:
+        SceneError: the scene has no such layer, or a moment lies outside its record.
+    """
+    check_option("layer", layer, LAYERS, SceneError)
+    there = {one.name: one for one in seen.layers}
+    name = ("surface" if "surface" in there else "camera") if layer == "auto" else layer
+    if name not in there:
+        raise SceneError(f"layer={layer}: this method and scene have {', '.join(there)} only")
+    wanted: list[float | None] = [*times] if isinstance(times, Sequence) else [times]
+    found = []
+    for time_s in wanted:
+        if seen.start_s is None:
+            if time_s is not None:
+                raise SceneError(f"time={time_s}: scene '{module.scene.name}' does not change in time; leave time out")
+        elif time_s is None:
+            start, span = module.scene.record
+            time_s = start + span / 2
+        elif not seen.start_s <= time_s <= seen.end_s:
+            raise SceneError(
+                f"time={time_s:g} s lies outside the record, which runs from {seen.start_s:g} to {seen.end_s:g} s; "
+                "src/render.py shows what the model predicts beyond it"
+            )
+        chosen = there[name]
+        blended = chosen.basis.at(time_s)
+        blended = blended.clamp(0, 1) if chosen.clipped and layer == "camera" else blended
+        whole = Moment(seen, chosen, time_s, blended, blended, module)
+        found.append(Moment(seen, chosen, time_s, blended, whole.of_blended(blended), module))
+    return found

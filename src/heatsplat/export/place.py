@@ -1,0 +1,139 @@
+"""Where a scene lies on the earth, or at least which way is up: its points in metres east, north and up."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from heatsplat.contracts import SceneData, SceneError
+from heatsplat.export.formats.base import optional
+from heatsplat.geometry.alignment import Similarity, similarity_between
+from heatsplat.geometry.trajectories import upward
+
+log = logging.getLogger("heatsplat")
+
+# Columns of a table of positions, as preparation writes them and as others do.
+NAMES = ("file", "name", "image")
+LATITUDES = ("latitude_deg", "latitude", "gps_lat", "lat")
+LONGITUDES = ("longitude_deg", "longitude", "gps_lon", "lon")
+HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
+LEAST_SPREAD = 0.02  # positions whose second extent is below this share of the first lie on a line
+ONE_WAY = 0.95  # length of the mean viewing direction from which on all cameras look the same way
+
+
+@dataclass(frozen=True)
+class Place:
+    """Points of the world in other coordinates: east, north, up (x to the right and y to the top of a map).
+
+    Args:
+        similarity: from the world.
+        crs: such as "EPSG:32631"; None where the scene is not known to lie anywhere.
+        unit: of lengths: "metre", or "unit of the scene".
+    """
+
+    similarity: Similarity
+    crs: str | None
+    unit: str
+
+    @property
+    def scale(self) -> float:
+        return float(self.similarity.scale)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Points [n, 3] float64."""
+        return self.similarity(points.double())
+
+
+def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | None = None) -> Place:
+    """Where a scene lies: by a table of camera positions in a UTM zone, else with its own scale and direction of up.
+
+    Args:
+        scene: with its training cameras.
+        gps: CSV with the name, latitude and longitude (WGS 84, degrees) and height (metres) of camera positions.
+        above: [3] direction that counts as up, in place of the scene's own; not with ``gps``. None: that of its weather;
+            else where all cameras look the same way (a drone that looks down, a wall seen from the front) back towards
+            them; else upward in their images.
+
+    Raises:
+        SceneError: the table cannot be read, or its positions do not place the cameras.
+        ImportError: rasterio, which knows map projections, is not installed.
+    """
+    if gps is not None:
+        return _placed(scene, Path(gps).expanduser())
+    cameras = [frame.camera for frame in scene.train.frames]
+    forward = torch.stack([camera.viewmat[2, :3] for camera in cameras]).mean(0)
+    images_up = upward(cameras).double()
+    if above is not None:
+        up = above.double()
+    elif scene.weather is not None:
+        up = scene.weather.up.double()
+    elif forward.norm() > ONE_WAY:
+        up = -forward
+    else:
+        up = images_up
+    up = normalize(up, dim=0)
+    axes = torch.eye(3, dtype=torch.float64)
+    # North is y of the world, unless that is (nearly) up; where the cameras look down their images' top.
+    candidates = [axes[1], images_up, axes[2], axes[0]] if scene.weather is not None else [images_up, *axes[[1, 2, 0]]]
+    north = next(one for one in candidates if (one - (one @ up) * up).norm() > 0.5)
+    north = normalize(north - (north @ up) * up, dim=0)
+    rotation = torch.stack([torch.linalg.cross(north, up), north, up])
+    metres = scene.metres_per_unit
+    scale = torch.tensor(1.0 if metres is None else metres, dtype=torch.float64)
+    shift = torch.zeros(3, dtype=torch.float64)
+    return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
+
+
+def _placed(scene: SceneData, path: Path) -> Place:
+    """By the similarity that brings the training cameras closest to their positions."""
+    positions = _positions(path)
+    found = {
+        frame.camera.center: positions[Path(frame.name).stem]
+        for frame in scene.train.frames
+        if Path(frame.name).stem in positions
+    }
+    if len(found) < 3:
+        names = ", ".join(frame.name for frame in scene.train.frames[:2])
+        raise SceneError(f"{path} has positions of {len(found)} of the training images ({names}, ...); 3 are needed")
+    degrees = torch.tensor(list(found.values()), dtype=torch.float64)
+    warp = optional("rasterio.warp", "map")
+    zone = int((float(degrees[:, 1].mean()) + 180) // 6) + 1
+    crs = f"EPSG:{(32600 if float(degrees[:, 0].mean()) >= 0 else 32700) + zone}"
+    east, north = warp.transform("EPSG:4326", crs, degrees[:, 1].tolist(), degrees[:, 0].tolist())
+    target = torch.tensor([east, north, degrees[:, 2].tolist()], dtype=torch.float64).T
+    spread = torch.linalg.svdvals(target - target.mean(0))
+    if spread[1] < LEAST_SPREAD * spread[0]:
+        raise SceneError(f"{path}: the positions lie on a line, which leaves the turn about it open; leave gps out")
+    source = torch.stack(list(found)).double()
+    similarity = similarity_between(source, target)
+    residual = (similarity(source) - target).square().sum(1).mean().sqrt().item()
+    log.info("%s: %d cameras placed in %s, %.2f m from their positions (rms)", path, len(found), crs, residual)
+    return Place(similarity, crs, "metre")
+
+
+def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
+    """Latitude, longitude and height by name without ending; rows without a position are left out."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SceneError(f"what.gps={path} cannot be read: {error}") from error
+    columns = []
+    for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
+        there = next((name for name in wanted if rows and name in rows[0]), None)
+        if there is None:
+            raise SceneError(f"what.gps={path} has no column {' or '.join(wanted)}")
+        columns.append(there)
+    name, *numbers = columns
+    try:
+        return {
+            Path(row[name]).stem: tuple(float(row[n]) for n in numbers) for row in rows if all(row[n] for n in numbers)
+        }
+    except ValueError as error:
+        raise SceneError(f"what.gps={path}: {error} in {', '.join(numbers)}") from error

@@ -1,0 +1,30 @@
+"""Photos and thermal images that do not belong together are found."""
+
+from dataclasses import replace
+
+import torch
+from materials import checks, clean
+
+from heatsplat.doctor.base import Material
+from heatsplat.doctor.examination import examine
+
+
+def test_photos_of_other_moments_and_photos_that_lie_beside_are_found():
+    # A hand that sweeps: each frame shows what the one before did from a little further on.
+    steps = [torch.roll(clean().images[0], 3 * f, 1) for f in range(10)]
+    images = torch.stack(steps)
+    photos = [image[..., None].expand(-1, -1, 3).float() for image in steps]
+    about = {"names": [f"{i}" for i in range(10)], "times_s": None, "chosen": list(range(10)), "images": images}
+    assert "pairing" not in checks(Material(**about, rgb=photos))
+    assert "2 frame(s)" in next(
+        f.what for f in examine(Material(**about, rgb=photos[2:] + photos[:2])) if f.check == "pairing"
+    )
+    aside = [torch.roll(photo, 5, 0) for photo in photos]
+    assert "beside" in next(f.what for f in examine(Material(**about, rgb=aside)) if f.check == "pairing")
+
+
+def test_clocks_of_two_cameras_that_disagree_are_found():
+    times = [float(i) for i in range(len(clean().names))]
+    late = replace(clean(), times_s=times, rgb_times_s=[t + 2.5 for t in times])
+    assert any("+2.5 s" in one.what for one in examine(late))
+    assert "pairing" not in checks(replace(clean(), times_s=times, rgb_times_s=times))

@@ -1,0 +1,27 @@
+"""What a doctor looks at is that of the scene."""
+
+from dataclasses import replace
+
+import torch
+
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.doctor.base import Material, material_of
+
+
+def test_the_material_has_the_training_views_with_their_unit_and_names():
+    scene = Synthetic(scene="static", size="tiny").scene
+    material = material_of(scene)
+    assert material.names == [frame.name for frame in scene.train.frames]
+    assert material.unit_k == scene.thermal_range.span_k and material.name(3) == material.names[material.chosen[3]]
+    torch.testing.assert_close(material.images[2], scene.train[2].thermal[..., 0].double())
+    assert 0 < material.noise < material.contrast
+
+
+def test_what_a_mask_leaves_out_and_what_is_unknown_do_not_count():
+    images = torch.arange(12.0, dtype=torch.float64).reshape(1, 3, 4)
+    images[0, 0, 0] = torch.nan
+    masks = torch.ones(1, 3, 4, dtype=torch.bool)
+    masks[0, 2, 3] = False
+    material = Material(["a"], None, [0], images, masks=masks)
+    assert material.known(0).tolist() == [float(i) for i in range(1, 11)]
+    assert material.size(0.5) == "50 % of the range" and replace(material, unit_k=4.0).size(0.5) == "2 K"

@@ -1,0 +1,25 @@
+"""Findings of all checks come in order, and there are none where nothing is wrong."""
+
+import pytest
+from materials import changed, clean
+
+from heatsplat.doctor.examination import CHECKS, examine
+
+
+@pytest.mark.parametrize("scene", ["static", "heated", "cooling", "glass", "haze"])
+def test_clean_recordings_raise_no_alarm(scene):
+    assert examine(clean(scene)) == []
+
+
+def test_findings_come_the_most_costly_first_and_say_what_helps():
+    images = clean().images.clone()
+    images[5], images[:, 3, 4], images[:, 20, 30] = images[4], 1.0, 1.0
+    found = examine(changed(clean(), images))
+    assert {"duplicates", "dead_pixels"} <= {one.check for one in found}
+    assert [one.cost for one in found] == sorted((one.cost for one in found), reverse=True)
+    assert all(one.remedy and 0 < one.cost <= 1.5 for one in found)
+
+
+def test_every_check_says_what_it_looks_at():
+    assert len({check.name for check in CHECKS}) == len(CHECKS) == 10
+    assert all(check.summary for check in CHECKS)

@@ -1,0 +1,26 @@
+"""LAS and LAZ as laspy reads them: points, temperatures, attributes."""
+
+import numpy as np
+import pytest
+import torch
+
+from heatsplat.export.formats.base import colours_of
+from heatsplat.export.formats.las import Las
+from heatsplat.export.place import place_of
+
+laspy = pytest.importorskip("laspy", reason="laspy is not installed (pip install -e '.[dev]')")
+pytest.importorskip("lazrs", reason="lazrs is not installed (pip install -e '.[dev]')")
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_another_library_reads_what_was_written(cooling, tmp_path, compressed):
+    form = Las(compressed=compressed, least_opacity=0.0)
+    form.write(cooling, tmp_path / f"a{form.suffix}")
+    found = laspy.read(tmp_path / f"a{form.suffix}")
+    expected = place_of(cooling.module.scene)(cooling.seen.means)
+    assert np.abs(found.xyz - expected.numpy()).max() <= 1e-4
+    assert np.array_equal(found["temperature"], cooling.values)
+    assert np.array_equal(found["time_constant"], cooling.seen.attributes["time constant"], equal_nan=True)
+    assert torch.allclose(torch.tensor(np.array(found["opacity"])), cooling.seen.opacities)
+    colours = colours_of(cooling, "inferno", None)
+    assert np.abs(found.red / 65535 - colours[:, 0]).max() < 1e-4

@@ -1,0 +1,60 @@
+"""GeoTIFF as rasterio reads it: what lies where on the map, and how warm it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.basis import constant_basis
+from heatsplat.export.formats.map import Map
+from heatsplat.export.moment import moments
+from heatsplat.export.place import place_of
+
+rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
+
+
+@pytest.fixture
+def two_plates(cooling):
+    """Two opaque discs of 0.2 and 0.8 (image values), the warm one higher, east and north of the other."""
+    seen = replace(
+        cooling.seen,
+        means=torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.5]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        scales=torch.tensor([[0.3, 0.3, 0.01]]).repeat(2, 1),
+        opacities=torch.full((2,), 0.99),
+        layers=[replace(cooling.layer, basis=constant_basis(torch.tensor([0.2, 0.8])))],
+        attributes={"time constant": torch.tensor([100.0, 900.0])},
+    )
+    return moments(cooling.module, seen, 600.0)[0]
+
+
+def test_temperature_and_attributes_lie_where_they_are(two_plates, tmp_path):
+    form = Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep")
+    form.write(two_plates, tmp_path / "a.tif")
+    bounds = two_plates.module.scene.thermal_range
+    with rasterio.open(tmp_path / "a.tif") as found:
+        assert found.descriptions[0] == "temperature [deg C]" and found.descriptions[1] == "time_constant"
+        assert (found.width, found.height) == (300, 300) and np.isnan(found.nodata)
+        places = place_of(two_plates.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(two_plates.seen.means).tolist()
+        for (x, y, _), unit, seconds in zip(places, (0.2, 0.8), (100.0, 900.0), strict=True):
+            (values,) = found.sample([(x, y)])
+            assert values[0] == pytest.approx(bounds.to_celsius(unit), abs=0.02)
+            assert values[1] == pytest.approx(seconds, rel=1e-4)
+        (nothing,) = found.sample([(0.5 * (places[0][0] + places[1][0]), 0.5 * (places[0][1] + places[1][1]))])
+        assert np.isnan(nothing).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"resolution": 0}, "what.resolution must be above 0"),
+        ({"bounds": [3, 0, 1, 2]}, "what.bounds must be"),
+        ({"unseen": "show"}, "what.unseen must be nan or keep"),
+        ({"above": [0, 0, 0]}, "what.above must be a direction"),
+    ],
+)
+def test_settings_that_make_no_map_are_named(settings, message):
+    with pytest.raises(SceneError, match=message):
+        Map(**settings)

@@ -1,0 +1,46 @@
+"""The Gaussians at a moment: what they are and what is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.basis import constant_basis
+from heatsplat.export.moment import moments
+from heatsplat.shots import at_time
+
+
+def test_temperatures_are_those_that_the_model_sends(cooling):
+    module, scene = cooling.module, cooling.module.scene
+    frame = at_time(scene, scene.train.frames[0], 600.0)
+    expected = scene.thermal_range.to_celsius(module.emissions(module.splats, frame)[:, 0])
+    assert cooling.quantity == "temperature" and len(expected) == len(cooling.values)
+    assert (cooling.values.clamp(*cooling.seen.limits) - expected.clamp(*cooling.seen.limits)).abs().max() < 0.1
+
+
+def test_a_layer_is_what_it_says(cooling):
+    (truth,) = moments(cooling.module, cooling.seen, 600.0, "truth")
+    expected = cooling.module.scene.truth(cooling.seen.means, torch.tensor([600.0], dtype=torch.float64))[:, 0]
+    assert (truth.values - expected).abs().max() < 0.1
+    with pytest.raises(SceneError, match=r"layer=surface: this method and scene have camera, truth only"):
+        moments(cooling.module, cooling.seen, 600.0, "surface")
+    with pytest.raises(SceneError, match="layer must be one of auto, camera"):
+        moments(cooling.module, cooling.seen, 600.0, "air")
+
+
+def test_several_moments_and_none_outside_the_record(cooling):
+    found = moments(cooling.module, cooling.seen, [100.0, 600.0, 900.0])
+    assert [one.time_s for one in found] == [100.0, 600.0, 900.0]
+    assert torch.equal(found[1].values, cooling.values) and not torch.equal(found[0].values, cooling.values)
+    with pytest.raises(SceneError, match=r"time=-500 s lies outside the record, which runs from -30.638 to"):
+        moments(cooling.module, cooling.seen, -500.0)
+
+
+def test_a_scene_without_times_has_one_moment(cooling):
+    still = replace(cooling.layer, basis=constant_basis(cooling.blended))
+    seen = replace(cooling.seen, layers=[still], start_s=None, end_s=None)
+    (moment,) = moments(cooling.module, seen, None)
+    assert moment.time_s is None and torch.equal(moment.values, cooling.values)
+    with pytest.raises(SceneError, match="leave time out"):
+        moments(cooling.module, seen, 3.0)

@@ -1,0 +1,62 @@
+"""Where a scene lies: by positions that are known exactly, and by its cameras."""
+
+import math
+
+import pytest
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.place import place_of
+
+rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
+
+
+def table(scene, path, columns=("file", "latitude_deg", "longitude_deg", "altitude_m")):
+    """Positions of cameras whose world is turned by 30 degrees and 2 m a unit, at a known place of UTM zone 32."""
+    from rasterio.warp import transform
+
+    turn = math.radians(30.0)
+    lines = [",".join(columns)]
+    for frame in scene.train.frames:
+        x, y, z = frame.camera.center.tolist()
+        east = 500_000 + 2 * (math.cos(turn) * x - math.sin(turn) * y)
+        north = 5_200_000 + 2 * (math.sin(turn) * x + math.cos(turn) * y)
+        (longitude,), (latitude,) = transform("EPSG:32632", "EPSG:4326", [east], [north])
+        lines.append(f"{frame.name},{latitude:.12f},{longitude:.12f},{100 + 2 * z:.9f}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_positions_give_the_projection_the_scale_and_the_turn(cooling, tmp_path):
+    place = place_of(cooling.module.scene, table(cooling.module.scene, tmp_path / "gps.csv"))
+    assert place.crs == "EPSG:32632" and place.unit == "metre" and place.scale == pytest.approx(2.0, abs=1e-5)
+    found = place(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.5]]))
+    turn = math.radians(30.0)
+    expected = [[5e5, 5.2e6, 100.0], [5e5 + 2 * math.cos(turn), 5.2e6 + 2 * math.sin(turn), 101.0]]
+    assert (found - torch.tensor(expected, dtype=torch.float64)).abs().max() < 1e-3
+
+
+def test_without_positions_up_is_known_and_axes_are_at_right_angles(cooling):
+    place = place_of(cooling.module.scene)
+    rotation = place.similarity.rotation
+    assert place.crs is None
+    assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
+    assert torch.linalg.det(rotation) == pytest.approx(1.0)
+    along = place_of(cooling.module.scene, above=torch.tensor([1.0, 0.0, 0.0])).similarity.rotation
+    assert torch.allclose(along[2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+
+
+def test_a_table_that_places_nothing_is_refused(cooling, tmp_path):
+    scene = cooling.module.scene
+    with pytest.raises(SceneError, match="has no column latitude_deg or"):
+        place_of(scene, table(scene, tmp_path / "a.csv", ("file", "phi", "lambda", "altitude_m")))
+    (tmp_path / "b.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
+    with pytest.raises(SceneError, match="has positions of 0 of the training images"):
+        place_of(scene, tmp_path / "b.csv")
+    names = [frame.name for frame in scene.train.frames[:4]]
+    rows = [f"{name},47,9.00{i},500" for i, name in enumerate(names)]
+    (tmp_path / "c.csv").write_text("\n".join(["file,lat,lon,alt", *rows]) + "\n")
+    with pytest.raises(SceneError, match="lie on a line"):
+        place_of(scene, tmp_path / "c.csv")
+    with pytest.raises(SceneError, match="cannot be read"):
+        place_of(scene, tmp_path / "none.csv")

@@ -1,0 +1,79 @@
+"""Cameras that are found from thermal frames alone, against those that filmed them."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.colmap import read_model
+from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
+from heatsplat.datamodules.synthetic_scene.film import Size
+from heatsplat.geometry.alignment import pose_errors
+from heatsplat.preparation.features import Sift
+from heatsplat.preparation.frame import Frame, Position
+from heatsplat.preparation.frames import Reading, read_recording
+from heatsplat.preparation.poses import FindPoses, Search
+
+
+def search_of(tmp_path: Path, frames: int, **options) -> Search:
+    (tmp_path / "images").mkdir()
+    start, found = datetime(2024, 7, 1, tzinfo=UTC), []
+    for i in range(frames):
+        (tmp_path / "images" / f"f{i:03d}.tif").touch()
+        place = Position(51.0 + 1e-4 * i, 4.0, 75.0)
+        found.append(
+            Frame(
+                f"f{i:03d}",
+                Path(f"f{i:03d}.tif"),
+                0,
+                lambda: np.zeros((4, 4), np.float32),
+                time=start + timedelta(seconds=i),
+                position=place,
+            )
+        )
+    return Search(FindPoses(Sift(), **options), found, tmp_path)
+
+
+def test_few_frames_are_all_matched_and_a_video_only_with_its_neighbours(tmp_path):
+    search = search_of(tmp_path, 30, all_pairs=10, overlap=2)
+    pairs = search.pairs()
+    assert len(pairs) < 30 * 29 / 2 and len(pairs) == len(set(pairs))
+    assert {(f"f{i:03d}.tif", f"f{i + step:03d}.tif") for i in range(20) for step in (1, 2, 4, 8)} <= set(pairs)
+    search.options = FindPoses(Sift(), video=False)
+    assert len(search.pairs()) == 30 * 29 / 2
+
+
+def test_gps_counts_where_it_tells_frames_apart(tmp_path):
+    assert search_of(tmp_path, 5).origin is not None
+    (tmp_path / "b").mkdir()
+    assert search_of(tmp_path / "b", 5, gps_sd_m=(30.0, 30.0)).origin is None  # they lie within 45 m of each other
+
+
+def test_two_frames_and_photos_that_are_missing_are_refused(tmp_path):
+    with pytest.raises(SceneError, match="too few"):
+        search_of(tmp_path, 2)
+    (tmp_path / "b").mkdir()
+    with pytest.raises(SceneError, match="no photo"):
+        search_of(tmp_path / "b", 4, by="rgb")
+
+
+@pytest.mark.slow
+def test_cameras_are_found_from_thermal_frames_with_drift_dead_pixels_and_gps_noise(tmp_path):
+    recording = flight(Size(320, 256, 24, 200), duration_s=120.0)
+    write_camera(recording, tmp_path / "source", Field((47.0, 9.0, 500.0), 0.5, drift_k=0.08, dead_pixels=40))
+    frames = read_recording(tmp_path / "source", Reading()).frames
+    models = []
+    for target in (tmp_path / "one", tmp_path / "two"):
+        (target / "images").mkdir(parents=True)
+        for frame in frames:
+            (target / "images" / f"{frame.name}.tiff").symlink_to(frame.path)
+        said = FindPoses(Sift(most=1500), gps_sd_m=(0.5, 0.5))(frames, target)
+        models.append(read_model(target))
+    assert said.values["registered"] == 24 and said.values["metres_per_unit"] == 1.0
+    errors = pose_errors(torch.from_numpy(np.stack(models[0].viewmats)), torch.from_numpy(recording.viewmats))
+    assert errors.degrees.median() < 0.5 and errors.percent.median() < 1.0
+    assert float(errors.similarity.scale) == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_array_equal(np.stack(models[0].viewmats), np.stack(models[1].viewmats))
