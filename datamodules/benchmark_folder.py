@@ -59,12 +59,17 @@ def write_scenes(
     if unknown := set(scenes or ()) - set(known):
         raise SceneError(f"study.scenes: there is no {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for name in scenes or known:
-        made_from = {"protocol": protocol["version"], "size": None if name in (real or {}) else size or protocol["size"]}
+        made_from = {
+            "protocol": protocol["version"],
+            "size": None if name in (real or {}) else size or protocol["size"],
+        }
         meta = target / SCENES / name / META
         if meta.exists():
             there = json.loads(meta.read_text())
             if {key: there.get(key) for key in made_from} != made_from:
-                raise SceneError(f"{meta.parent} is of another size or protocol: delete it, or give study.target another folder")
+                raise SceneError(
+                    f"{meta.parent} is of another size or protocol: delete it, or give study.target another folder"
+                )
             log.info("%s is there already", meta.parent)
             continue
         log.info("writing %s", meta.parent)

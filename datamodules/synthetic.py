@@ -28,7 +28,7 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
+        scene: outdoor, outdoor_true, facade, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
             cooling, ..., or room_0, room_1 and so on, rooms furnished at random.
         size: tiny, demo, benchmark or large.
         frames: number of frames; None for that of the size.
@@ -60,8 +60,8 @@ class Synthetic(SceneDataModule):
         root: str | None = None,
         **options,
     ) -> None:
-        own_split = "json" if scene in YARDS or split == "parts" else "every_8th"
         in_parts = split == "parts"
+        own_split = YARDS[scene][1].split if scene in YARDS else "json" if in_parts else "every_8th"
         super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
         if scene not in PRESETS and scene not in YARDS and number_of(scene) is None:
             known = ", ".join((*PRESETS, *YARDS, f"{ROOM}0, {ROOM}1 and so on"))

@@ -70,7 +70,9 @@ def test_both_agree_where_nothing_is_nonlinear():
 @pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
-    names = Surface._fields[:-1] if solution == "linear_temperature" else tuple(UNITS)  # but for a core
+    names = (
+        Surface._fields[:-2] if solution == "linear_temperature" else tuple(UNITS)
+    )  # but for a core and heat from within
     leaves = [getattr(surface, name).clone().requires_grad_() for name in names]
     at = 40_000.0  # the start is still remembered by some
     live = surface._replace(**dict(zip(names, leaves, strict=True)))
@@ -165,14 +167,14 @@ def test_cost_does_not_depend_on_the_length_of_the_record():
 
 def test_extreme_bodies_stay_finite_in_float32():
     climate = Climate(drivers())
-    surface = Surface(*(x.float() for x in bodies(wind=True)[:-1]))._replace(
+    surface = Surface(*(x.float() for x in bodies(wind=True)[:-2]))._replace(
         log_rate=torch.tensor([math.log(1e-7), math.log(0.1), math.log(0.1), math.log(1e-7)]),
         share=torch.tensor([0.98, 0.02, 0.98, 0.02]),
         sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
         wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
     )
     for solution in (climate.linear_temperature, climate.stepped_temperature):
-        leaves = [x.clone().requires_grad_() for x in surface[:-1]]
+        leaves = [x.clone().requires_grad_() for x in surface[:-2]]
         x = solution(Surface(*leaves), 130_000.0)
         assert x.isfinite().all()
         assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves[:-1]))
@@ -242,3 +244,30 @@ def test_derivatives_by_what_lies_behind_are_those_of_the_values(climate):
             for sign in (1, -1)
         )
         torch.testing.assert_close((up - down) / 2e-4, leaf.grad, atol=0.02 * float(leaf.grad.abs().max()), rtol=0.0)
+
+
+def test_the_sun_on_bodies_without_an_end_is_what_their_table_makes_of_the_same_light(climate):
+    given = climate.drivers
+    up = tensor(0, 0, 1)
+    lit = (given.beams @ up).clamp(min=0)
+    bare = {"sky": None, "around": None, "wind_anomaly": None}
+    beams = Climate(replace(given, beams=lit[:, None] * up, light=None, **bare), semi_infinite=True)
+    level = Climate(replace(given, beams=None, light=lit, up=None, **bare), semi_infinite=True)
+    surface = Surface(tensor(0, 5, -3), tensor(1e-6, 3e-5, 1e-3).log(), tensor(60, 60, 60), normals=up.expand(3, 3))
+    truth = course(level.linear_temperature, surface._replace(normals=None))
+    assert truth.max() > 20
+    assert (course(beams.linear_temperature, surface) - truth).abs().max() < 0.2  # K, of 60 K in full sun
+
+
+@pytest.mark.parametrize("semi_infinite", [False, True])
+def test_heat_from_within_is_a_driver_that_never_changes(climate, semi_infinite):
+    there = Climate(climate.drivers, semi_infinite)
+    without = bodies(wind=True)
+    inner = tensor(0.5, 2, 0, 4)
+    heated = without._replace(inner=inner)
+    rise = there.mean_temperature(heated) - there.mean_temperature(without)
+    assert (rise[[0, 1, 3]] > 0.7 * inner[[0, 1, 3]]).all() and (rise < 1.3 * inner + 1e-9).all()
+    late = there.linear_temperature(heated, 172800.0) - there.linear_temperature(without, 172800.0)
+    assert (late[2].abs() < 1e-9) and (late[[0, 1, 3]] > 0.2).all()
+    with pytest.raises(ValueError, match="heated from within are solved about a mean only"):
+        there.stepped_temperature(heated, 3600.0)
