@@ -125,9 +125,10 @@ class QualityMetrics(pl.Callback):
         self._log(module, "val", means, step)
         if clocks["train_seconds"] is not None:
             self._log(module, "val_by_seconds", means, round(clocks["train_seconds"]))
-        self.curve = [row for row in self.curve if row["step"] < step]
-        loss = float(self._losses) / self._steps if self._steps else None
+        before = self.curve[-1].get("loss") if self.curve and self.curve[-1]["step"] == step else None
+        loss = float(self._losses) / self._steps if self._steps else before
         self._losses, self._steps = 0.0, 0
+        self.curve = [row for row in self.curve if row["step"] < step]
         self.curve.append({"step": step, **clocks, "gaussians": len(module.splats), "loss": loss, **means})
         write_csv(module.output_dir / CURVE_FILE, self.curve, tuple(self.curve[-1]))
 
