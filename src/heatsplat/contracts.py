@@ -99,6 +99,11 @@ class Camera:
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)
         return Camera(self.viewmat, self.K * scale[:, None], width, height)
 
+    def within(self, longest: int) -> Camera:
+        """The same view with at most ``longest`` pixels on its longer side."""
+        shrink = max(1.0, max(self.width, self.height) / longest)
+        return self.resized(max(1, round(self.width / shrink)), max(1, round(self.height / shrink)))
+
 
 @dataclass(frozen=True)
 class Environment:

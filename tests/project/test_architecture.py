@@ -24,7 +24,7 @@ ALLOWED = {
     "density": {"contracts", "geometry", "physics", "splats"},
     "effects": {"contracts", "geometry", "physics"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
-    "callbacks": {"contracts", "metrics", "physics", "io", "heatsplat", "uncertainty", "viewer"},
+    "callbacks": {"contracts", "geometry", "metrics", "physics", "io", "heatsplat", "shots", "uncertainty", "viewer"},
     "export": {"contracts", "geometry", "io", "physics", "renderers", "shots", "uncertainty"},
     "viewer": {"contracts", "export", "io"},
     "composition": {"training", "heatsplat"},

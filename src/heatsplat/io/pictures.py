@@ -6,6 +6,7 @@ tenths of a second; the colour maps and the tick positions are matplotlib's.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -230,6 +231,7 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
     each = FIGURE_PANEL * width / height
     barred = sum(panel.bar is not None for panel in panels)
     size = (each * len(panels) + 0.7 * barred + 0.2, FIGURE_PANEL + 0.35 + (0.2 if title else 0))
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # which lists the tables of every font it embeds
     settings = {"font.size": 8, "pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "heatsplat"}
     with matplotlib.rc_context(settings):
         figure = Figure(figsize=size, layout="constrained")
@@ -245,6 +247,11 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
                 figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit)
         date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
         figure.savefig(path, metadata={date: None})
+
+
+def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
+    """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
+    draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
 
 
 def figure_picture(figure: Figure) -> np.ndarray:
