@@ -18,13 +18,12 @@ from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import (
     SIZES,
     Recording,
-    camera_path,
     expose,
     film,
-    frame_times,
     hits,
     pixel_rays,
 )
+from heatsplat.datamodules.synthetic_scene.paths import camera_path, frame_times
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS, TABLE_TOP, Pattern, Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
