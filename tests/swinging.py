@@ -1,11 +1,12 @@
 """A wall that a swung camera films: exact images at any moment, and what a detector that lags makes of them."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import torch
 
-from heatsplat.contracts import Camera, Frame
+from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.datamodules.synthetic_scene.moving import Bolometers
 
 HEIGHT, WIDTH, HZ = 32, 40, 30.0
@@ -44,3 +45,41 @@ def frames():
 def recorded(tau, readout):
     """What a simulated camera reads, [F, H, W] float64."""
     return Bolometers(tau, readout).images(lambda at: (wall(t)[0] for t in at), TIMES.numpy(), HEIGHT)
+
+
+def film(found=None):
+    """The scene of these frames."""
+    views = ViewSet(found or frames(), lambda index: None)
+    return SceneData("wall", views, views, views, torch.zeros(4, 3))
+
+
+def ready(part, **raw):
+    """A part of a sensor that has seen the scene, with these raw parameters."""
+    part = part.double()
+    part.prepare(film())
+    with torch.no_grad():
+        for name, value in raw.items():
+            getattr(part, name).fill_(value)
+    return part
+
+
+def through(chain, i):
+    """What a chain of parts makes of the clean image of a frame, [H, W]."""
+    image, depth = wall(TIMES[i].item())
+    return chain(image[..., None], frames()[i], depth)[..., 0]
+
+
+def points_on_a_wall(images, hz=1.0):
+    """The wall in these images [F, H, W] with noise, and points on it; its times are ``hz`` times too fast."""
+    generator = torch.Generator().manual_seed(0)
+    images = images + 0.002 * torch.randn(images.shape, generator=generator)
+    known = [replace(one, time_s=one.time_s / hz) for one in frames()]
+    views = ViewSet(known, lambda i: View(known[i], images[i, ..., None].float()))
+    spots = torch.cat([4 * torch.rand(500, 2, generator=generator) - 2, torch.zeros(500, 1)], 1)
+    empty = views.subset([])
+    return SceneData("wall", views, empty, empty, spots)
+
+
+def clean():
+    """Clean images of all frames, [F, H, W]."""
+    return torch.stack([wall(t)[0] for t in TIMES.tolist()])

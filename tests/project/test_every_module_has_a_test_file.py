@@ -32,7 +32,6 @@ ELSEWHERE = {
         "effects/base effects/surface effects/weather_record effects/physical/attenuation "
         "effects/physical/harmonic_source effects/physical/reflection effects/physical/relaxation"
     ),
-    "effects/test_image_motion": "effects/physical/rolling_readout effects/physical/thermal_lag",
     "effects/test_joint_fit": (
         "effects/joint/data effects/joint/evidence effects/joint/image_grid effects/joint/least_squares effects/joint/model "
         "effects/joint/selection effects/joint/terms effects/physical/agc effects/physical/fixed_pattern "
