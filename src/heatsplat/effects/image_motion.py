@@ -18,6 +18,7 @@ ROUNDS = 6
 FAST = 0.9  # quantile of speeds that counts as fast
 SURE = 5.0  # standard errors that an estimate has to be away from zero
 WIDE_PX = 0.25  # displacements that are smaller in fast images are as good as none
+LONGEST_S = 0.1  # what takes longer is none of a detector: it is the scene that changes
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Delays:
 
     @property
     def sure(self) -> Tensor:
-        """[2] whether they stand out of their errors."""
-        return self.seconds.abs() > SURE * self.errors
+        """[2] whether they stand out of their errors, and a detector may take as long."""
+        return (self.seconds.abs() > SURE * self.errors) & (self.seconds.abs() < LONGEST_S)
 
     def undone(self, obs: Observations) -> Tracks:
         """The tracks without the delays; the same where these are none or too small to matter.
