@@ -20,7 +20,7 @@ def evidence(inspected: Inspection) -> Evidence:
     late, error, trail = 1e3 * found.seconds[0].item(), 1e3 * found.errors[0].item(), found.pixels[0].item()
     why = f"images are {late:.2g} ± {error:.1g} ms late: {trail:.2g} pixels at the {found.fast_px_s:.3g} a second of fast ones"
     if not found.sure[0]:
-        return Evidence(0.0, f"{why}, no more than chance, or none of a detector")
+        return Evidence(0.0, f"{why}, no more than chance, or no detector's")
     if trail < 0:
         return Evidence(0.0, f"{why}, which is no lag but clocks that disagree")
     return Evidence(trail / WIDE_PX, why)
