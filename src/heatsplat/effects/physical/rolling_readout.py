@@ -18,7 +18,11 @@ def evidence(inspected: Inspection) -> Evidence:
         f"the last row is read {takes:.2g} ± {error:.1g} ms after the first: both are off by {shift:.2g} pixels at the "
         f"{found.fast_px_s:.3g} a second of fast ones"
     )
-    return Evidence(shift / WIDE_PX, why) if found.sure[1] else Evidence(0.0, f"{why}, no more than chance, or no detector's")
+    return (
+        Evidence(shift / WIDE_PX, why)
+        if found.sure[1]
+        else Evidence(0.0, f"{why}, no more than chance, or no detector's")
+    )
 
 
 EFFECT = Effect(
