@@ -16,6 +16,7 @@ from torch import Tensor
 from heatsplat.datamodules.synthetic_scene.carried import Carried
 from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws, Gloss, Haze
 from heatsplat.datamodules.synthetic_scene.heat import Material, Waveform, periodic
+from heatsplat.datamodules.synthetic_scene.moving import Bolometers
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
 
 # Directions (cycles per wavelength) and phases of the smooth part of every pattern: three waves that share no axis.
@@ -122,6 +123,7 @@ class Preset:
         flaws: what is wrong with the thermal camera, or None for nothing but noise.
         gloss: what its surfaces are besides black bodies, or None.
         diffusivity: of heat along the surfaces, in m²/s; exact on flat ones, as if they had no end. 0 for none.
+        video_hz: frames per second of a camera that is swung; None for single frames all through the record.
         carried: a hot ball that is carried through the scene, or None.
         bounds_c: temperatures of black and white in the camera's images; None for those that its frames need.
         effects: names of the effects that it shows (``heatsplat.effects.catalogue``), which is what ought to be found.
@@ -145,6 +147,7 @@ class Preset:
     approach_m: float = 0.15
     gloss: Gloss | None = None
     diffusivity: float = 0.0
+    video_hz: float | None = None
     carried: Carried | None = None
     bounds_c: tuple[float, float] | None = None
     effects: frozenset[str] = frozenset()
@@ -157,6 +160,8 @@ class Preset:
             raise ValueError(f"preset starts surfaces that it does not have: {sorted(unknown)}; it has {sorted(names)}")
         if unknown := self.bare - set(names):
             raise ValueError(f"preset has no points on surfaces that it does not have: {sorted(unknown)}")
+        if self.flaws and self.flaws.detector and self.video_hz is None:
+            raise ValueError("a detector that lags or is read row by row needs a camera that is swung: give video_hz")
         if self.held and self.lamp is not None:
             raise ValueError("a preset is either held steady or heated by a lamp, not both")
         if self.carried is not None and (self.held or self.lamp is not None or self.diffusivity):
@@ -370,6 +375,15 @@ PRESETS: dict[str, Preset] = {
         surfaces=TABLE_TOP,
         flaws=replace(_GOOD, drift=0.02, bend=0.25),
         effects=_shows("frame_offset", "tone"),
+    ),
+    "swung": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, video_hz=30.0),
+    "moving_camera": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        video_hz=30.0,
+        flaws=replace(_GOOD, detector=Bolometers(tau_s=0.012, readout_s=0.020)),
+        effects=_shows("thermal_lag", "rolling_readout"),
     ),
     "mirrors": Preset(
         start_k=_WARM,
