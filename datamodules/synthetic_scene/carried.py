@@ -57,9 +57,7 @@ class Carried:
             shapes: what may stand between.
             ambient_c: what the surface would see in place of the ball.
         """
-        excess = STEFAN_BOLTZMANN * (
-            (self.celsius + KELVIN_AT_0_C) ** 4 - (ambient_c + KELVIN_AT_0_C) ** 4
-        )
+        excess = STEFAN_BOLTZMANN * ((self.celsius + KELVIN_AT_0_C) ** 4 - (ambient_c + KELVIN_AT_0_C) ** 4)
         result = points.new_zeros(len(points), len(self.stations))
         for k, station in enumerate(self.stations):
             to_ball = points.new_tensor(station) - points

@@ -53,7 +53,9 @@ def parts_of(
     for i in left[math.ceil(near / 2) :: near]:
         parts[i] = "near"
     if TRAIN not in parts or set(parts) == {TRAIN}:
-        raise SceneError(f"data.parts leaves {parts.count(TRAIN)} of {len(parts)} frames to train on; give other shares")
+        raise SceneError(
+            f"data.parts leaves {parts.count(TRAIN)} of {len(parts)} frames to train on; give other shares"
+        )
     return parts
 
 

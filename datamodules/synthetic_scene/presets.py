@@ -160,7 +160,9 @@ class Preset:
         if self.held and self.lamp is not None:
             raise ValueError("a preset is either held steady or heated by a lamp, not both")
         if self.carried is not None and (self.held or self.lamp is not None or self.diffusivity):
-            raise ValueError("a preset with a carried source has no other: neither a lamp, nor held or conducting surfaces")
+            raise ValueError(
+                "a preset with a carried source has no other: neither a lamp, nor held or conducting surfaces"
+            )
 
 
 # Exchange coefficients are those of a room with moving air, radiation included. Depths are chosen so that the time
