@@ -69,8 +69,8 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
     if missing := [name for name, file in files.items() if file is None]:
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise SceneError(
-            f"{handed_in} lacks {len(missing)} of the {len(names)} held-out views of {scene.name}: {', '.join(missing[:5])}{more}. "
-            f"Render every view of {scene / 'transforms_test.json'} and write it to {handed_in}/<view>.tiff (or .npy)"
+            f"{handed_in} lacks {len(missing)} of the {len(names)} held-out views of {scene.name}: "
+            f"{', '.join(missing[:5])}{more}. Render every view of {scene / 'transforms_test.json'} and write it to {handed_in}/<view>.tiff (or .npy)"
         )
     scorer, rows = Scorer(bounds), []
     for name, file in files.items():
@@ -174,7 +174,8 @@ def scenes_in(root: Path) -> list[str]:
     )
     if not names:
         raise SceneError(
-            f"{root} has no scenes/ and truth/ of the protocol: write them with python src/study.py study=scenes study.target={root}"
+            f"{root} has no scenes/ and truth/ of the protocol; write them: python src/study.py study=scenes "
+            f"study.target={root}"
         )
     return names
 

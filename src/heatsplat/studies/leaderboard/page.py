@@ -15,7 +15,7 @@ from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, beside_the_best, summary
+from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, beside_reference, summary
 from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -31,10 +31,11 @@ def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
         folder: where the page lies, for links to the settings of runs; None leaves links out.
     """
     score = board.protocol["scores"][0]
-    beside = beside_the_best(entries, score)
+    beside = beside_reference(entries, board)
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     content = {
         "score": score,
+        "reference": board.protocol["reference"],
         "unit": DEFINITIONS[score].unit,
         "definitions": {name: DEFINITIONS[name].sentence for name in board.protocol["scores"]},
         "tracks": {track: " ".join(board.protocol["tracks"][track]) for track in board.tracks},

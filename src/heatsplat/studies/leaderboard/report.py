@@ -12,7 +12,7 @@ from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import Entry, beside_the_best, standings, summary
+from heatsplat.studies.leaderboard.standings import Entry, beside_reference, standings, summary
 
 log = logging.getLogger("heatsplat")
 
@@ -49,8 +49,8 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
         "",
         f"A cell is {score} ({unit}) of the held-out views, mean over seeds, with the ranks that the seeds allow: methods whose "
         "difference is below two of its standard errors are tied, and share their ranks. What ran with one seed is taken to "
-        "spread as much as the others do on average. `of the best` is the geometric mean over its scenes of a method's error "
-        "as a multiple of the best error there.",
+        f"spread as much as the others do on average. The first column is the geometric mean, over the scenes that both ran on, of "
+        f"a method's error as a multiple of that of `{board.protocol['reference']}`; methods that ran on few scenes compare there only.",
         "",
     ]
     for track in board.tracks:
@@ -58,6 +58,8 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
         if not any(entry.scores for entry in own):
             continue
         settings = " ".join(board.protocol["tracks"][track])
+        if steps := sorted({int(cost["steps"]) for entry in own for cost in entry.costs if cost.get("steps")}):
+            settings += f"`; steps taken: `{steps[0]:,}" + (f" to {steps[-1]:,}" if len(steps) > 1 else "")
         lines += [f"## Equal {track}", "", f"`{settings}`", "", *_table(own, board, track), ""]
         lines += [f"### By what is held out, equal {track}", "", *_parts(own, board), ""]
         if reasons := _reasons(own):
@@ -72,14 +74,14 @@ def _clock(board: Board) -> str:
 
 def order(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
     """Methods of a track, the best first; those without results last."""
-    beside = beside_the_best(entries, board.protocol["scores"][0])
+    beside = beside_reference(entries, board)
     names = list(dict.fromkeys(entry.method for entry in entries))
     return sorted(names, key=lambda name: beside.get((name, track), (float("inf"), 0))[0])
 
 
 def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
     score = board.protocol["scores"][0]
-    beside = beside_the_best(entries, score)
+    beside = beside_reference(entries, board)
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     places = {(entry.method, entry.scene): entry for entry in entries}
     rows = []
@@ -87,11 +89,11 @@ def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
         own = [places.get((method, scene)) for scene in scenes]
         if not any(one and one.scores for one in own):
             continue
-        ratio, count = beside[method, track]
+        ratio, count = beside.get((method, track), (None, 0))
         seconds = [one.cost("seconds") for one in own if one and one.cost("seconds") is not None]
         told = number(sum(seconds) / len(seconds) if seconds else None, 0)
-        rows.append([f"`{method}`", f"{ratio:.2f}", count, told, *(_cell(one, score) for one in own)])
-    head = ["method", "of the best", "scenes", f"s ({_clock(board)})", *scenes]
+        rows.append([f"`{method}`", number(ratio, 2), count, told, *(_cell(one, score) for one in own)])
+    head = ["method", f"x {board.protocol['reference']}", "scenes", f"s ({_clock(board)})", *scenes]
     return markdown_table(head, rows, "lrrr" + "r" * len(scenes))
 
 
@@ -109,7 +111,7 @@ def _cell(entry: Entry | None, score: str) -> str:
 
 
 def _parts(entries: Sequence[Entry], board: Board) -> list[str]:
-    """Mean over scenes of each part's score, as a multiple of the best there."""
+    """The three best of each part of each scene."""
     score = board.protocol["scores"][0]
     parts = list(dict.fromkeys(part for entry in entries for one in entry.scores for part in one.parts))
     scenes = list(dict.fromkeys(entry.scene for entry in entries))

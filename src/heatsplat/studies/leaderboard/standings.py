@@ -182,13 +182,16 @@ def ranks(values: Sequence[Sequence[float]], usual: float | None, higher: bool =
     return found
 
 
-def beside_the_best(entries: Sequence[Entry], score: str) -> dict[tuple[str, str], tuple[float, int]]:
-    """(method, track) -> geometric mean over scenes of its error as a multiple of the best there, and of how many scenes."""
+def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, str], tuple[float, int]]:
+    """(method, track) -> geometric mean of its error as a multiple of the reference's, over the scenes that both ran on, and
+    their number; a method without such a scene is left out."""
+    score, reference = board.protocol["scores"][0], board.protocol["reference"]
     logs: dict[tuple[str, str], list[float]] = {}
     for scene, track in dict.fromkeys((entry.scene, entry.track) for entry in entries):
         own = {e.method: e.mean(score) for e in entries if (e.scene, e.track) == (scene, track) and e.mean(score)}
         for method, value in own.items():
-            logs.setdefault((method, track), []).append(math.log(value / min(own.values())))
+            if reference in own:
+                logs.setdefault((method, track), []).append(math.log(value / own[reference]))
     return {key: (math.exp(statistics.fmean(found)), len(found)) for key, found in logs.items()}
 
 
