@@ -70,7 +70,8 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise SceneError(
             f"{handed_in} lacks {len(missing)} of the {len(names)} held-out views of {scene.name}: "
-            f"{', '.join(missing[:5])}{more}. Render every view of {scene / 'transforms_test.json'} and write it to {handed_in}/<view>.tiff (or .npy)"
+            f"{', '.join(missing[:5])}{more}. Render every view of {scene / 'transforms_test.json'} and write it to "
+            f"{handed_in}/<view>.tiff (or .npy)"
         )
     scorer, rows = Scorer(bounds), []
     for name, file in files.items():

@@ -186,7 +186,10 @@ class RowSweeper(BasicSweeper):
     def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
         """Composes every job before any starts, unless the launcher does so by itself: a hundred take a minute."""
         if not isinstance(self.launcher, JobLauncher):
-            super().validate_batch_is_legal(batch)
+            # Of a leaderboard one job per method and track: scenes and seeds make no other configuration.
+            alike = ("data.scene=", "seed=", "callbacks.temperatures.image=")
+            told = {tuple(text for text in job if not text.startswith(alike)): job for job in batch}
+            super().validate_batch_is_legal(list(told.values()) if self.board else batch)
 
     def _plan(self, arguments: list[str]) -> bool:
         """Plans the runs of a published table and tells them, with what is missing; False where nothing is to be done.

@@ -49,8 +49,8 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
         "",
         f"A cell is {score} ({unit}) of the held-out views, mean over seeds, with the ranks that the seeds allow: methods whose "
         "difference is below two of its standard errors are tied, and share their ranks. What ran with one seed is taken to "
-        f"spread as much as the others do on average. The first column is the geometric mean, over the scenes that both ran on, of "
-        f"a method's error as a multiple of that of `{board.protocol['reference']}`; methods that ran on few scenes compare there only.",
+        f"spread as much as the others do on average. `x {board.protocol['reference']}` is the geometric mean of a method's "
+        "error as a multiple of that method's, over the scenes that both ran on.",
         "",
     ]
     for track in board.tracks:
