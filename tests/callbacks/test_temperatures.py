@@ -9,7 +9,6 @@ from heatsplat.callbacks.temperatures import TemperatureRenders
 from heatsplat.contracts import Camera, Frame, ThermalRange, View
 from heatsplat.io.tiff import read_temperature
 
-
 BOUNDS = ThermalRange(10.0, 30.0)
 
 
