@@ -28,7 +28,7 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
     assert "- `etgs` on driven: heatsplat.contracts.SceneError: scene 'x' lacks weather" in text
     assert (
-        "- `3dgs` on driven: not run yet" in text and "- `supirgs` on cooling, driven: made for coarse_camera" in text
+        "- `3dgs` on driven: not run yet" in text and "- `supirgs` on cooling, driven: made for coarse images" in text
     )
     rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
     found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]

@@ -42,7 +42,7 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert [found[name, "cooling"].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
     assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
     assert found["3dgs", "driven"].reason == "not run yet"
-    assert found["supirgs", "driven"].reason.startswith("made for coarse_camera")
+    assert found["supirgs", "driven"].reason.startswith("made for coarse images")
     beside = beside_reference(list(found.values()), asked)
     assert beside["etgs", "steps"] == (pytest.approx(0.5, abs=1e-4), 1)
     (sweep / "3dgs_cooling_steps_0" / "submission" / "near_00003.tiff").unlink()

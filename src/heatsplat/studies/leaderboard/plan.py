@@ -40,11 +40,7 @@ class Board:
     def left_out(self, method: str, scene: str) -> str | None:
         """Why the protocol does not run a method on a scene; None where it does."""
         only = (self.protocol.get("only") or {}).get(method)
-        return (
-            None
-            if only is None or scene in only
-            else f"made for {', '.join(only)}; elsewhere it would throw pixels away"
-        )
+        return None if only is None or scene in only["scenes"] else only["why"]
 
     def jobs(self, given: Sequence[str] = ()) -> list[list[str]]:
         """Overrides of every run, those of the command line first; all methods and scenes with one seed before the next."""
