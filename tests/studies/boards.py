@@ -14,7 +14,7 @@ PROTOCOL = yaml.safe_load((Path(__file__).parents[2] / "conf" / "protocol" / "th
 VIEWS = ("near_00003", "times_00007", "times_00008")
 ASKED = {
     "protocol": PROTOCOL, "root": None, "methods": None, "scenes": None, "tracks": ["steps"], "seeds": [0, 1],
-    "clock": "cpu_seconds", "submissions": [], "document": None, "page": None, "train": True,
+    "clock": "cpu_seconds", "submissions": [], "document": None, "page": None, "train": True, "note": "On a busy machine.",
 }  # fmt: skip
 
 
@@ -27,7 +27,9 @@ def protocol_folder(root: Path, *scenes: str) -> Path:
     """scenes/ and truth/ with these scenes."""
     for scene in scenes:
         (root / "scenes" / scene).mkdir(parents=True)
-        (root / "scenes" / scene / "meta.json").write_text(json.dumps({"min_value": 15.0, "max_value": 45.0}))
+        (root / "scenes" / scene / "meta.json").write_text(
+            json.dumps({"min_value": 15.0, "max_value": 45.0, "size": "tiny"})
+        )
         for view in VIEWS:
             write_temperature(root / "truth" / scene / f"{view}.tiff", truth(view))
     return root

@@ -23,7 +23,10 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
         "board.html",
     }
     text = (tmp_path / "docs" / "board.md").read_text()
-    assert "4 runs, 0.01 h of processor time" in text and "steps taken: `2,000`" in text
+    assert (
+        "Scenes of size tiny; 4 runs, 0.01 h of processor time together; seeds 0, 1. On a busy machine." in text
+        and "steps taken: `2,000`" in text
+    )
     assert "| `3dgs` | 1.00 | 1 | 10 | **1.100 (1–2)** | – |" in text
     assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
     assert "- `etgs` on driven: heatsplat.contracts.SceneError: scene 'x' lacks weather" in text

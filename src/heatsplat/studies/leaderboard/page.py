@@ -41,6 +41,8 @@ def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
         "tracks": {track: " ".join(board.protocol["tracks"][track]) for track in board.tracks},
         "summary": summary(entries, board),
         "seeds": list(board.seeds),
+        "sizes": board.sizes,
+        "note": board.note,
         "scenes": [
             {"name": name, "shows": board.protocol["scenes"].get(name, {}).get("shows", "a recording"),
              "pictures": _pictures([one for one in entries if one.scene == name], board)}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.score import scenes_in
+from heatsplat.studies.score import META, SCENES, scenes_in
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Board:
         submissions: folders of renders of other code, scored beside.
         document, page: where the table and the page go besides the folder of the sweep; None for nowhere.
         train: False to write what is there and run nothing.
+        note: on the conditions of the runs, for the table and the page.
     """
 
     protocol: Mapping[str, Any]
@@ -36,6 +38,13 @@ class Board:
     document: Path | None = None
     page: Path | None = None
     train: bool = True
+    note: str = ""
+
+    @property
+    def sizes(self) -> list[str]:
+        """Sizes of the scenes, as they were written."""
+        metas = (json.loads((self.root / SCENES / name / META).read_text(encoding="utf-8")) for name in self.scenes)
+        return list(dict.fromkeys(str(meta.get("size") or "as recorded") for meta in metas))
 
     def left_out(self, method: str, scene: str) -> str | None:
         """Why the protocol does not run a method on a scene; None where it does."""
@@ -113,5 +122,5 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str]) -> Board:
     return Board(
         protocol, root, **chosen, seeds=list(asked["seeds"] or protocol["seeds"]), clock=asked["clock"],
         submissions=[Path(text).expanduser() for text in asked["submissions"]],
-        document=path(asked["document"]), page=path(asked["page"]), train=asked["train"],
+        document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
     )  # fmt: skip

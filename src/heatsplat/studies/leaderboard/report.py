@@ -44,8 +44,9 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
     lines = [
         "# Leaderboard",
         "",
-        f"Every method on every scene of the [protocol](protocol.md), written by `experiment=leaderboard`. {told['runs']} runs, "
-        f"{told['hours']:.2f} h of {_clock(board)} together; {len(board.seeds)} seed{'s' * (len(board.seeds) > 1)} asked for.",
+        f"Every method on every scene of the [protocol](protocol.md), written by `experiment=leaderboard`. Scenes of size "
+        f"{', '.join(board.sizes)}; {told['runs']} runs, {told['hours']:.2f} h of {_clock(board)} together; seeds "
+        f"{', '.join(map(str, board.seeds))}. {board.note}".rstrip(),
         "",
         f"A cell is {score} ({unit}) of the held-out views, mean over seeds, with the ranks that the seeds allow: methods whose "
         "difference is below two of its standard errors are tied, and share their ranks. What ran with one seed is taken to "
