@@ -83,7 +83,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
 
     Args:
         folder: what is handed out.
-        truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count.
+        truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count; and images/.
         also: further keys of meta.json.
 
     Raises:
@@ -105,10 +105,11 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
             frames.append(entry)
             if subset == "train":
                 _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
-                if view.rgb is not None:
-                    _png(folder / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
             else:
                 _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
+            if view.rgb is not None:
+                place = folder if subset == "train" else truth
+                _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
         _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
     points = scene.points.double().numpy()
     colors = np.full_like(points, 0.5) if scene.point_colors is None else scene.point_colors.double().numpy()
