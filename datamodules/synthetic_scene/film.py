@@ -27,6 +27,8 @@ _FIELD_OF_VIEW_DEG = 48.0
 _LOOK_AT = (0.0, 0.15, 0.3)
 # Frames come faster at the start, when things change fastest: time grows as this power of the frame number.
 _HASTE = 1.4
+# Colour of a source that is hot enough to be seen in the dark.
+_GLOWING = (0.9, 0.35, 0.15)
 # The camera runs this long after the heat has begun to flow, in seconds; a surface changes infinitely fast at first.
 _FIRST_FRAME_S = 20.0
 
@@ -44,7 +46,8 @@ class Size:
 SIZES = {
     "tiny": Size(64, 52, 19, 600),
     "demo": Size(160, 128, 72, 4000),
-    "large": Size(512, 410, 240, 20000),
+    "benchmark": Size(320, 256, 120, 8000),
+    "large": Size(640, 512, 240, 20000),
 }
 
 
@@ -62,7 +65,7 @@ class Recording:
         thermal_range: the scene's own, or whole degrees that enclose all noise-free temperatures with half a degree to spare.
         points: [P, 3] float64 points seen in the frames, a few millimetres off their surfaces.
         point_colors: [P, 3] in [0, 1].
-        clean: [F, H, W] float32 temperatures without noise and flaws; None where the camera has no flaws.
+        exact: [F, H, W] float32 temperatures without noise and flaws.
     """
 
     scene: Scene
@@ -74,7 +77,12 @@ class Recording:
     thermal_range: ThermalRange
     points: np.ndarray
     point_colors: np.ndarray
-    clean: np.ndarray | None = None
+    exact: np.ndarray
+
+    @property
+    def clean(self) -> np.ndarray | None:
+        """``exact`` where the camera has flaws; None where it has none but noise."""
+        return self.exact if self.scene.preset.flaws else None
 
     def shows(self, frame: int, surface: str) -> np.ndarray:
         """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
@@ -111,7 +119,8 @@ def film(
     lens = _lens(size, distortion, pixel_aspect)
     times, viewmats = (scene.route or partial(_by_hand, scene.preset))(size.frames, seed)
     rays = pixel_rays(lens, pixel_centres(lens))
-    celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
+    exact = np.empty((size.frames, size.height, size.width), dtype=np.float32)
+    celsius = np.empty_like(exact)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
     lows, highs = np.empty(size.frames), np.empty(size.frames)
     flaws = scene.preset.flaws
@@ -119,6 +128,7 @@ def film(
     def shoot(frame: int) -> None:
         temperature, color = expose(scene, lens, rays, viewmats[frame], float(times[frame]))
         lows[frame], highs[frame] = temperature.min().item(), temperature.max().item()
+        exact[frame] = temperature.numpy()
         if noise_k and not flaws:
             temperature = temperature + _noise(noise_k, temperature, seed, frame)
         celsius[frame] = temperature.numpy()
@@ -129,10 +139,9 @@ def film(
         count = max(round(size.points / scene.preset.sparseness), 16)
         points, colors = sparse_points(scene, lens, viewmats, count, seed)
     enclosing = ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5))
-    thermal_range, clean = scene.thermal_range or enclosing, None
+    thermal_range = scene.thermal_range or enclosing
     if flaws:
-        clean = celsius
-        recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(torch.from_numpy(clean).double()), seed))
+        recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(torch.from_numpy(exact).double()), seed))
         if noise_k:
             recorded = recorded + torch.stack([_noise(noise_k, one, seed, i) for i, one in enumerate(recorded)])
         celsius = recorded.float().numpy()
@@ -146,7 +155,7 @@ def film(
         thermal_range=thermal_range,
         points=points.numpy(),
         point_colors=colors.numpy(),
-        clean=clean,
+        exact=exact,
     )
 
 
@@ -282,6 +291,10 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
             ambient = scene.preset.ambient_c
             share = haze.transmission(distance, time_s / scene.preset.duration_s)
             celsius = ambient + (celsius - ambient) * share
+        center = -(viewmat[:3, :3].T @ viewmat[:3, 3])[None]
+        hot = scene.in_front(center, directions @ viewmat[:3, :3], points, which, time_s)
+        if hot.any():
+            celsius[hot], color[hot] = scene.preset.carried.celsius, color.new_tensor(_GLOWING)
         return celsius, color, scene.transmits[which] > 0
 
     celsius, color, clear = look(rays)
