@@ -159,6 +159,7 @@ class OutdoorPreset(Preset):
         bounds_c: temperatures of black and white, the same in every weather, so that one model serves them all.
         labels: names of the classes.
         hours: part of the solved record that is filmed, and whose weather is known, in seconds; None: all of it.
+        split: rule by which frames are held out (``datamodules.splits``); json: the last day.
     """
 
     surfaces: tuple[OutdoorSurface, ...] = YARD
@@ -170,6 +171,7 @@ class OutdoorPreset(Preset):
     bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES
     hours: tuple[float, float] | None = None
+    split: str = "json"
 
 
 OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}

@@ -99,6 +99,11 @@ class Camera:
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)
         return Camera(self.viewmat, self.K * scale[:, None], width, height)
 
+    def within(self, longest: int) -> Camera:
+        """The same view with at most ``longest`` pixels on its longer side."""
+        shrink = max(1.0, max(self.width, self.height) / longest)
+        return self.resized(max(1, round(self.width / shrink)), max(1, round(self.height / shrink)))
+
 
 @dataclass(frozen=True)
 class Environment:
@@ -408,6 +413,14 @@ class RenderOutput:
     meta: dict[str, Tensor]
     weighted: WeightedSums | None = None
     signed: Tensor | None = None
+
+    @property
+    def seen_depth(self) -> Tensor | None:
+        """Mean depth [H, W] of what is seen in the first modality, a constant; infinite where nothing is, None without."""
+        if self.depth is None:
+            return None
+        alpha = self.alpha[0].detach()
+        return torch.where(alpha > 1e-3, self.depth.detach() / alpha, torch.inf)
 
 
 def evenly_spread(count: int, limit: int) -> list[int]:

