@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
 from heatsplat.datamodules.synthetic_scene.outdoor import SKIES, OutdoorScene, in_weather, training_frames
 from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, YARDS
+from heatsplat.datamodules.synthetic_scene.parts import TRAIN, parts_of, rules
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.rooms import ROOM, number_of, room
 from heatsplat.datamodules.synthetic_scene.scene import Scene
@@ -26,16 +28,18 @@ class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
+        scene: outdoor, outdoor_true, facade, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
             cooling, ..., or room_0, room_1 and so on, rooms furnished at random.
-        size: tiny, demo or large.
+        size: tiny, demo, benchmark or large.
         frames: number of frames; None for that of the size.
         noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
         only: name of a surface; only its pixels count. None: all do.
         weather: outdoors: fair (None), calm, windy or overcast; all start from the same midnight.
         days: of outdoor_true: 2 to 7, of which the last is held out; None takes 2.
-        split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere.
+        split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere. "parts" holds
+            out several parts, whose names begin those of their frames, and gives every view its exact image.
+        parts: what "parts" leaves out (``synthetic_scene.parts.parts_of``).
         root: not used; the name is there so that every data set takes the same keys.
         **options: of ``SceneDataModule``: downscale, seed, ...
     """
@@ -52,11 +56,13 @@ class Synthetic(SceneDataModule):
         weather: str | None = None,
         days: int | None = None,
         split: str | None = None,
+        parts: Mapping[str, Any] | None = None,
         root: str | None = None,
         **options,
     ) -> None:
-        own_split = "json" if scene in YARDS else "every_8th"
-        super().__init__(root=root, scene=scene, split=split or own_split, **options)
+        in_parts = split == "parts"
+        own_split = YARDS[scene][1].split if scene in YARDS else "json" if in_parts else "every_8th"
+        super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
         if scene not in PRESETS and scene not in YARDS and number_of(scene) is None:
             known = ", ".join((*PRESETS, *YARDS, f"{ROOM}0, {ROOM}1 and so on"))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
@@ -79,6 +85,7 @@ class Synthetic(SceneDataModule):
         self.scene_seed = scene_seed
         self.only = only
         self.weather, self.days = weather, days
+        self.parts = rules(parts) if in_parts else None
 
     def load(self) -> SceneData:
         """The recording as a scene; its truth and probes come from the solver."""
@@ -91,6 +98,9 @@ class Synthetic(SceneDataModule):
         indoors = None if outdoors else Scene(PRESETS[self.scene_name] if number is None else room(number))
         recording = film(world or indoors, self.size, self.scene_seed, self.noise_k)
         preset, count = recording.scene.preset, len(recording.times_s)
+        parts = ["frame"] * count
+        if self.parts is not None:
+            parts = parts_of(recording.times_s, recording.viewmats, **self.parts)
         names = [surface.name for surface in preset.surfaces]
         if self.only is not None and self.only not in names:
             raise SceneError(f"data.only={self.only}: scene '{self.scene_name}' has {', '.join(names)}")
@@ -100,14 +110,14 @@ class Synthetic(SceneDataModule):
             self.scene_name,
             [
                 RawFrame(
-                    name=f"frame_{frame:05d}.png",
+                    name=f"{parts[frame]}_{frame:05d}.png",
                     viewmat=recording.viewmats[frame],
                     lens=recording.lens,
                     read=partial(recording.grey, frame, np.uint16),
                     read_rgb=partial(recording.rgb.__getitem__, frame),
                     read_mask=None if self.only is None else partial(recording.shows, frame, self.only),
                     time_s=float(time_s),
-                    subset="train" if frame < training_frames(count) else "test",
+                    subset=self._subset(parts[frame], frame, count),
                 )
                 for frame, time_s in enumerate(recording.times_s)
             ],
@@ -128,7 +138,11 @@ class Synthetic(SceneDataModule):
             **(_of_the_yard(world, recording) if outdoors else {}),
             **({"true_attributes": recording.scene.grey_bodies} if indoors and indoors.mirrors else {}),
         )
-        return scene if recording.clean is None else _with_clean(scene, recording)
+        return scene if recording.clean is None and self.parts is None else _with_clean(scene, recording)
+
+    def _subset(self, part: str, frame: int, count: int) -> str:
+        trains = frame < training_frames(count) if self.parts is None else part == TRAIN
+        return "train" if trains else "test"
 
 
 def _of_the_yard(world: OutdoorScene, recording: Recording) -> dict[str, Any]:
@@ -147,16 +161,14 @@ def _with_clean(scene: SceneData, recording: Recording) -> SceneData:
     def known(views: ViewSet) -> ViewSet:
         def decode(position: int) -> View:
             view = views[position]
-            image = torch.from_numpy(recording.clean[view.frame.frame_id])[..., None]
+            image = torch.from_numpy(recording.exact[view.frame.frame_id])[..., None]
             unit = scene.thermal_range.to_unit(image).clamp(0.0, 1.0)
             return replace(view, clean=resampled(unit, view.camera.height, view.camera.width, "area"))
 
         return ViewSet(views.frames, decode)
 
-    notes = {
-        **scene.notes,
-        "camera": "has flaws (effects); clean_* scores are against its clean record",
-    }
+    flaws = "has noise" if recording.clean is None else "has flaws (effects)"
+    notes = {**scene.notes, "camera": f"{flaws}; clean_* scores are against its clean record"}
     return replace(scene, train=known(scene.train), val=known(scene.val), test=known(scene.test), notes=notes)
 
 

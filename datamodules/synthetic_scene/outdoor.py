@@ -157,6 +157,7 @@ class OutdoorPreset(Preset):
         weather: name of its weather in ``SKIES``.
         bounds_c: temperatures of black and white, the same in every weather, so that one model serves them all.
         labels: names of the classes.
+        split: rule by which frames are held out (``datamodules.splits``); json: the last day.
     """
 
     surfaces: tuple[OutdoorSurface, ...] = YARD
@@ -167,6 +168,7 @@ class OutdoorPreset(Preset):
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES
+    split: str = "json"
 
 
 OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}

@@ -417,6 +417,14 @@ class RenderOutput:
     weighted: WeightedSums | None = None
     signed: Tensor | None = None
 
+    @property
+    def seen_depth(self) -> Tensor | None:
+        """Mean depth [H, W] of what is seen in the first modality, a constant; infinite where nothing is, None without."""
+        if self.depth is None:
+            return None
+        alpha = self.alpha[0].detach()
+        return torch.where(alpha > 1e-3, self.depth.detach() / alpha, torch.inf)
+
 
 def evenly_spread(count: int, limit: int) -> list[int]:
     """At most ``limit`` positions out of ``count``, evenly spread, first and last among them; the first alone for one."""

@@ -50,5 +50,5 @@ def test_steps_are_those_of_the_images(flight):
     assert count == 2 and step == pytest.approx(np.sqrt((2.0**2 + 3.0**2) / 2), rel=0.05)
     assert step_across(np.where(known, off * 0.0, np.nan), owner)[0] == pytest.approx(0, abs=1e-9)
     assert seam_lines(owner)[20].sum() >= 2
-    picture = comparison({"images": values, "other": truth + 1, "this": truth}, owner, "°C")
+    picture = comparison({"images": values, "other": truth + 1, "this": truth}, owner, "°C", np.abs(values - truth))
     assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

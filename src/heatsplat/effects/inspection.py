@@ -8,6 +8,7 @@ from functools import cached_property
 from heatsplat.contracts import SceneData
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect
+from heatsplat.effects.image_motion import Delays, delays
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.fit import Fit, fit_of
 from heatsplat.effects.joint.model import Model
@@ -41,5 +42,11 @@ class Inspection:
             return None
         terms = {effect.name: effect for effect in self.effects if effect.term is not None}
         drivers = weather_record.drivers(obs)
-        fit = fit_of(Data(terms, obs.tracks, obs.times_s, obs.ambient, obs.noise, normals(obs), drivers))
+        tracks = obs.tracks if self.delays is None else self.delays.undone(obs)
+        fit = fit_of(Data(terms, tracks, obs.times_s, obs.ambient, obs.noise, normals(obs), drivers))
         return selected(fit) if fit.observations > 0 else None
+
+    @cached_property
+    def delays(self) -> Delays | None:
+        """By how long images are late as they move; None where nothing tells."""
+        return delays(self.obs)

@@ -96,13 +96,16 @@ def seam_lines(owner: np.ndarray) -> np.ndarray:
     return lines
 
 
-def comparison(maps: Mapping[str, np.ndarray], owner: np.ndarray, unit: str) -> np.ndarray:
+def comparison(
+    maps: Mapping[str, np.ndarray], owner: np.ndarray, unit: str, spread: np.ndarray | None = None
+) -> np.ndarray:
     """Maps side by side with common colours; below, how others differ from the last one, with the steps across the seams.
 
     Args:
         maps: name -> [H, W]; the last one is compared with the others.
         owner: of ``mosaic``.
         unit: of the values.
+        spread: standard deviation of the last map's pixels [H, W], which has a panel where it is known.
     """
     *others, (name, own) = maps.items()
     low, high = bounds_of(own[np.isfinite(own)])
@@ -119,6 +122,10 @@ def comparison(maps: Mapping[str, np.ndarray], owner: np.ndarray, unit: str) -> 
         log.info("%s", told)
         panels.append(Panel(image, told))
     panels[-1] = Panel(panels[-1].image, panels[-1].title, Bar(-limit, limit, unit, ERROR))
+    if spread is not None:
+        widest = error_limit_of(spread[np.isfinite(spread)])
+        bar = Bar(0.0, widest, unit, "viridis")
+        panels.append(Panel(colorize(spread, 0.0, widest, "viridis"), f"standard deviation of {name}", bar))
     count = len(maps)
     rows = [compose(panels[:count]), compose(panels[count:])]
     width = max(row.shape[1] for row in rows)

@@ -6,6 +6,7 @@ tenths of a second; the colour maps and the tick positions are matplotlib's.
 
 from __future__ import annotations
 
+import base64
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -267,6 +268,14 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
         raise OSError(f"cannot write {path}")
+
+
+def data_uri(picture: np.ndarray, quality: int = 85) -> str:
+    """An RGB picture [H, W, 3] uint8 as the ``src`` of an image in a page (WebP). Raises OSError where OpenCV lacks it."""
+    done, encoded = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise OSError("this OpenCV has no WebP encoder")
+    return f"data:image/webp;base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
 def _ticks(bar: Bar) -> list[tuple[float, str]]:

@@ -30,7 +30,7 @@ def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
 EFFECT = Effect(
     name="agc",
     stage="sensor",
-    place=4,
+    place=6,
     summary="contrast that the camera stretches from image to image",
     source="SupIR-GS, Eq. 5",
     null="the images have one gain",

@@ -62,7 +62,7 @@ def starts(data: Data) -> Sequence[Model]:
 EFFECT = Effect(
     name="fixed_pattern",
     stage="sensor",
-    place=1,
+    place=3,
     summary="uneven gain and offset of the pixels",
     source="SupIR-GS, Eq. 4",
     null="residuals average to nothing at every place of the image",

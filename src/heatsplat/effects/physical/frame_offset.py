@@ -63,7 +63,7 @@ def in_common(fit: Fit, more: Model, less: Model) -> bool:
 EFFECT = Effect(
     name="frame_offset",
     stage="sensor",
-    place=3,
+    place=5,
     summary="a level of the sensor that drifts from image to image",
     source="drift of uncooled cameras between shutters",
     null="the images have no offset in common with all their points",

@@ -37,7 +37,7 @@ def kinds(fit: Fit) -> Sequence[object]:
 EFFECT = Effect(
     name="tone",
     stage="sensor",
-    place=5,
+    place=7,
     summary="a bent curve from heat to grey",
     source="SupIR-GS, Eq. 7, 8",
     null="what a common change of an image does to its greys is a straight line of them",

@@ -85,7 +85,7 @@ def falloff(fit: Fit, none: Model) -> tuple[float, float]:
 EFFECT = Effect(
     name="vignetting",
     stage="sensor",
-    place=2,
+    place=4,
     summary="falloff of the lens towards the corners",
     source="SupIR-GS, Eq. 6",
     null="residuals do not depend on the distance from the middle of the image",

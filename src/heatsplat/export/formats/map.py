@@ -19,12 +19,14 @@ from heatsplat.export.seams import comparison, mosaic, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, surface_depth
 from heatsplat.geometry.looks import surface_points
 from heatsplat.io.pictures import write_png
-from heatsplat.shots import sightings
+from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
 
 AWAY = 1000.0  # half widths of the map from which it is seen: what stands h high is displaced by h / 1000 at its edge
 LARGEST = 8192  # pixels of a side
+DEVIATION = "standard deviation"  # band of it
 MARGIN = 0.02  # of the longer side, around the scene's points
 
 
@@ -41,6 +43,7 @@ class Map(Format):
         gps: table of camera positions, "auto" or None (``export.place``); without one the map has no CRS.
         above: [x, y, z] direction in the world from which the map is seen; None finds it (``export.place``).
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
+        uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``).
         against: such a map of another run on the same scene: a picture beside the file (.png) compares this map with it and with
             a mosaic of the recorded images, seams and all (``export.seams``). None draws none.
     """
@@ -54,6 +57,7 @@ class Map(Format):
         gps: str | None = AUTO,
         above: Sequence[float] | None = None,
         unseen: str = "nan",
+        uncertainty: bool = False,
         against: str | None = None,
     ) -> None:
         if resolution is not None and not resolution > 0:
@@ -65,6 +69,7 @@ class Map(Format):
         if above is not None and (len(above) != 3 or not any(above) or gps not in (None, AUTO)):
             raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
         self.resolution, self.bounds, self.gps, self.unseen = resolution, bounds, gps, unseen
+        self.uncertainty = uncertainty
         self.against = None if against is None else Path(against).expanduser()
         self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
 
@@ -109,7 +114,8 @@ class Map(Format):
             recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
             names = ("images", name, _method(moment) if name != _method(moment) else f"{name}, this run")
             maps = dict(zip(names, (recorded, values, own), strict=True))
-            write_png(path.with_suffix(".png"), comparison(maps, owner, moment.seen.unit))
+            spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
+            write_png(path.with_suffix(".png"), comparison(maps, owner, moment.seen.unit, spread))
 
     def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
         """West and north edge, width of a pixel, columns and rows."""
@@ -152,7 +158,12 @@ class Map(Format):
             known = covered(camera, depth, sightings(scene, lambda frame: _depth(module, frame)))
             means = means.where(known[..., None], torch.nan)
         unit = seen.unit.replace("°", "deg ")
-        bands = {f"{moment.quantity} [{unit}]" if unit else moment.quantity: moment.of_blended(means[..., 0]).numpy()}
+        unit = f" [{unit}]" if unit else ""
+        bands = {f"{moment.quantity}{unit}": moment.of_blended(means[..., 0]).numpy()}
+        if self.uncertainty:
+            frame = at_time(module.scene, Frame("map", first_free_id(module.scene), camera), moment.time_s)
+            deviation = Uncertainty(module).deviation(frame)
+            bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
         return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
 
 
