@@ -7,8 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import median_filter, uniform_filter
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry.projection import to_camera, to_pixels
@@ -18,7 +19,7 @@ log = logging.getLogger("heatsplat")
 
 WINDOW = 9  # pixels over which a side of a seam is averaged
 APART = 7  # pixels from a seam to the middle of its side
-GROUND = 41  # pixels over which the ground is smoothed
+GROUND = 32  # pixels of a block of the ground
 LEAST = 40  # pairs of pixels of a seam that counts
 
 
@@ -55,11 +56,22 @@ def mosaic(scene: SceneData, points: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(depth: Tensor) -> Tensor:
-    """A depth map [H, W] without its roughness: means over GROUND pixels, for images lie on the ground as a whole."""
-    known = depth.isfinite().double().numpy()
-    share = uniform_filter(known, GROUND)
-    mean = uniform_filter(depth.where(depth.isfinite(), 0.0).double().numpy(), GROUND) / share.clip(1e-9)
-    return torch.from_numpy(np.where(share > 0.05, mean, np.inf))
+    """A depth map [H, W] as the ground as a whole lies: medians of blocks and of their neighbours, linear in between."""
+    height, width = depth.shape
+    known = torch.where(depth.isfinite(), depth, torch.nan).double().numpy()
+    if not np.isfinite(known).any():
+        return depth.double()
+    rows, columns = (-(-side // GROUND) for side in (height, width))
+    padded = np.full((rows * GROUND, columns * GROUND), np.nan)
+    padded[:height, :width] = known
+    cells = padded.reshape(rows, GROUND, columns, GROUND).swapaxes(1, 2).reshape(rows, columns, -1)
+    enough = np.isfinite(cells).any(-1)
+    blocks = np.full((rows, columns), np.median(known[np.isfinite(known)]))
+    blocks[enough] = np.nanmedian(cells[enough], axis=-1)
+    blocks = torch.from_numpy(median_filter(blocks, 5, mode="nearest"))[None, None]
+    return interpolate(blocks, (rows * GROUND, columns * GROUND), mode="bilinear", align_corners=False)[
+        0, 0, :height, :width
+    ]
 
 
 def step_across(values: np.ndarray, owner: np.ndarray) -> tuple[float, int]:
