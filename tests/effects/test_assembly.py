@@ -85,6 +85,8 @@ def test_a_part_stands_in_the_configuration_exactly_when_its_effect_is_on(name):
 def test_light_meets_the_camera_in_order_and_pattern_and_falloff_are_two_effects_of_one_part():
     assert list(assembled(*assembly.NAMES)["sensor"]["parts"]) == [
         "point_spread",
+        "thermal_lag",
+        "rolling_readout",
         "calibration",
         "frame_offset",
         "agc",
