@@ -29,7 +29,7 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     )
     assert "| `3dgs` | 1.00 | 1 | 10 | **1.100 (1–2)** | – |" in text
     assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
-    assert "- `etgs` on driven: heatsplat.contracts.SceneError: scene 'x' lacks weather" in text
+    assert "- `etgs` on driven: scene 'x' lacks weather" in text
     assert (
         "- `3dgs` on driven: not run yet" in text and "- `supirgs` on cooling, driven: made for coarse images" in text
     )

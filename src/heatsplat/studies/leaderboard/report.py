@@ -142,7 +142,7 @@ def _reasons(entries: Sequence[Entry]) -> list[str]:
 
 def _short(entry: Entry) -> str:
     """The reason without the name of the scene, so that scenes of one reason stand together."""
-    return entry.reason.replace(f"'{entry.scene}'", "").replace(f"scene {entry.scene}", "the scene")
+    return entry.reason.replace(f"scene '{entry.scene}'", "the scene")
 
 
 def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object]]:

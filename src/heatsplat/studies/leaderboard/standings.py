@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -108,7 +109,7 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
     if entry is None or int(overrides.get("seed", 0)) not in board.seeds:
         return
     if not (folder / METRICS_FILE).exists():
-        entry.reason = reason_of(folder)
+        entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
         return
     try:
         score = scored_once(folder, entry.scene, board)
