@@ -1,6 +1,7 @@
 """Scenes of a protocol on disk: what is handed out, what is kept, and what a reader of COLMAP or nerfstudio makes of it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,8 +79,6 @@ def test_what_is_there_stays_and_another_size_is_refused(root, tmp_path):
         write_scenes(root, PROTOCOL, size="demo", scenes=["cooling"])
     with pytest.raises(SceneError, match="there is no boiling; there are cooling, coarse_camera"):
         write_scenes(root, PROTOCOL, scenes=["boiling"])
-    from dataclasses import replace
-
     without = replace(Synthetic(scene="static", size="tiny", frames=4).scene, thermal_range=None)
     with pytest.raises(SceneError, match="scene static has no temperatures"):
         write_scene(without, tmp_path / "scene", tmp_path / "truth", {})
