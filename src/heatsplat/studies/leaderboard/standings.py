@@ -155,6 +155,17 @@ def usual_spread(values: Sequence[Sequence[float]]) -> float | None:
     return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
 
 
+def spread_of(entries: Sequence[Entry], board: Board) -> str:
+    """A sentence on what is taken for the spread of what ran with one seed."""
+    values = [entry.values(board.protocol["scores"][0]) for entry in entries]
+    if not any(len(own) == 1 for own in values):
+        return ""
+    usual = usual_spread(values)
+    if usual is None:
+        return "All ran with one seed, which tells no spread: ranks are those of the bare numbers."
+    return f"What ran with one seed is taken to spread by {100 * usual:.1f} %, as the others do."
+
+
 def ranks(values: Sequence[Sequence[float]], usual: float | None, higher: bool = False) -> list[tuple[int, int]]:
     """Best and worst rank of each: those that are not told apart from it by the seeds may stand before or behind it.
 
