@@ -41,9 +41,13 @@ def test_what_is_handed_out_holds_no_pixel_of_a_held_out_view(root):
         for subset in ("train", "test")
     }  # fmt: skip
     assert names(scene / "thermal") == names(scene / "images") == listed["train"]
-    assert names(truth) == names(truth / "images") == listed["test"]
+    assert names(truth) - {"materials"} == names(truth / "images") == listed["test"]
     assert {name.rpartition("_")[0] for name in listed["test"]} == {"near", "views", "times"}
     assert sorted(read_model(scene).names) == sorted(f"{name}.tiff" for name in listed["train"])
+    known = np.genfromtxt(truth / "materials.csv", delimiter=",", names=True)
+    assert (
+        set(known["heat_capacity_j_m3_k"]) >= {1.4e6, 1.0e6} and len(known) > 300 and set(known["emissivity"]) == {1.0}
+    )
     meta = json.loads((scene / "meta.json").read_text())
     assert meta["ambient_c"] == 22.0 and meta["metres_per_unit"] == 1.0 and meta["size"] == "tiny"
 
