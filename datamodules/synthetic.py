@@ -166,9 +166,15 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
             **(_of_the_yard(world, recording) if outdoors else {}),
-            **({"true_attributes": recording.scene.grey_bodies} if indoors and indoors.mirrors else {}),
+            **self._of_the_room(indoors),
         )
         return scene if recording.clean is None and self.parts is None else _with_clean(scene, recording)
+
+    def _of_the_room(self, room: Scene | None) -> dict[str, Any]:
+        """True properties of an indoor scene: of mirroring surfaces, and with ``parts`` of all."""
+        if room is None or not (room.mirrors or self.parts is not None):
+            return {}
+        return {"true_attributes": room.grey_bodies if self.parts is None else room.attributes}
 
     def _subset(self, part: str, frame: int, count: int) -> str:
         trains = frame < training_frames(count) if self.parts is None else part == TRAIN
