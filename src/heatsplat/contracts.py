@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -304,6 +305,7 @@ class SceneData:
         truth: function (points [n, 3], times_s [F]) -> °C [n, F] on synthetic scenes, or None.
         true_attributes: function (points [n, 3]) -> properties of the surface there by name with unit, each [n], on
             synthetic scenes, or None.
+        positions: table of where the cameras stood on the earth (``export.place``), or None.
     """
 
     name: str
@@ -322,6 +324,7 @@ class SceneData:
     probes: Tensor | None = None
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
     true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
+    positions: Path | None = None
 
     @property
     def bulk(self) -> tuple[Tensor, float]:

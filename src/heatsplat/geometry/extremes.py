@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.geometry.looks import Look
+from heatsplat.geometry.looks import Look, surface_points
 
 EDGE = 0.1  # step of depth from pixel to pixel, of the depth, from which on they are two surfaces
 STEEPEST = 10.0  # times its frontal area that a pixel shows at most: beyond, depth is noise
@@ -66,21 +66,15 @@ def extremes(looks: Sequence[Look], share: float = 0.05, count: int = 4) -> tupl
 def _pieces(look: Look) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points [n, 3] in the world, areas, values and widths [n] of the pixels that show a surface."""
     camera, depth = look.camera, look.depth.double()
-    height, width = depth.shape
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    fx, fy, cx, cy = (camera.K[i, j].double() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    rays = torch.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, torch.ones(height, width)], dim=-1)
     found = depth.isfinite() & look.values.isfinite()
-    local = rays * depth.where(found, 0.0)[..., None]
-    across, down = (local.diff(dim=d).narrow(1 - d, 0, (height, width)[1 - d] - 1) for d in (1, 0))
+    points = surface_points(camera, depth.where(found, 0.0))
+    across, down = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
     areas = torch.linalg.cross(across, down).norm(dim=-1)
     here = depth[:-1, :-1]
-    steps = torch.maximum(across[..., 2].abs(), down[..., 2].abs())
-    frontal = here.square() / (fx * fy)
+    steps = torch.maximum((depth[:-1, 1:] - here).abs(), (depth[1:, :-1] - here).abs())
+    frontal = here.square() / (camera.K[0, 0] * camera.K[1, 1]).double()
     kept = found[:-1, :-1] & found[1:, :-1] & found[:-1, 1:] & (steps < EDGE * here) & (areas < STEEPEST * frontal)
-    viewmat = camera.viewmat.double()
-    points = (local[:-1, :-1][kept] - viewmat[:3, 3]) @ viewmat[:3, :3]
-    return points, areas[kept], look.values[:-1, :-1][kept].double(), frontal[kept].sqrt()
+    return points[:-1, :-1][kept], areas[kept], look.values[:-1, :-1][kept].double(), frontal[kept].sqrt()
 
 
 def _joined(points: Tensor, areas: Tensor, values: Tensor, cell: float, count: int, sign: int) -> list[Surface]:

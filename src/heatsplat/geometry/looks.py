@@ -40,6 +40,15 @@ class Look:
         return inside & found.isfinite() & ((local[:, 2] - there).abs() <= DEPTH_TOLERANCE * there), found
 
 
+def surface_points(camera: Camera, depth: Tensor) -> Tensor:
+    """Points [H, W, 3] of the world, float64, at a depth (camera z, [H, W]) in the middle of each pixel of a camera."""
+    height, width = depth.shape
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones(height, width)], dim=-1).double()
+    local = pixels @ torch.linalg.inv(camera.K.double()).T * depth.double()[..., None]
+    return (local - camera.viewmat[:3, 3].double()) @ camera.viewmat[:3, :3].double()
+
+
 def values_at(looks: Sequence[Look], points: Tensor, normals: Tensor | None = None) -> Tensor:
     """Values [n] of points [n, 3] of surfaces, float64: means over the looks that see them, NaN where none does.
 

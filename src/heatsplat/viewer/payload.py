@@ -172,12 +172,18 @@ def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
     return told
 
 
-def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> Mapping[str, Any]:
-    """What the sensor adds to the clean image of a frame, in the scene's unit."""
-    images = module.predict_all(frame)
-    difference = (images[module.modality] - images["clean"]).mean(-1).cpu() * span
-    steps, step = steps_of(_small(difference, size).flatten())
-    return block.add(steps.view(size), "i2") | {"step": step}
+@torch.no_grad()
+def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> list[Mapping[str, Any]]:
+    """What each part of the sensor adds to the image of a frame, in their order, in the scene's unit."""
+    image = module.render(frame).features[..., : module.thermal.modality_channels[0]]
+    told = []
+    for name, part in module.sensor.parts.items():
+        after = part(image, frame)
+        difference = (after - image).mean(-1).cpu() * span
+        steps, step = steps_of(_small(difference, size).flatten())
+        told.append(block.add(steps.view(size), "i2") | {"step": step, "name": name.replace("_", " ")})
+        image = after
+    return told
 
 
 def _small(image: Tensor, size: tuple[int, int]) -> Tensor:
