@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +30,8 @@ This page is generated: `python src/study.py study=evidence`.
 An effect is simulated where its evidence exceeds its threshold. Evidence is a statistic on the training images that stays
 below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint fit of all of
 them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion in the
-presence of the others. Where metadata is missing an effect is off, and the reason says so.
+presence of the others. Where metadata is missing an effect is off, and the reason says so. Effects whose threshold is "asked
+for" have no evidence yet: they are simulated where they are switched on.
 
 `method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing.
 `effects.<name>=on|off|auto` overrules any of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what
@@ -159,7 +161,7 @@ def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -
     rows = [
         (
             effect.name, effect.stage, effect.summary, effect.source, ", ".join(sorted(effect.needs)) or "images",
-            effect.null, f"{effect.threshold:g}", effect.adds,
+            effect.null, f"{effect.threshold:g}" if math.isfinite(effect.threshold) else "asked for", effect.adds,
         )
         for effect in CATALOGUE
     ]  # fmt: skip

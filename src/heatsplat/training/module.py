@@ -23,7 +23,8 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import NORMALS, SKY_SEEN, SUN_SEEN, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.training.exposure import Exposure
 from heatsplat.training.init import Initialisation
 from heatsplat.training.normals import Normals
 from heatsplat.training.optimisation import Optimisation, penalties
@@ -60,6 +61,7 @@ class SplatTraining(pl.LightningModule):
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
         normals: where normals come from, of models that read them; None: as before training, throughout.
+        exposure: what hides sun and sky, of models that ask for that; None: nothing, throughout.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -87,6 +89,7 @@ class SplatTraining(pl.LightningModule):
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
         normals: Normals | None = None,
+        exposure: Exposure | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -104,6 +107,7 @@ class SplatTraining(pl.LightningModule):
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
         self.normals = normals or Normals()
+        self.exposure = exposure or Exposure()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -347,6 +351,8 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         if NORMALS in self.splats and step + 1 in self.normals.refresh:
             self._face(self.splats[NORMALS].detach())
+        if step + 1 in self.exposure.refresh:
+            self._expose()
         if change is not None:
             for group in optimizer.param_groups:
                 if group["name"] in self._declared:
@@ -356,6 +362,14 @@ class SplatTraining(pl.LightningModule):
     def _face(self, normals: Tensor) -> None:
         """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
         self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
+
+    @torch.no_grad()
+    def _expose(self) -> None:
+        """Looks anew what hides sun and sky from the splats, where a model asks for that."""
+        for name, look in ((SUN_SEEN, self.exposure.sun), (SKY_SEEN, self.exposure.sky)):
+            if name in self.splats:
+                splats = self.splats
+                splats[name].copy_(look(self.scene, self.composited, splats.means.detach(), splats[NORMALS].detach()))
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
