@@ -4,6 +4,7 @@ import csv
 import logging
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,7 @@ def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
     seen = torch.ones(height, width, dtype=torch.bool)
     seen[0] = False
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        write_shot([(torch.full((height, width, 1), 0.5), seen)], frames, scene, tmp_path, video=False)
+        write_shot([({"recorded": torch.full((height, width, 1), 0.5)}, seen)], frames, scene, tmp_path, video=False)
     values = read_temperature(next(tmp_path.glob("tiff/*.tiff")))
     assert np.isnan(values[0]).all()
     assert np.allclose(values[1:], scene.thermal_range.to_celsius(0.5))
@@ -35,9 +36,37 @@ def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
     frames = shot_frames(scene, "view", 0.0, 0, 1)
     camera = frames[0].camera
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        write_shot([(torch.full((camera.height, camera.width, 1), 0.5), None)], frames, scene, tmp_path, video=False)
+        images = {"recorded": torch.full((camera.height, camera.width, 1), 0.5)}
+        write_shot([(images, None)], frames, scene, tmp_path, video=False)
     assert np.isfinite(read_temperature(next(tmp_path.glob("tiff/*.tiff")))).all()
     assert "no training view" not in caplog.text
+
+
+def test_every_image_of_a_frame_has_files_of_its_own_and_one_range(tmp_path):
+    scene = make_scene()
+    frames = shot_frames(scene, "view", [0.0, 10.0], 0, 2)
+    camera = frames[0].camera
+    size = camera.height, camera.width
+    shown = [
+        {
+            "recorded": torch.full((*size, 1), 0.5),
+            "clean": torch.full((*size, 1), 0.4 + i / 10),
+            "rgb": torch.ones(*size, 3),
+        }
+        for i in range(2)
+    ]
+    images = zip(shown, (None, None), strict=True)
+    written = write_shot(images, frames, scene, tmp_path, codec="mpeg4", figures="svg")
+    names = sorted({path.relative_to(tmp_path).parts[0] for path in written})
+    films = ["video.mp4", "video_clean.mp4", "video_rgb.mp4"]
+    assert names == ["figures", "frames.csv", "png", "png_clean", "png_rgb", "tiff", "tiff_clean", *films]
+    assert all(path.stat().st_size for path in written)
+    clean = [read_temperature(path) for path in sorted(tmp_path.glob("tiff_clean/*"))]
+    assert np.allclose(clean[1] - clean[0], scene.thermal_range.span_k / 10, atol=1e-4)
+    one, other = (cv2.imread(str(tmp_path / f"{kind}/view_0001.png")) for kind in ("png", "png_clean"))
+    assert (one[40:] == other[40:]).all()  # 0.5 has one colour in both; the titles differ
+    first, second = (cv2.imread(str(tmp_path / f"png_clean/view_000{i}.png")) for i in range(2))
+    assert not (first[40:] == second[40:]).all()
 
 
 def test_moments_beyond_the_record_are_told_apart():

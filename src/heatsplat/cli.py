@@ -262,11 +262,17 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     from rich.progress import track
 
     from heatsplat.contracts import SceneError, check_option
+    from heatsplat.io.video import CODECS, encoder
     from heatsplat.runs.run import UNSEEN, load
     from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
     from heatsplat.training.session import prepare_machine
+    from heatsplat.uncertainty import Uncertainty
 
     check_option("unseen", config["unseen"], UNSEEN, SceneError)
+    check_option("codec", config["codec"], CODECS, SceneError)
+    check_option("figures", config["figures"], (None, "pdf", "svg"), SceneError)
+    if config["video"]:
+        encoder(config["codec"])  # what is missing is told before anything is rendered
     prepare_machine(config["threads"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
@@ -274,11 +280,16 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     frames = shot_frames(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
     warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
     keep = config["unseen"] == "keep"
+    names = trained.image_names if config["images"] == "all" else config["images"]
+    for name in names:
+        check_option("images", name, trained.image_names, SceneError)
     images = (
-        (trained.module.predict(frame).cpu(), None if keep else trained.seen(frame))
-        for frame in track(frames, "rendering")
+        (trained.images(frame, names), None if keep else trained.seen(frame)) for frame in track(frames, "rendering")
     )
-    options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c")}
+    options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c", "codec", "figures")}
+    if config["uncertainty"]:
+        told = Uncertainty(trained.module)
+        options |= {"deviation": told.deviation, "widest": told.widest}
     written = write_shot(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 

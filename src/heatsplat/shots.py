@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +16,13 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
-from heatsplat.io.pictures import temperature_picture, write_png
+from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible, write_figure, write_png
 from heatsplat.io.tiff import write_temperature
-from heatsplat.io.video import write_video
+from heatsplat.io.video import video as film
 
 log = logging.getLogger("heatsplat")
+
+DEVIATION = "viridis"  # colours of standard deviations: not those of temperatures
 
 TRAJECTORIES = ("orbit", "path", "test", "train", "view")
 
@@ -114,8 +117,7 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     found = []
     for view in scene.train:
         camera, mask = view.camera, view.mask
-        shrink = max(1.0, max(camera.width, camera.height) / SIGHTING_SIZE)
-        coarse = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
+        coarse = camera.within(SIGHTING_SIZE)
         if mask is not None:
             rows = np.arange(coarse.height) * camera.height // coarse.height
             columns = np.arange(coarse.width) * camera.width // coarse.width
@@ -144,7 +146,7 @@ def warn_beyond_record(scene: SceneData, frames: Sequence[Frame], assumption: st
 
 
 def write_shot(
-    images: Iterable[tuple[Tensor, Tensor | None]],
+    images: Iterable[tuple[Mapping[str, Tensor], Tensor | None]],
     frames: Sequence[Frame],
     scene: SceneData,
     output_dir: Path,
@@ -153,8 +155,15 @@ def write_shot(
     video: bool = True,
     fps: float = 15.0,
     range_c: Sequence[float] | None = None,
+    codec: str = "auto",
+    figures: str | None = None,
+    deviation: Callable[[Frame], Tensor] | None = None,
+    widest: float = 1.0,
 ) -> list[Path]:
-    """Paths of the files written for a shot: TIFF in °C, PNG with a bar, one video, and ``frames.csv``.
+    """Paths of the files written for a shot: TIFF in °C, PNG with a bar, a video of each image, and ``frames.csv``.
+
+    Files of the first image of a frame lie in tiff, png and video.mp4, those of others, such as "clean", in tiff_clean,
+    png_clean and video_clean.mp4; images in colour have no TIFF. All frames share the ends of their colours.
 
     The table says of each frame its time, which share of its pixels some training view has seen, and how many seconds it
     lies beyond the training record. What no training view has seen is NaN in TIFF and hatched in pictures: it is no
@@ -164,48 +173,73 @@ def write_shot(
     temperatures: TIFFs then hold image values in [0, 1], and the log says so.
 
     Args:
-        images: of each frame the image [H, W, 1] and which of its pixels were seen, [H, W] bool (None: all).
+        images: of each frame its images [H, W, 1] or [H, W, 3] by name, the same names in all, and which pixels were seen,
+            [H, W] bool (None: all).
         frames: of the shot.
         scene: that is shown.
         output_dir: folder of the files.
         tiff, png, video: which of them to write.
         fps: images per second of the video.
         range_c: °C at the ends of the colours; None takes the scene's range.
+        codec: of videos (``io.video.video``).
+        figures: "pdf" or "svg" writes a figure for print of each frame, all its images in a row, into figures; None none.
+        deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
+            and png_uncertainty, also of what was not seen; None writes none.
+        widest: of these, at the end of the colours.
     """
     bounds = scene.thermal_range
     if bounds is None:
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
+    bar = Bar(low, high, "°C" if bounds else "")
     written: list[Path] = []
     rows: list[tuple[str, float | None, float, float]] = []
-
-    def pictures() -> Iterator[np.ndarray]:
-        for frame, (image, seen) in zip(frames, images, strict=True):
-            values = (bounds.to_celsius(image) if bounds else image)[..., 0]
-            share = 1.0
-            if seen is not None:
-                values, share = values.where(seen, torch.nan), seen.float().mean().item()
-            stem = Path(frame.name).stem
+    with ExitStack() as open_videos:
+        films: dict[str, Callable[[np.ndarray], None]] = {}
+        for frame, (shown, seen) in zip(frames, images, strict=True):
+            stem, share = Path(frame.name).stem, 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
-            if tiff:
-                written.append(output_dir / "tiff" / f"{stem}.tiff")
-                write_temperature(written[-1], values)
             title = stem if frame.time_s is None else f"{stem}   {frame.time_s:.1f} s"
             title += f"   {share:.0%} seen" if share < 0.995 else ""
             title += f"   prediction, {beyond:.0f} s beyond the record" if beyond else ""
-            picture = temperature_picture(values, low, high, title, unit="°C" if bounds else "")
-            if png:
-                written.append(output_dir / "png" / f"{stem}.png")
-                write_png(written[-1], picture)
-            yield picture
-
-    if video:
-        write_video(output_dir / "video.mp4", pictures(), fps)
-        written.append(output_dir / "video.mp4")
-    else:
-        for _ in pictures():
-            pass
+            panels = []
+            for number, (name, image) in enumerate(shown.items()):
+                suffix = f"_{name}" if number else ""
+                values = image if seen is None else image.where(seen[..., None], torch.nan)
+                if image.shape[-1] == 3:
+                    panel = Panel(visible(values), name)
+                else:
+                    values = (bounds.to_celsius(values) if bounds else values)[..., 0]
+                    panel = Panel(colorize(values, low, high), name, bar)
+                    if tiff:
+                        written.append(output_dir / f"tiff{suffix}" / f"{stem}.tiff")
+                        write_temperature(written[-1], values)
+                panels.append(panel)
+                if not (png or video):
+                    continue
+                picture = compose([replace(panel, title=f"{title}   {name}" if number else title)])
+                if png:
+                    written.append(output_dir / f"png{suffix}" / f"{stem}.png")
+                    write_png(written[-1], picture)
+                if video:
+                    if name not in films:
+                        written.append(output_dir / f"video{suffix}.mp4")
+                        films[name] = open_videos.enter_context(film(written[-1], fps, codec))
+                    films[name](picture)
+            if deviation is not None:
+                spread = deviation(frame)
+                ends = Bar(0.0, widest, bar.unit, DEVIATION)
+                panels.append(Panel(colorize(spread, 0.0, widest, DEVIATION), "uncertainty", ends))
+                if tiff:
+                    written.append(output_dir / "tiff_uncertainty" / f"{stem}.tiff")
+                    write_temperature(written[-1], spread)
+                if png:
+                    written.append(output_dir / "png_uncertainty" / f"{stem}.png")
+                    write_png(written[-1], compose([replace(panels[-1], title=f"{title}   uncertainty")]))
+            if figures is not None:
+                written.append(output_dir / "figures" / f"{stem}.{figures}")
+                write_figure(written[-1], panels, title)
     written.append(output_dir / "frames.csv")
     with open(written[-1], "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)

@@ -1,5 +1,7 @@
 """Temperature files are bit-exact; pictures show the right colours at the right places."""
 
+import sys
+
 import cv2
 import matplotlib
 import numpy as np
@@ -12,16 +14,23 @@ from heatsplat.io.pictures import (
     GAP,
     UNKNOWN,
     Bar,
+    Panel,
     _ticks,
     colorize,
-    comparison_picture,
-    temperature_picture,
+    comparison_panels,
+    compose,
+    error_limit_of,
+    write_figure,
     write_png,
 )
 from heatsplat.io.tiff import read_temperature, write_temperature
-from heatsplat.io.video import write_video
+from heatsplat.io.video import video
 
 RANGE = ThermalRange(10.0, 50.0)
+
+
+def picture_of(values, low, high, title="", unit="°C"):
+    return compose([Panel(colorize(values, low, high), title, Bar(low, high, unit))])
 
 
 def test_temperatures_survive_bit_by_bit(tmp_path):
@@ -74,13 +83,13 @@ def test_ticks_lie_at_round_numbers_within_the_bar():
 def test_the_picture_holds_the_image_and_the_bar():
     celsius = np.full((65, 80), 10.0)
     celsius[:, 40:] = 50.0
-    picture = temperature_picture(celsius, 10, 50, "t = 5 s")
+    picture = picture_of(celsius, 10, 50, "t = 5 s")
     assert picture.dtype == np.uint8 and picture.shape[0] % 2 == 0 and picture.shape[1] % 2 == 0
     cold, warm = colorize(np.array([[10.0, 50.0]]), 10, 50)[0]
     row = picture[picture.shape[0] // 2]  # 65 rows enlarged 4 times
     assert (row[GAP : GAP + 160] == cold).all()
     assert (row[GAP + 160 : GAP + 320] == warm).all()
-    longer = temperature_picture(celsius, 10, 50, "a title that is far too long " * 9)
+    longer = picture_of(celsius, 10, 50, "a title that is far too long " * 9)
     assert longer.shape == picture.shape  # frames of a video must not change their size with their title
 
 
@@ -92,7 +101,7 @@ def test_comparison_shows_signed_errors_in_celsius():
     prediction[33:] -= 0.05
     mask = torch.ones(65, 40, dtype=torch.bool)
     mask[:, 30:] = False
-    picture = comparison_picture(target, prediction, RANGE, mask, title="frame")
+    picture = compose(comparison_panels(target, prediction, RANGE, mask), "frame")
     step = 160 + GAP
     middle = picture.shape[0] // 2
     red, blue = colorize(np.array([[2.0, -2.0]]), -2, 2, "RdBu_r")[0]
@@ -106,45 +115,89 @@ def test_comparison_shows_signed_errors_in_celsius():
 @pytest.mark.parametrize("channels", [1, 3])
 def test_comparison_without_range_or_pixels(channels):
     image = torch.rand(20, 30, channels, generator=torch.Generator().manual_seed(1))
-    same = comparison_picture(image, image)
+    same = compose(comparison_panels(image, image))
     assert same.ndim == 3 and (same < 255).any()
-    empty = comparison_picture(torch.full_like(image, float("nan")), image, RANGE)
+    empty = compose(comparison_panels(torch.full_like(image, float("nan")), image, RANGE))
     assert empty.shape[0] == same.shape[0]
     with pytest.raises(ValueError, match="of one shape"):
-        comparison_picture(image, image[:-1])
+        comparison_panels(image, image[:-1])
 
 
 def test_png_round_trip(tmp_path):
-    picture = temperature_picture(np.linspace(0, 1, 600).reshape(20, 30), 0, 1, unit="")
+    picture = picture_of(np.linspace(0, 1, 600).reshape(20, 30), 0, 1, unit="")
     write_png(tmp_path / "a" / "p.png", picture)
     assert (cv2.imread(str(tmp_path / "a" / "p.png"))[..., ::-1] == picture).all()
 
 
-def test_video_round_trip(tmp_path):
-    y = np.linspace(0, 1, 64)[:, None] * np.ones((1, 48))
-    frames = [temperature_picture(y * (0.2 + 0.1 * i), 0, 1, f"t = {i} s") for i in range(5)]
-    path = tmp_path / "v" / "time.mp4"
-    assert write_video(path, iter(frames), fps=10) == 5
-    video = cv2.VideoCapture(str(path))
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
-    read = []
-    while (got := video.read())[0]:
+def test_edges_that_no_camera_saw_do_not_set_the_error_bar():
+    errors = np.abs(np.random.default_rng(0).normal(0, 0.3, 10_000))
+    assert error_limit_of(errors) == 1.0  # 99 in 100 stay below 0.77
+    errors[:1500] = 20.0
+    assert error_limit_of(errors) == 2.0
+    assert error_limit_of(np.zeros(0)) == error_limit_of(np.zeros(9)) == 1e-3
+    assert error_limit_of(np.array([0.0] * 90 + [3.0] * 10)) == 5.0  # nothing but a corner of a background is wrong
+
+
+def test_figures_hold_text_and_pixels(tmp_path):
+    image = torch.linspace(0, 1, 600).reshape(20, 30, 1)
+    shown = comparison_panels(image, image + 0.01, RANGE, bounds=(10, 50), error_limit=2.0)
+    for ending in ("svg", "pdf"):
+        write_figure(tmp_path / "a" / f"p.{ending}", shown, "frame 1")
+        content = (tmp_path / "a" / f"p.{ending}").read_bytes()
+        write_figure(tmp_path / f"p.{ending}", shown, "frame 1")
+        assert (tmp_path / f"p.{ending}").read_bytes() == content  # no date, no random names
+    svg = (tmp_path / "a" / "p.svg").read_text()
+    assert ">ground truth</text>" in svg and ">frame 1</text>" in svg and "<image" in svg
+
+
+def read_video(path):
+    film, read = cv2.VideoCapture(str(path)), []
+    while (got := film.read())[0]:
         read.append(got[1][..., ::-1])
-    assert len(read) == 5
+    return film.get(cv2.CAP_PROP_FPS), int(film.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode(), read
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "h264"])
+def test_video_round_trip(tmp_path, codec):
+    if codec == "h264":
+        pytest.importorskip("imageio_ffmpeg")
+    y = np.linspace(0, 1, 64)[:, None] * np.ones((1, 48))
+    frames = [picture_of(y * (0.2 + 0.1 * i), 0, 1, f"t = {i} s") for i in range(5)]
+    path = tmp_path / "v" / "time.mp4"
+    with video(path, 10, codec) as add:
+        for frame in frames:
+            add(frame)
+    fps, name, read = read_video(path)
+    assert fps == pytest.approx(10)
+    assert name == {"mpeg4": "FMP4", "h264": "h264"}[codec]
+    assert len(read) == 5 and read[0].shape == frames[0].shape
     assert np.abs(read[3].astype(int) - frames[3]).mean() < 6  # lossy, yet the same picture
     assert np.abs(read[0].astype(int) - frames[4]).mean() > 6
 
 
-def test_videos_are_checked(tmp_path):
+def test_videos_are_checked(tmp_path, monkeypatch):
     frame = np.zeros((16, 16, 3), dtype=np.uint8)
+
+    def write(name, frames, codec="mpeg4"):
+        with video(tmp_path / name, codec=codec) as add:
+            for one in frames:
+                add(one)
+
     with pytest.raises(ValueError, match="at least one frame"):
-        write_video(tmp_path / "v.mp4", [])
+        write("v.mp4", [])
     with pytest.raises(ValueError, match=r"video frame 1 is uint8 \[16, 18, 3\], the first was uint8 \[16, 16, 3\]"):
-        write_video(tmp_path / "v.mp4", [frame, np.zeros((16, 18, 3), dtype=np.uint8)])
+        write("v.mp4", [frame, np.zeros((16, 18, 3), dtype=np.uint8)])
     with pytest.raises(ValueError, match=r"name the file \.mp4"):
-        write_video(tmp_path / "v.avi", [frame])
+        write("v.avi", [frame])
     with pytest.raises(ValueError, match="even sides"):
-        write_video(tmp_path / "v.mp4", [frame[:15]])
+        write("v.mp4", [frame[:15]])
+    with pytest.raises(ValueError, match="codec must be one of auto, h264, mpeg4"):
+        write("v.mp4", [frame], "av1")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ImportError, match=r"pip install 'heatsplat\[video\]'"):
+        write("v.mp4", [frame], "h264")
+    write("v.mp4", [frame], "auto")
+    assert read_video(tmp_path / "v.mp4")[1] == "FMP4"
 
 
 def test_what_is_not_known_is_hatched_so_that_no_colour_bar_has_it():

@@ -243,3 +243,30 @@ def test_derivatives_by_what_lies_behind_are_those_of_the_values(climate):
             for sign in (1, -1)
         )
         torch.testing.assert_close((up - down) / 2e-4, leaf.grad, atol=0.02 * float(leaf.grad.abs().max()), rtol=0.0)
+
+
+def test_the_sun_on_bodies_without_an_end_is_what_their_table_makes_of_the_same_light(climate):
+    given = climate.drivers
+    up = tensor(0, 0, 1)
+    lit = (given.beams @ up).clamp(min=0)
+    bare = {"sky": None, "around": None, "wind_anomaly": None}
+    beams = Climate(replace(given, beams=lit[:, None] * up, light=None, **bare), semi_infinite=True)
+    level = Climate(replace(given, beams=None, light=lit, up=None, **bare), semi_infinite=True)
+    surface = Surface(tensor(0, 5, -3), tensor(1e-6, 3e-5, 1e-3).log(), tensor(60, 60, 60), normals=up.expand(3, 3))
+    truth = course(level.linear_temperature, surface._replace(normals=None))
+    assert truth.max() > 20
+    assert (course(beams.linear_temperature, surface) - truth).abs().max() < 0.2  # K, of 60 K in full sun
+
+
+@pytest.mark.parametrize("semi_infinite", [False, True])
+def test_heat_from_within_is_a_driver_that_never_changes(climate, semi_infinite):
+    there = Climate(climate.drivers, semi_infinite)
+    without = bodies(wind=True)
+    inner = tensor(0.5, 2, 0, 4)
+    heated = without._replace(inner=inner)
+    rise = there.mean_temperature(heated) - there.mean_temperature(without)
+    assert (rise[[0, 1, 3]] > 0.7 * inner[[0, 1, 3]]).all() and (rise < 1.3 * inner + 1e-9).all()
+    late = there.linear_temperature(heated, 172800.0) - there.linear_temperature(without, 172800.0)
+    assert (late[2].abs() < 1e-9) and (late[[0, 1, 3]] > 0.2).all()
+    with pytest.raises(ValueError, match="heated from within are solved about a mean only"):
+        there.stepped_temperature(heated, 3600.0)

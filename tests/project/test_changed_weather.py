@@ -37,13 +37,19 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
     """The frames that a render with these overrides asks a model for."""
     seen = []
 
-    def predict(frame):
+    def predict_all(frame):
         seen.append(frame)
-        return torch.full((8, 8, 1), 0.5)
+        return {"thermal": torch.full((8, 8, 1), 0.5)}
 
     data = Yard()
-    heat = SimpleNamespace(needs=frozenset(needs), beyond_record="nothing changes")
-    module = SimpleNamespace(thermal=heat, predict=predict, renderer=SimpleNamespace(backend="gsplat"))
+    heat = SimpleNamespace(needs=frozenset(needs), beyond_record="nothing changes", companions=())
+    module = SimpleNamespace(
+        thermal=heat,
+        predict_all=predict_all,
+        modality="thermal",
+        sensor=SimpleNamespace(parts={}),
+        renderer=SimpleNamespace(backend="gsplat"),
+    )
     stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)

@@ -6,9 +6,13 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, Weather
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
+from heatsplat.datamodules.synthetic_scene.shapes import trace
 from heatsplat.physics.exposure import nearest_direction, open_share, sky_directions, sun_directions
 from heatsplat.renderers.settings import Renderer
 from heatsplat.training.exposure import Exposure
+from heatsplat.training.normals import Normals
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 SPACING = 0.25
@@ -46,7 +50,7 @@ def test_a_wall_shades_the_ground_as_far_as_its_height_says():
     for height in (30.0, 45.0, 60.0):  # of the sun, in the east (x)
         radians = math.radians(height)
         sun = torch.tensor([[math.cos(radians), 0.0, math.sin(radians)]], dtype=torch.float64)
-        lit = Exposure().open(scene, show, means, normals, sun)[:, 0]
+        lit = Exposure(allowance=1.5).open(scene, show, means, normals, sun)[:, 0]
         level = (normals[:, 2] > 0) & (means[:, 1].abs() < 3)
         reach = 3.0 / math.tan(radians)  # of the shadow, to the west of the wall
         margin = 0.6
@@ -70,7 +74,7 @@ def test_the_floor_of_a_street_sees_the_sky_that_geometry_leaves_it(width, heigh
     left = sheet((-half, -0.5 * length, 0.0), (0, 1.0, 0), (0, 0, 1.0), (length, height), (1.0, 0, 0), 0.5)
     right = sheet((half, -0.5 * length, 0.0), (0, 1.0, 0), (0, 0, 1.0), (length, height), (-1.0, 0, 0), 0.5)
     scene, show, means, normals = looked_at(floor, left, right, spacing=0.5)
-    seen = Exposure(directions=100).sky(scene, show, means, normals)
+    seen = Exposure(directions=100, allowance=1.5).sky(scene, show, means, normals)
     middle = (normals[:, 2] > 0) & (means[:, 0].abs() < 1) & (means[:, 1].abs() < 4)
     truth = math.cos(math.atan(2 * height / width))
     assert truth - 0.06 < seen[middle].mean().item() < truth + 0.02
@@ -97,3 +101,23 @@ def test_directions_of_the_sun_stand_for_all_of_its_way():
     assert len(sun_directions(-UP.expand(3, 3), UP)) == 0
     with pytest.raises(ValueError, match="exposure.directions and side must be at least 1"):
         Exposure(side=0)
+
+
+def test_the_yard_is_lit_as_rays_say():
+    """Of a yard's points, against its boxes by ray tracing: shadows that are found outweigh those that are not there."""
+    scene, world = Synthetic(scene="outdoor", size="demo").scene, OutdoorScene(OUTDOOR["outdoor"])
+    normals, exposure = Normals(views=12), Exposure(side=192)
+    normals.prepare(scene, Renderer("cpu"), scene.points)
+    exposure.prepare(scene, Renderer("cpu"), normals.discs, ["sun_seen"])
+    found = exposure.look(scene.points)
+    assert set(found) == {"sun_seen"}
+    directions = sun_directions(scene.weather.sun, scene.weather.up)
+    some = range(2, len(directions), 9)
+    on, which = world.nearest(scene.points.double())
+    facing = world.normals(on, which)
+    rays = [trace(world.shapes, on + 1e-3 * facing, directions[k].expand(len(on), 3))[0].isinf() for k in some]
+    truth = torch.stack(rays, dim=1).float()
+    weights = (facing @ directions[some].T).clamp(min=0.0)
+    error, without = (((shares - truth).abs() * weights).sum() for shares in (found["sun_seen"][:, some], 1.0))
+    assert found["sun_seen"].shape == (len(scene.points), len(directions))
+    assert error < 0.6 * without

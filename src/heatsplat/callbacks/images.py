@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,21 @@ import pytorch_lightning as pl
 from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.contracts import Frame, SceneData, View, evenly_spread
-from heatsplat.io.pictures import comparison_picture, write_png
+from heatsplat.contracts import Frame, SceneData, SceneError, ThermalRange, View, check_option, evenly_spread
+from heatsplat.io.pictures import (
+    Panel,
+    bounds_of,
+    comparison_panels,
+    compose,
+    difference,
+    error_limit_of,
+    write_figure,
+    write_png,
+)
 from heatsplat.metrics import mae_c, psnr
+
+RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
+RANGE_PIXELS = 20_000  # of each of them, at most
 
 
 class ImagePanels(pl.Callback):
@@ -20,15 +33,20 @@ class ImagePanels(pl.Callback):
 
     So too, with "_rgb" and the like after the name, the images that a model explains besides (its companions). The same
     validation views every time (renders/val holds their latest state, TensorBoard all of them), and test views
-    at the end (renders/test).
+    at the end (renders/test). Colours have the same ends in all panels, those of the training images; test panels share
+    the ends of the error, too.
 
     Args:
         val_views: how many validation views, spread evenly; 0 for none.
         test_views: how many test views, spread evenly; -1 for all, 0 for none.
+        figures: "pdf" or "svg" writes test panels for print, too; None does not.
     """
 
-    def __init__(self, val_views: int = 3, test_views: int = 8) -> None:
-        self.val_views, self.test_views = val_views, test_views
+    def __init__(self, val_views: int = 3, test_views: int = 8, figures: str | None = None) -> None:
+        check_option("callbacks.images.figures", figures, (None, "pdf", "svg"), SceneError)
+        self.val_views, self.test_views, self.figures = val_views, test_views, figures
+        self._bounds: tuple[float, float] | None = None
+        self._kept: list[dict[str, Any]] = []
 
     def on_validation_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
@@ -42,23 +60,73 @@ class ImagePanels(pl.Callback):
     ) -> None:
         count = min(len(module.scene.test), int(trainer.num_test_batches[0]))
         if batch_idx in evenly_spread(count, count if self.test_views < 0 else self.test_views):
-            self._draw("test", module, outputs, trainer.global_step)
+            self._kept.append(outputs)
 
-    def _draw(self, split: str, module: pl.LightningModule, outputs: dict[str, Any], step: int) -> None:
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        """Draws what was kept, now that the errors of all are known."""
+        errors: dict[str, list[np.ndarray]] = {}
+        for outputs in self._kept:
+            for modality, image in _images(module, outputs).items():
+                errors.setdefault(modality, []).append(magnitudes(outputs["view"], modality, image, module.scene))
+        limits = {modality: error_limit_of(np.concatenate(found)) for modality, found in errors.items()}
+        for outputs in self._kept:
+            self._draw("test", module, outputs, trainer.global_step, limits)
+        self._kept = []
+
+    def _draw(
+        self,
+        split: str,
+        module: pl.LightningModule,
+        outputs: dict[str, Any],
+        step: int,
+        limits: Mapping[str, float] | None = None,
+    ) -> None:
         view, writer = outputs["view"], board(module)
-        for modality, image in ({module.modality: outputs["prediction"]} | outputs.get("companions", {})).items():
+        self._bounds = self._bounds or scene_bounds(module.scene, module.modality)
+        for modality, image in _images(module, outputs).items():
             name = file_stem(view.frame) + ("" if modality == module.modality else f"_{modality}")
-            picture = panels(view, modality, image, module.scene)
-            write_png(module.output_dir / "renders" / split / f"{name}.png", picture)
+            shown, title = panels(view, modality, image, module.scene, self._bounds, (limits or {}).get(modality))
+            path = module.output_dir / "renders" / split / f"{name}.png"
+            picture = compose(shown, title)
+            write_png(path, picture)
+            if self.figures is not None and split == "test":
+                write_figure(path.with_suffix(f".{self.figures}"), shown, title)
             if writer is not None:
                 writer.add_image(f"{split}/{name}", picture, step, dataformats="HWC")
 
 
-def panels(view: View, modality: str, prediction: Tensor, scene: SceneData) -> np.ndarray:
-    """Ground truth, render and error of one image of a view, with its scores, uint8 RGB."""
+def _images(module: pl.LightningModule, outputs: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The images of a step's outputs by modality."""
+    return {module.modality: outputs["prediction"]} | outputs.get("companions", {})
+
+
+def scene_bounds(scene: SceneData, modality: str) -> tuple[float, float]:
+    """Ends of the colours of all images of a scene, in °C or image values: those of some training images."""
+    known = _range_of(scene, modality)
+    values = []
+    for i in evenly_spread(len(scene.train), RANGE_VIEWS):
+        view = scene.train[i]
+        image = view.image(modality).float().mean(-1).cpu()
+        pixels = (image if view.mask is None else image[view.mask.cpu()]).flatten()
+        pixels = pixels[pixels.isfinite()]
+        values.append(pixels[:: max(1, len(pixels) // RANGE_PIXELS)].numpy())
+    pixels = np.concatenate(values)
+    ends = bounds_of(pixels) if pixels.size else (0.0, 1.0)
+    return ends if known is None else tuple(float(known.to_celsius(end)) for end in ends)
+
+
+def panels(
+    view: View,
+    modality: str,
+    prediction: Tensor,
+    scene: SceneData,
+    bounds: tuple[float, float] | None = None,
+    error_limit: float | None = None,
+) -> tuple[list[Panel], str]:
+    """Ground truth, render and error of one image of a view, and a title with its scores."""
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
-    thermal_range = scene.thermal_range if modality in ("thermal", "clean") else None
+    thermal_range = _range_of(scene, modality)
     title = [view.frame.name]
     if view.frame.time_s is not None:
         title.append(f"t = {view.frame.time_s:.4g} s")
@@ -66,7 +134,19 @@ def panels(view: View, modality: str, prediction: Tensor, scene: SceneData) -> n
     if thermal_range is not None and target.shape[-1] == 1:
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
     title += [text.format(value) for value, text in scores if value is not None]
-    return comparison_picture(target, prediction, thermal_range, mask, title="   ·   ".join(title))
+    return comparison_panels(target, prediction, thermal_range, mask, bounds, error_limit), "   ·   ".join(title)
+
+
+def magnitudes(view: View, modality: str, prediction: Tensor, scene: SceneData) -> np.ndarray:
+    """Magnitudes [n] of the errors of an image where it counts, in °C or image values."""
+    target = view.image(modality).cpu()
+    mask = None if view.mask is None else view.mask.cpu()
+    counted, error = difference(target, prediction.float().cpu(), _range_of(scene, modality), mask)
+    return np.abs(error[counted])
+
+
+def _range_of(scene: SceneData, modality: str) -> ThermalRange | None:
+    return scene.thermal_range if modality in ("thermal", "clean") else None
 
 
 def file_stem(frame: Frame) -> str:

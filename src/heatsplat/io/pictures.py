@@ -6,6 +6,8 @@ tenths of a second; the colour maps and the tick positions are matplotlib's.
 
 from __future__ import annotations
 
+import base64
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,6 +18,8 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
@@ -33,6 +37,7 @@ FONT = 13
 GAP = 14
 BAR = 14
 PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
+FIGURE_PANEL = 1.8  # inches of height of an image in print
 
 
 @cache
@@ -88,42 +93,59 @@ def _hatching(shape: tuple[int, ...]) -> np.ndarray:
     return np.array(UNKNOWN, dtype=np.uint8)[stripes]
 
 
-def temperature_picture(
-    values: Any, low: float, high: float, title: str = "", unit: str = "°C", colormap: str = THERMAL
-) -> np.ndarray:
-    """One colour-mapped image with its bar, uint8 RGB; its size depends on the image, the bounds and the unit only.
-
-    Args:
-        values: [H, W] or [H, W, 1], tensor or array.
-        low, high: values of the bar's ends.
-        title: one line above the image, cut where it is too long.
-        unit: of the values.
-        colormap: name of a matplotlib map.
-    """
-    values = np.asarray(values)
-    values = values[..., 0] if values.ndim == 3 else values
-    return compose([Panel(colorize(values, low, high, colormap), title, Bar(low, high, unit, colormap))])
-
-
-def comparison_picture(
+def comparison_panels(
     target: Any,
     prediction: Any,
     thermal_range: ThermalRange | None = None,
     mask: Any = None,
+    bounds: tuple[float, float] | None = None,
     error_limit: float | None = None,
-    title: str = "",
-) -> np.ndarray:
-    """Ground truth, render and their difference side by side, uint8 RGB.
+) -> list[Panel]:
+    """Ground truth, render and their difference, for one picture or figure.
 
     **Convention:** the difference is render minus ground truth: red is too warm, blue too cold. Ground truth and render
-    share the colours, spread over the values of the ground truth.
+    share the colours.
 
     Args:
         target, prediction: [H, W, C] in [0, 1], C = 1 or 3.
         thermal_range: temperatures of 0 and 1; None labels bars with image values.
         mask: [H, W] bool, True where a pixel counts; the others are hatched in ground truth and difference.
-        error_limit: end of the difference's bar, in °C (image values without a range); default: chosen from the image.
-        title: one line above the panels.
+        bounds: ends of the colours in °C (image values without a range); None spreads them over the ground truth.
+        error_limit: end of the difference's bar in the same unit; None takes that of ``error_limit_of``.
+    """
+    target, prediction = (np.asarray(image, dtype=np.float32) for image in (target, prediction))
+    counted, error = difference(target, prediction, thermal_range, mask)
+    thermal = target.shape[2] == 1
+    unit = "°C" if thermal and thermal_range else ""
+    if error_limit is None:
+        error_limit = error_limit_of(np.abs(error[counted]))
+
+    if thermal:
+        images = [image[..., 0] for image in (target, prediction)]
+        if thermal_range is not None:
+            images = [thermal_range.to_celsius(image) for image in images]
+        low, high = bounds or bounds_of(images[0][counted] if counted.any() else images[1])
+        images[0] = np.where(counted, images[0], np.nan)
+        pictures = [colorize(image, low, high) for image in images]
+        bar = Bar(low, high, unit)
+    else:
+        pictures = [visible(image) for image in (target, prediction)]
+        pictures[0][~counted] = _hatching(counted.shape)[~counted]
+        bar = None
+    error_bar = Bar(-error_limit, error_limit, unit, ERROR)
+    return [
+        Panel(pictures[0], "ground truth"),
+        Panel(pictures[1], "render", bar),
+        Panel(colorize(error, -error_limit, error_limit, ERROR), "render − ground truth", error_bar),
+    ]
+
+
+def difference(
+    target: Any, prediction: Any, thermal_range: ThermalRange | None = None, mask: Any = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels count [H, W], and render minus ground truth [H, W] in °C or image values, NaN where they do not.
+
+    Args: as ``comparison_panels``.
     """
     target, prediction = (np.asarray(image, dtype=np.float32) for image in (target, prediction))
     if target.shape != prediction.shape or target.ndim != 3:
@@ -131,34 +153,32 @@ def comparison_picture(
     counted = np.isfinite(target).all(-1)
     if mask is not None:
         counted &= np.asarray(mask)
-    thermal = target.shape[2] == 1
-    unit, scale = ("°C", thermal_range.span_k) if thermal and thermal_range else ("", 1.0)
-    error = np.where(counted, (prediction - target).mean(-1) * scale, np.nan)
-    if error_limit is None:
-        error_limit = _round_up(float(np.nanpercentile(np.abs(error), 99)) if counted.any() else 0.0)
+    scale = thermal_range.span_k if target.shape[2] == 1 and thermal_range else 1.0
+    return counted, np.where(counted, (prediction - target).mean(-1) * scale, np.nan)
 
-    if thermal:
-        images = [image[..., 0] for image in (target, prediction)]
-        if thermal_range is not None:
-            images = [thermal_range.to_celsius(image) for image in images]
-        shown = images[0][counted] if counted.any() else images[1]
-        low, high = (float(x) for x in np.percentile(shown, (0.1, 99.9)))
-        images[0] = np.where(counted, images[0], np.nan)
-        pictures = [colorize(image, low, high) for image in images]
-        bar = Bar(low, high, unit)
-    else:
-        pictures = [(np.nan_to_num(image).clip(0, 1) * 255).round().astype(np.uint8) for image in (target, prediction)]
-        pictures[0][~counted] = _hatching(counted.shape)[~counted]
-        bar = None
-    difference = Bar(-error_limit, error_limit, unit, ERROR)
-    return compose(
-        [
-            Panel(pictures[0], "ground truth"),
-            Panel(pictures[1], "render", bar),
-            Panel(colorize(error, -error_limit, error_limit, ERROR), "render − ground truth", difference),
-        ],
-        title,
-    )
+
+def bounds_of(values: Any) -> tuple[float, float]:
+    """Ends of colours that all but a thousandth of some values at each side lie between."""
+    low, high = np.percentile(values, (0.1, 99.9))
+    return float(low), float(high)
+
+
+def error_limit_of(errors: Any) -> float:
+    """A round end of an error's bar, from magnitudes [n]: what 99 in 100 stay below, but no more than ten times the mean of the
+    smaller three quarters.
+
+    So edges that no camera saw, wrong by the range of the scene, do not blot out all other errors.
+    """
+    errors = np.sort(np.asarray(errors, dtype=np.float64))
+    if not errors.size:
+        return _round_up(0.0)
+    most, usual = np.percentile(errors, 99), errors[: 3 * errors.size // 4].mean() if errors.size > 1 else 0.0
+    return _round_up(float(min(most, 10 * usual) if usual > 0 else most))
+
+
+def visible(image: Any) -> np.ndarray:
+    """An image [H, W, 3] in [0, 1] as uint8; NaN is black."""
+    return (np.nan_to_num(np.asarray(image)).clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
@@ -204,6 +224,37 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
     return np.asarray(page)
 
 
+def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> None:
+    """Writes panels in a row as a figure for print, .pdf or .svg: lettering stays text, pixels stay pixels; makes its folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    height, width = panels[0].image.shape[:2]
+    each = FIGURE_PANEL * width / height
+    barred = sum(panel.bar is not None for panel in panels)
+    size = (each * len(panels) + 0.7 * barred + 0.2, FIGURE_PANEL + 0.35 + (0.2 if title else 0))
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # which lists the tables of every font it embeds
+    settings = {"font.size": 8, "pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "heatsplat"}
+    with matplotlib.rc_context(settings):
+        figure = Figure(figsize=size, layout="constrained")
+        if title:
+            figure.suptitle(title, fontsize=8)
+        for i, panel in enumerate(panels, start=1):
+            axes = figure.add_subplot(1, len(panels), i)
+            axes.imshow(panel.image, interpolation="none")
+            axes.set_title(panel.title, fontsize=8)
+            axes.set_axis_off()
+            if (bar := panel.bar) is not None:
+                colours = ScalarMappable(Normalize(bar.low, bar.high), bar.colormap)
+                figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit)
+        date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
+        figure.savefig(path, metadata={date: None})
+
+
+def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
+    """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
+    draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
+
+
 def figure_picture(figure: Figure) -> np.ndarray:
     """A matplotlib figure as pixels, uint8 RGB. Make it as an object (``Figure(...)``): pyplot keeps global state."""
     canvas = FigureCanvasAgg(figure)
@@ -217,6 +268,14 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
         raise OSError(f"cannot write {path}")
+
+
+def data_uri(picture: np.ndarray, quality: int = 85) -> str:
+    """An RGB picture [H, W, 3] uint8 as the ``src`` of an image in a page (WebP). Raises OSError where OpenCV lacks it."""
+    done, encoded = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise OSError("this OpenCV has no WebP encoder")
+    return f"data:image/webp;base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
 def _ticks(bar: Bar) -> list[tuple[float, str]]:

@@ -2,51 +2,102 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+log = logging.getLogger("heatsplat")
 
-def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float = 24.0) -> int:
-    """Writes RGB pictures as an MPEG-4 video and returns their number.
+CODECS = ("auto", "h264", "mpeg4")
+QUALITY = 8  # of H.264, of 10: numbers beside the bar stay sharp
 
-    Frames are taken one by one, so that a long video needs the memory of one picture.
+
+@contextmanager
+def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[Callable[[np.ndarray], None]]:
+    """What takes the RGB pictures of a video one by one: a long one needs the memory of one picture.
+
+    Pictures are [H, W, 3] uint8, all of one size with even sides (codecs work on 2 x 2 blocks).
 
     Args:
         path: ends in .mp4; its folder is made.
-        frames: [H, W, 3] uint8, all of one size with even sides (the codec works on 2 x 2 blocks).
-        fps: frames per second.
+        fps: pictures per second.
+        codec: "h264", which browsers play and which needs the extra "video"; "mpeg4" (part 2), which OpenCV writes and
+            most players play; "auto" takes the first of them that there is.
 
     Raises:
-        ValueError: no frames, or one of another size or type.
-        OSError: the codec or the file is not there.
+        ImportError: codec "h264" without the extra.
+        ValueError: no pictures, one of another size or type, or an unknown codec.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path}: videos are written as MPEG-4, name the file .mp4")
+    open_file = encoder(codec)
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer, shape, count = None, None, 0
+    opened: list[tuple[Callable[[np.ndarray], Any], Callable[[], Any]]] = []
+    shape: tuple[int, ...] = ()
+    count = 0
+
+    def add(picture: np.ndarray) -> None:
+        nonlocal shape, count
+        if not opened:
+            shape = picture.shape
+            if picture.ndim != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2:
+                raise ValueError(f"video frames are [H, W, 3] with even sides, got {list(shape)}")
+            opened.append(open_file(path, (shape[1], shape[0]), fps))
+        if picture.shape != shape or picture.dtype != np.uint8:
+            raise ValueError(
+                f"video frame {count} is {picture.dtype} {list(picture.shape)}, the first was uint8 {list(shape)}"
+            )
+        opened[0][0](picture)
+        count += 1
+
     try:
-        for frame in frames:
-            if writer is None:
-                shape = frame.shape
-                if frame.ndim != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2:
-                    raise ValueError(f"video frames are [H, W, 3] with even sides, got {list(shape)}")
-                size = (shape[1], shape[0])
-                writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-                if not writer.isOpened():
-                    raise OSError(f"cannot write {path}: this OpenCV has no MPEG-4 encoder or the folder is read-only")
-            if frame.shape != shape or frame.dtype != np.uint8:
-                raise ValueError(
-                    f"video frame {count} is {frame.dtype} {list(frame.shape)}, the first was uint8 {list(shape)}"
-                )
-            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-            count += 1
+        yield add
     finally:
-        if writer is not None:
-            writer.release()
+        for _, close in opened:
+            close()
     if count == 0:
         raise ValueError(f"{path}: a video needs at least one frame")
-    return count
+
+
+def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callable, Callable]]:
+    """What opens a video of a codec: of path, width and height, and pictures per second it makes what adds and what closes.
+
+    Raises:
+        ImportError, ValueError: as ``video``.
+    """
+    if codec not in CODECS:
+        raise ValueError(f"codec must be one of {', '.join(CODECS)}, got '{codec}'")
+    if codec == "mpeg4":
+        return _opencv
+    try:
+        package = import_module("imageio_ffmpeg")
+    except ImportError as error:
+        if codec == "auto":
+            log.info("videos are MPEG-4 part 2, which browsers do not play; pip install 'heatsplat[video]' gives H.264")
+            return _opencv
+        raise ImportError("codec=h264 needs imageio-ffmpeg: pip install 'heatsplat[video]'") from error
+
+    def ffmpeg(path: Path, size: tuple[int, int], fps: float) -> tuple[Callable, Callable]:
+        rate = Fraction(fps).limit_denominator(1000)
+        options = {"codec": "libx264", "quality": QUALITY, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        writer = package.write_frames(str(path), size, fps=rate, output_params=["-movflags", "faststart"], **options)
+        writer.send(None)
+        return lambda picture: writer.send(np.ascontiguousarray(picture)), writer.close
+
+    return ffmpeg
+
+
+def _opencv(path: Path, size: tuple[int, int], fps: float) -> tuple[Callable, Callable]:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    if not writer.isOpened():
+        raise OSError(f"cannot write {path}: this OpenCV has no MPEG-4 encoder or the folder is read-only")
+    return lambda picture: writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)), writer.release

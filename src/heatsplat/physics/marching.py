@@ -35,10 +35,12 @@ def learned(surface: Surface) -> Tensor:
     """The parameters that the kernel knows derivatives by, [n, Q]; those of effects that are off have no column.
 
     Raises:
-        ValueError: the bodies have two nodes, which only ``Climate.linear_temperature`` knows.
+        ValueError: the bodies have two nodes or heat from within, which only ``Climate.linear_temperature`` knows.
     """
-    if surface.core is not None:
-        raise ValueError("bodies of two nodes are solved about a mean only: use linear_temperature")
+    if surface.core is not None or surface.inner is not None:
+        raise ValueError(
+            "bodies of two nodes or heated from within are solved about a mean only: use linear_temperature"
+        )
     columns = [getattr(surface, name) for name in UNITS]
     return torch.stack([column for column in columns if column is not None], dim=1)
 

@@ -172,6 +172,18 @@ class Trained:
         image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
         return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
 
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """What ``images`` has: "recorded", "clean" where the camera changes it, others of the model such as "rgb"."""
+        clean = ("clean",) if self.module.sensor.parts else ()
+        return ("recorded", *clean, *self.module.thermal.companions)
+
+    def images(self, frame: Frame, names: Sequence[str]) -> dict[str, Tensor]:
+        """Images [H, W, C] in [0, 1] of a frame by name, on the CPU."""
+        found = self.module.predict_all(frame)
+        found["recorded"] = found[self.module.modality]
+        return {name: found[name].cpu() for name in names}
+
     def seen(self, frame: Frame) -> Tensor:
         """Which pixels of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
         return covered(frame.camera, self.depth(frame), self._sightings)

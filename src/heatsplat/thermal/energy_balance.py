@@ -17,6 +17,7 @@ from heatsplat.physics.exposure import sun_directions
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
+from heatsplat.physics.walls import u_value
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
@@ -63,10 +64,15 @@ class EnergyBalance(ThermalModel):
     the sun's direction no normal, without any irradiance no sunlight. What the scene's own geometry does to them (shadows,
     sky that is hidden, light from the ground) is there where it is asked for.
 
+    Bodies without an end (``semi_infinite``) are massive walls and ground that the record does not heat through: one number
+    in the place of the rate, a = (H/b)², tells their effusivity b. ``inner`` adds a constant heat from within, q/H for each
+    Gaussian, such as a heated room behind a wall: heat that is lost, and with ``indoor_c`` a U-value.
+
     Identifiable: α/C and h/C, and e/C by night, with the state at the start of the record where it is still remembered
     when images begin; the share of wind in h where the wind changes while surface and air differ. Not identifiable: the
     common factor of α, h, e and C; α from C/h of surfaces that the sun never meets; the rate of surfaces that settle between
-    any two samples of the weather.
+    any two samples of the weather. The heat from within is told from that of the sky by nights of different skies only, and
+    counts from the air: an air temperature that is 1 K off is 1 K of it.
 
     Bodies of two nodes have a core behind the surface, which follows it at a rate of its own: ground and walls that are warm
     after dusk. Both rates are looked up in the same tables; it costs twice as much.
@@ -76,8 +82,9 @@ class EnergyBalance(ThermalModel):
 
     Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW;
     "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two nodes "initial_core" in
-    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H. With solution
-    "corrected" a constant, "marched_at" [N, Q], the parameters at which a Gaussian was last marched.
+    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H; with heat from within
+    "inner_rise", q/H in image units. With solution "corrected" a constant, "marched_at" [N, Q], the parameters at which a
+    Gaussian was last marched.
 
     Args:
         solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
@@ -88,6 +95,9 @@ class EnergyBalance(ThermalModel):
             humidity and the last without), or None: nothing radiates.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
+        semi_infinite: bodies have no end (with one node and solution "linear").
+        inner: whether there is heat from within (with solution "linear").
+        indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
         shadows: whether what stands in the way of the sun casts shadows (``Query.exposure``).
@@ -95,7 +105,7 @@ class EnergyBalance(ThermalModel):
         albedo: of the ground, for sunlight that comes back from what is not sky; None: nothing comes back.
         emissivity: assumed for ``attributes``, in (0, 1].
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
-        lr_initial, lr_rate, lr_sun, lr_share, lr_wind: learning rates.
+        lr_initial, lr_rate, lr_sun, lr_share, lr_wind, lr_inner: learning rates.
         lr_end: factor on them at the last step, log-linear in between.
 
     Raises:
@@ -113,6 +123,9 @@ class EnergyBalance(ThermalModel):
         sky: str | None = "auto",
         wind: bool = True,
         sun: bool = True,
+        semi_infinite: bool = False,
+        inner: bool = False,
+        indoor_c: float | None = None,
         normals: str = "seen",
         shadows: bool = False,
         sky_view: bool = False,
@@ -124,6 +137,7 @@ class EnergyBalance(ThermalModel):
         lr_sun: float = 2e-2,
         lr_share: float = 1e-2,
         lr_wind: float = 1e-2,
+        lr_inner: float = 2.5e-3,
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
@@ -135,8 +149,13 @@ class EnergyBalance(ThermalModel):
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
-        if nodes == 2 and solution != "linear":
-            raise ValueError("nodes=2 is solved about a mean only: give solution=linear, or nodes=1")
+        for name, asked in (("nodes=2", nodes == 2), ("semi_infinite", semi_infinite), ("inner", inner)):
+            if asked and solution != "linear":
+                raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
+        if nodes == 2 and semi_infinite:
+            raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
+        if indoor_c is not None and not inner:
+            raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
         if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
             raise ValueError(
                 "shadows, sky_view and albedo are of sunlight on surfaces as they lie: give sun=true, normals=seen"
@@ -148,6 +167,7 @@ class EnergyBalance(ThermalModel):
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
+        self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
         self.climate: Climate | None = None
@@ -188,7 +208,7 @@ class EnergyBalance(ThermalModel):
             SceneError: the record lacks a series that the model was trained with.
         """
         drivers, self.simulated = self._drivers(weather)
-        self._weather, self.climate = weather, Climate(drivers)
+        self._weather, self.climate = weather, Climate(drivers, self.semi_infinite)
         self._kept, self._course = Kept(self.climate, self._moments), None
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
@@ -202,6 +222,8 @@ class EnergyBalance(ThermalModel):
             tensors["initial_core"] = tensor(grey.clone(), self.lr_initial)
             tensors["log_core_rate"] = tensor(torch.full_like(grey, -math.log(START_CORE_S)), self.lr_rate)
             tensors["log_coupling"] = tensor(torch.full_like(grey, math.log(START_COUPLING)), self.lr_rate)
+        if self.inner:
+            tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
@@ -232,10 +254,14 @@ class EnergyBalance(ThermalModel):
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of
-        the sky is open and of the sun's beam arrives; and with the assumed emissivity absorptivity, convection at mean wind and
-        heat capacity per area."""
+        the sky is open and of the sun's beam arrives; and with the assumed emissivity absorptivity, convection at mean wind,
+        heat capacity per area (of bodies without an end their effusivity), and the heat that a wall loses with its U-value,
+        which are estimates (``physics.walls``)."""
         surface = self._surface(splats, query)
-        values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
+        if self.semi_infinite:  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
+            values = {"settling_time_h": torch.exp(-surface.log_rate) / 3600.0}
+        else:
+            values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
         if surface.core is not None:
             values["core_time_constant_h"] = torch.exp(-surface.core.log_rate) / 3600.0
             values["core_coupling"] = surface.core.coupling
@@ -243,6 +269,8 @@ class EnergyBalance(ThermalModel):
             values["sun_k_per_kw_m2"] = surface.sun
         if surface.wind is not None:
             values["wind_share"] = surface.wind
+        if surface.inner is not None:
+            values["inner_rise_k"] = surface.inner
         if surface.exposure.sky is not None:
             values["sky_open"] = surface.exposure.sky
         if surface.exposure.sun is not None and query.time_s is not None:
@@ -252,9 +280,17 @@ class EnergyBalance(ThermalModel):
             exchange = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
             values["radiation_share"] = surface.share
             values["convection_w_m2_k"] = exchange * (1 - surface.share)
-            values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
+            if self.semi_infinite:
+                values["effusivity_j_m2_k_s05"] = exchange * torch.exp(-0.5 * surface.log_rate)
+            else:
+                values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
             if self._sunlit:
                 values["absorptivity"] = exchange * surface.sun / 1000.0
+            if surface.inner is not None:
+                values["heat_loss_w_m2"] = exchange * surface.inner
+                if self.indoor_c is not None:
+                    mean_c = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
+                    values["u_value_w_m2_k"] = u_value(values["heat_loss_w_m2"], self.indoor_c, mean_c)
         return values
 
     def effects(self) -> dict[str, dict]:
@@ -321,6 +357,7 @@ class EnergyBalance(ThermalModel):
             normals=query.normals(splats) if drivers.up is not None else None,
             exposure=Exposure(*(query.rows(splats[n].detach()) if n in splats else None for n in (SUN_SEEN, SKY_SEEN))),
             core=core() if self.nodes == 2 else None,
+            inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
         )
 
     def _first_sun(self, grey: Tensor) -> Tensor:
@@ -341,6 +378,10 @@ class EnergyBalance(ThermalModel):
         effects: dict[str, dict[str, Any]] = {"convection": {"air": "recorded"}}
         if self.nodes == 2:
             effects["relaxation"] = {"nodes": "surface and core"}
+        if self.semi_infinite:
+            effects["relaxation"] = {"bodies": "without an end"}
+        if self.inner:
+            effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
         parts: dict[str, Any] = {}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
         if up is not None:

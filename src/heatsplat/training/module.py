@@ -153,6 +153,9 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.prepare(scene, self.splats.means.detach())
         if NORMALS in self.splats:
             self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
+        if self._exposed:
+            self.exposure.prepare(scene, self.renderer, self.normals.discs, self._exposed)
+            self._expose()
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -288,9 +291,11 @@ class SplatTraining(pl.LightningModule):
         self.thermal.on_step(here)
         signs = self.overlap.signs_at(here, len(self.splats), self.seed)
         maps = self.density.maps_at(here)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
+        output = self.render(
+            frame, depth=self.sensor.needs_depth, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs
+        )
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
-        prediction = self.sensor(image, frame)
+        prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
             prediction,
             view.image(self.modality),
@@ -351,7 +356,7 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         if NORMALS in self.splats and step + 1 in self.normals.refresh:
             self._face(self.splats[NORMALS].detach())
-        if step + 1 in self.exposure.refresh:
+        if self._exposed and step + 1 in self.exposure.refresh:
             self._expose()
         if change is not None:
             for group in optimizer.param_groups:
@@ -363,13 +368,16 @@ class SplatTraining(pl.LightningModule):
         """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
         self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
 
+    @property
+    def _exposed(self) -> list[str]:
+        """Tensors of the splats that tell what reaches them of sun and sky."""
+        return [name for name in (SUN_SEEN, SKY_SEEN) if name in self.splats]
+
     @torch.no_grad()
     def _expose(self) -> None:
         """Looks anew what hides sun and sky from the splats, where a model asks for that."""
-        for name, look in ((SUN_SEEN, self.exposure.sun), (SKY_SEEN, self.exposure.sky)):
-            if name in self.splats:
-                splats = self.splats
-                splats[name].copy_(look(self.scene, self.composited, splats.means.detach(), splats[NORMALS].detach()))
+        for name, shares in self.exposure.look(self.splats.means.detach()).items():
+            self.splats[name].copy_(shares)
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
@@ -388,8 +396,9 @@ class SplatTraining(pl.LightningModule):
 
         Last comes "clean", what a camera without the flaws of the sensor chain would record.
         """
-        image, *companions = self.render(frame).features.split(self.thermal.modality_channels, dim=-1)
-        images = (self.sensor(image, frame), *companions, image)
+        output = self.render(frame, depth=self.sensor.needs_depth)
+        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
 
