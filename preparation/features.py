@@ -130,8 +130,7 @@ class Aliked(Features):
         if missing := [name for name in WEIGHTS if not (folder / name).is_file()]:
             raise SceneError(
                 f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {folder} (from the "
-                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use "
-                "poses.features._target_=heatsplat.preparation.features.Sift"
+                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses/features=sift"
             )
         return ALIKED.from_pretrained("aliked-n16", max_num_keypoints=self.most), LightGlue("aliked").eval()
 

@@ -18,6 +18,7 @@ from rich.progress import Progress, track
 from heatsplat.contracts import SceneError, check_option
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section
@@ -26,6 +27,7 @@ from heatsplat.preparation.stretch import Stretch
 log = logging.getLogger(__name__)
 
 WORK = ".poses"  # folder in the prepared one: copies, features and matches, from which a stopped search goes on
+PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
 FEW_FEATURES = 60
 PAIRS_AT_ONCE = 200
@@ -256,6 +258,15 @@ class Search:
             lines.append(
                 f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward)."
             )
+        placed = sorted(written.images.values(), key=lambda image: (_moment(self.frames[image.name]), image.name))
+        if len(written.points3D) > 2:
+            draw_cameras(
+                self.target / PICTURE,
+                [np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]]) for image in placed],
+                np.array([point.xyz for point in written.points3D.values()]),
+                self.origin is not None,
+            )
+            lines += ["", f"![cameras over the points]({PICTURE})", ""]
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
         return Section("Poses", lines, values)
 

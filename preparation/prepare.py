@@ -65,6 +65,8 @@ def prepare(
         SceneError: what is in the folder cannot be read, or ``target`` lies in ``source``.
     """
     folder = Path(source).expanduser().resolve()
+    if not folder.is_dir():
+        raise SceneError(f"source={source}: there is no such folder")
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = Given(**conditions), Uncertainty(**uncertainty)
@@ -79,13 +81,14 @@ def prepare(
     frames = [given.settled(frame) for frame in found.frames]
     writer = Writer(target, uncertain, keep_counts)
     writer.check(frames)
+    dead = writer.find_dead_pixels(frames)
     records, fresh = [], 0
     for frame in track(frames, "radiometry"):
         record, written = writer.write(frame)
         records.append(record)
         fresh += written
     writer.finish(frames, records)
-    dead = writer.mask_dead_pixels(frames)
+    writer.write_masks(frames)
     log.info("%d frames, %d of them written now, the others were there", len(frames), fresh)
     frames = [replace(f, rgb=writer.photo_of(f)) if writer.photo_of(f).exists() else f for f in frames]
     notes = [*found.notes, *([f"{dead} pixels of the detector are dead; masks/ leaves them out"] if dead else [])]

@@ -190,7 +190,7 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     )
     figure.colorbar(image, label=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}")
     axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
-    _save(figure, target / "report" / "histograms.png")
+    save_picture(figure, target / "report" / "histograms.png")
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
@@ -203,7 +203,7 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
         title="Median of every frame, 5 .. 95 % of its pixels, and all of them",
     )
     axes.margins(x=0.01)
-    _save(figure, target / "report" / "over_time.png")
+    save_picture(figure, target / "report" / "over_time.png")
     middle = quantiles[:, MIDDLE]
     jump = np.abs(np.diff(middle)).max() if len(middle) > 1 else 0.0
     lines = [
@@ -223,7 +223,8 @@ def _rising(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.append(quantiles[0] - 1e-9, quantiles[last]), np.append(0.0, QUANTILES[last])
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_picture(figure: Figure, path: Path) -> None:
+    """Writes a figure as PNG, whole or not at all."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     write_atomically(path, buffer.getvalue())

@@ -50,6 +50,7 @@ class Writer:
     def __init__(self, target: Path, uncertain: Uncertainty, keep_counts: bool) -> None:
         self.target, self.uncertain, self.keep_counts = target, uncertain, keep_counts
         self.images = target / "images"
+        self.dead: np.ndarray | None = None  # [H, W] bool, pixels of the detector that say nothing
 
     def check(self, frames: Sequence[Frame]) -> None:
         """Raises SceneError where the folder holds images of another recording."""
@@ -99,10 +100,12 @@ class Writer:
     def _made_of(self, frame: Frame) -> str:
         file = frame.path.stat()
         parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
-        return hashlib.sha256(json.dumps([*parts, repr(self.uncertain)]).encode()).hexdigest()[:32]
+        dead = [] if self.dead is None else np.flatnonzero(self.dead).tolist()
+        return hashlib.sha256(json.dumps([*parts, repr(self.uncertain), dead]).encode()).hexdigest()[:32]
 
     def _record(self, frame: Frame, pixels: np.ndarray) -> dict[str, Any]:
-        known = pixels[np.isfinite(pixels)]
+        finite = np.isfinite(pixels)
+        known = pixels[finite if self.dead is None else finite & ~self.dead]
         record: dict[str, Any] = {
             "file": self.image_of(frame).name,
             "source": str(frame.path),
@@ -113,7 +116,7 @@ class Writer:
             "position": asdict(frame.position) if frame.position else None,
             "attitude": asdict(frame.attitude) if frame.attitude else None,
             "photo": str(self.photo_of(frame) if frame.picture is not None else frame.rgb or "") or None,
-            "unknown_pixels": int(pixels.size - known.size),
+            "unknown_pixels": int((~finite).sum()),
             "quantiles": [float(q) for q in np.quantile(known.astype(np.float64), QUANTILES)] if known.size else None,
         }
         if frame.calibration is None:
@@ -136,17 +139,20 @@ class Writer:
             record["uncertainty_c"] = {"at_c": median} | {n: x if np.isfinite(x) else None for n, x in parts.items()}
         return record
 
-    def mask_dead_pixels(self, frames: Sequence[Frame]) -> int:
-        """How many pixels of the detector are dead; masks/ leaves them out of every image (white counts)."""
+    def find_dead_pixels(self, frames: Sequence[Frame]) -> int:
+        """How many pixels of the detector are dead; from here on no record counts them."""
         few = [frames[i].pixels().astype(np.float32) for i in evenly_spread(len(frames), DEAD_FRAMES)]
-        if any(pixels.shape != few[0].shape for pixels in few):
-            return 0
-        dead = dead_pixels(torch.from_numpy(np.stack(few))).numpy()
-        if dead.any():
-            mask = cv2.imencode(".png", np.where(dead, 0, 255).astype(np.uint8))[1]
+        if all(pixels.shape == few[0].shape for pixels in few):
+            dead = dead_pixels(torch.from_numpy(np.stack(few))).numpy()
+            self.dead = dead if dead.any() else None
+        return 0 if self.dead is None else int(self.dead.sum())
+
+    def write_masks(self, frames: Sequence[Frame]) -> None:
+        """Leaves dead pixels out of every image: masks/ (white counts)."""
+        if self.dead is not None:
+            mask = cv2.imencode(".png", np.where(self.dead, 0, 255).astype(np.uint8))[1]
             for frame in frames:
                 self._replace(self.target / "masks" / f"{self.image_of(frame).name}.png", mask)
-        return int(dead.sum())
 
     def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:
         """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""

@@ -11,11 +11,12 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from heatsplat.contracts import ThermalRange
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.synthetic_scene.presets import Preset
+from heatsplat.datamodules.synthetic_scene.paths import by_hand, swung, swung_path
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.training.rng import generator_for
 
@@ -23,12 +24,8 @@ from heatsplat.training.rng import generator_for
 # is right to second order on a smooth surface, but not at an edge.
 _EDGE_K = 0.05
 _FIELD_OF_VIEW_DEG = 48.0
-# The path circles about this point, metres.
-_LOOK_AT = (0.0, 0.15, 0.3)
-# Frames come faster at the start, when things change fastest: time grows as this power of the frame number.
-_HASTE = 1.4
-# The camera runs this long after the heat has begun to flow, in seconds; a surface changes infinitely fast at first.
-_FIRST_FRAME_S = 20.0
+# Colour of a source that is hot enough to be seen in the dark.
+_GLOWING = (0.9, 0.35, 0.15)
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,8 @@ class Size:
 SIZES = {
     "tiny": Size(64, 52, 19, 600),
     "demo": Size(160, 128, 72, 4000),
-    "large": Size(512, 410, 240, 20000),
+    "benchmark": Size(320, 256, 120, 8000),
+    "large": Size(640, 512, 240, 20000),
 }
 
 
@@ -62,7 +60,7 @@ class Recording:
         thermal_range: the scene's own, or whole degrees that enclose all noise-free temperatures with half a degree to spare.
         points: [P, 3] float64 points seen in the frames, a few millimetres off their surfaces.
         point_colors: [P, 3] in [0, 1].
-        clean: [F, H, W] float32 temperatures without noise and flaws; None where the camera has no flaws.
+        exact: [F, H, W] float32 temperatures without noise and flaws.
     """
 
     scene: Scene
@@ -74,7 +72,12 @@ class Recording:
     thermal_range: ThermalRange
     points: np.ndarray
     point_colors: np.ndarray
-    clean: np.ndarray | None = None
+    exact: np.ndarray
+
+    @property
+    def clean(self) -> np.ndarray | None:
+        """``exact`` where the camera has flaws; None where it has none but noise."""
+        return self.exact if self.scene.preset.flaws else None
 
     def shows(self, frame: int, surface: str) -> np.ndarray:
         """Which pixels [H, W] of a frame's thermal image show a surface: those whose central ray meets it first."""
@@ -109,9 +112,11 @@ def film(
         pixel_aspect: fy / fx.
     """
     lens = _lens(size, distortion, pixel_aspect)
-    times, viewmats = (scene.route or partial(_by_hand, scene.preset))(size.frames, seed)
+    swings = scene.preset.video_hz is not None
+    times, viewmats = (scene.route or partial(swung if swings else by_hand, scene.preset))(size.frames, seed)
     rays = pixel_rays(lens, pixel_centres(lens))
-    celsius = np.empty((size.frames, size.height, size.width), dtype=np.float32)
+    exact = np.empty((size.frames, size.height, size.width), dtype=np.float32)
+    celsius = np.empty_like(exact)
     rgb = np.empty((size.frames, size.height, size.width, 3), dtype=np.uint8)
     lows, highs = np.empty(size.frames), np.empty(size.frames)
     flaws = scene.preset.flaws
@@ -119,20 +124,26 @@ def film(
     def shoot(frame: int) -> None:
         temperature, color = expose(scene, lens, rays, viewmats[frame], float(times[frame]))
         lows[frame], highs[frame] = temperature.min().item(), temperature.max().item()
+        exact[frame] = temperature.numpy()
         if noise_k and not flaws:
             temperature = temperature + _noise(noise_k, temperature, seed, frame)
         celsius[frame] = temperature.numpy()
         rgb[frame] = (color * 255.0).round().to(torch.uint8).numpy()
 
+    def see(moments: Sequence[float]) -> Iterator[Tensor]:
+        poses = swung_path(torch.tensor(moments, dtype=torch.float64), seed)
+        return pool.map(lambda pose, at: expose(scene, lens, rays, pose, at)[0], poses, moments)
+
     with own_threads() as threads, ThreadPoolExecutor(threads) as pool:
         list(pool.map(shoot, range(size.frames)))
+        read = flaws.detector.images(see, times, size.height) if flaws and flaws.detector else None
         count = max(round(size.points / scene.preset.sparseness), 16)
         points, colors = sparse_points(scene, lens, viewmats, count, seed)
     enclosing = ThermalRange(math.floor(lows.min() - 0.5), math.ceil(highs.max() + 0.5))
-    thermal_range, clean = scene.thermal_range or enclosing, None
+    thermal_range = scene.thermal_range or enclosing
     if flaws:
-        clean = celsius
-        recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(torch.from_numpy(clean).double()), seed))
+        read = torch.from_numpy(exact).double() if read is None else read
+        recorded = thermal_range.to_celsius(flaws.record(thermal_range.to_unit(read), seed))
         if noise_k:
             recorded = recorded + torch.stack([_noise(noise_k, one, seed, i) for i, one in enumerate(recorded)])
         celsius = recorded.float().numpy()
@@ -146,7 +157,7 @@ def film(
         thermal_range=thermal_range,
         points=points.numpy(),
         point_colors=colors.numpy(),
-        clean=clean,
+        exact=exact,
     )
 
 
@@ -182,51 +193,18 @@ def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
     )
 
 
-def _by_hand(preset: Preset, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-    times = frame_times(frames, preset.duration_s, seed)
-    return times, camera_path(times, preset.duration_s, seed, preset.approach_m)
-
-
-def frame_times(count: int, duration_s: float, seed: int) -> np.ndarray:
-    """Times [count] of frames taken by hand: uneven, increasing, whole milliseconds, from 20 s to duration_s."""
-    jitter = torch.rand(count, generator=generator_for(seed, 0, "frame times"), dtype=torch.float64).numpy()
-    moments = np.arange(count) + 0.6 * (jitter - 0.5)
-    moments = np.clip(moments, 0.0, count - 1) / max(count - 1, 1)
-    return np.round(_FIRST_FRAME_S + moments**_HASTE * (duration_s - _FIRST_FRAME_S), 3)
-
-
-def camera_path(times_s: np.ndarray, duration_s: float, seed: int, approach_m: float = 0.15) -> Tensor:
-    """World-to-camera matrices [F, 4, 4] of a hand that sweeps to and fro before the objects.
-
-    Every direction is visited several times during the record, so that a view does not tell the time.
-    """
-    generator = generator_for(seed, 0, "camera path")
-    t = torch.from_numpy(times_s) / duration_s
-
-    def sway(cycles: float) -> Tensor:
-        phase = torch.rand((), generator=generator, dtype=torch.float64)
-        return torch.sin(2.0 * math.pi * (cycles * t + phase))
-
-    azimuth = torch.deg2rad(33.0 * sway(5.3) + 2.0 * sway(23.0))
-    elevation = torch.deg2rad(26.0 + 9.0 * sway(3.4) + 1.5 * sway(19.0))
-    radius = 2.2 + approach_m * sway(2.3)
-    roll = torch.deg2rad(2.0 * sway(11.0))
-    aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.05 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
-    flat = radius * torch.cos(elevation)
-    center = aim + torch.stack(
-        [flat * torch.sin(azimuth), -flat * torch.cos(azimuth), radius * torch.sin(elevation)], dim=1
-    )
-
-    forward = torch.nn.functional.normalize(aim - center, dim=1)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=1)
-    down = torch.linalg.cross(forward, right)
-    c, s = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
-    rotation = torch.stack([c * right + s * down, c * down - s * right, forward], dim=1)
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(len(times_s), 1, 1)
-    viewmats[:, :3, :3] = rotation
-    viewmats[:, :3, 3] = -(rotation @ center[:, :, None])[:, :, 0]
-    return viewmats
+def misplaced(recording: Recording, error_px: float, seed: int) -> np.ndarray:
+    """World-to-camera matrices [F, 4, 4] as structure from motion gives them: turned by so many pixels along each side of the
+    image, standard deviation."""
+    if not error_px:
+        return recording.viewmats
+    lens, count = recording.lens, len(recording.viewmats)
+    drawn = torch.randn(count, 2, generator=generator_for(seed, 0, "pose error"), dtype=torch.float64).numpy()
+    turns = np.zeros((count, 3))
+    turns[:, 0], turns[:, 1] = error_px / lens.fy * drawn[:, 0], error_px / lens.fx * drawn[:, 1]
+    wrong = recording.viewmats.copy()
+    wrong[:, :3] = Rotation.from_rotvec(turns).as_matrix() @ wrong[:, :3]
+    return wrong
 
 
 def pixel_centres(lens: Lens) -> Tensor:
@@ -282,6 +260,10 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
             ambient = scene.preset.ambient_c
             share = haze.transmission(distance, time_s / scene.preset.duration_s)
             celsius = ambient + (celsius - ambient) * share
+        center = -(viewmat[:3, :3].T @ viewmat[:3, 3])[None]
+        hot = scene.in_front(center, directions @ viewmat[:3, :3], points, which, time_s)
+        if hot.any():
+            celsius[hot], color[hot] = scene.preset.carried.celsius, color.new_tensor(_GLOWING)
         return celsius, color, scene.transmits[which] > 0
 
     celsius, color, clear = look(rays)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from heatsplat.datamodules.synthetic_scene.moving import Bolometers
 from heatsplat.geometry.resampling import resampled
 from heatsplat.training.rng import generator_for
 
@@ -93,6 +94,7 @@ class CameraFlaws:
         drift: standard deviation of what o_f changes by from frame to frame (image units).
         blur_px: standard deviation of the blur.
         bend: c.
+        detector: what it makes of an image that moves, before all of that; None for one that sees a moment.
     """
 
     gain: float = 0.03
@@ -108,6 +110,7 @@ class CameraFlaws:
     drift: float = 0.0
     blur_px: float = 0.0
     bend: float = 0.0
+    detector: Bolometers | None = None
 
     def fields(self, height: int, width: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
         """G, B and the falloff over the image, each [H, W] float64."""

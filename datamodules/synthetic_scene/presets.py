@@ -13,8 +13,10 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from heatsplat.datamodules.synthetic_scene.carried import Carried
 from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws, Gloss, Haze
 from heatsplat.datamodules.synthetic_scene.heat import Material, Waveform, periodic
+from heatsplat.datamodules.synthetic_scene.moving import Bolometers
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Point, Shape, Sphere
 
 # Directions (cycles per wavelength) and phases of the smooth part of every pattern: three waves that share no axis.
@@ -121,6 +123,9 @@ class Preset:
         flaws: what is wrong with the thermal camera, or None for nothing but noise.
         gloss: what its surfaces are besides black bodies, or None.
         diffusivity: of heat along the surfaces, in m²/s; exact on flat ones, as if they had no end. 0 for none.
+        video_hz: frames per second of a camera that is swung; None for single frames all through the record.
+        carried: a hot ball that is carried through the scene, or None.
+        bounds_c: temperatures of black and white in the camera's images; None for those that its frames need.
         effects: names of the effects that it shows (``heatsplat.effects.catalogue``), which is what ought to be found.
         sparseness: by what factor its sparse model has fewer points than that of other presets.
         point_noise_m: how far a sparse point lies off its surface, standard deviation of each coordinate.
@@ -142,6 +147,9 @@ class Preset:
     approach_m: float = 0.15
     gloss: Gloss | None = None
     diffusivity: float = 0.0
+    video_hz: float | None = None
+    carried: Carried | None = None
+    bounds_c: tuple[float, float] | None = None
     effects: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -152,8 +160,14 @@ class Preset:
             raise ValueError(f"preset starts surfaces that it does not have: {sorted(unknown)}; it has {sorted(names)}")
         if unknown := self.bare - set(names):
             raise ValueError(f"preset has no points on surfaces that it does not have: {sorted(unknown)}")
+        if self.flaws and self.flaws.detector and self.video_hz is None:
+            raise ValueError("a detector that lags or is read row by row needs a camera that is swung: give video_hz")
         if self.held and self.lamp is not None:
             raise ValueError("a preset is either held steady or heated by a lamp, not both")
+        if self.carried is not None and (self.held or self.lamp is not None or self.diffusivity):
+            raise ValueError(
+                "a preset with a carried source has no other: neither a lamp, nor held or conducting surfaces"
+            )
 
 
 # Exchange coefficients are those of a room with moving air, radiation included. Depths are chosen so that the time
@@ -235,6 +249,16 @@ _LAMP = Lamp(
     waveform=periodic(period_s=600.0, on_s=300.0, ramp_s=120.0, duration_s=1800.0),
 )
 
+# Before the ball, between vase and can, over the vase, and down again between vase and ball; it touches nothing.
+_WAY = (
+    (-0.95, -0.6, 0.2),
+    (-0.2, -0.75, 0.12),
+    (0.29, -0.6, 0.15),
+    (0.32, 0.0, 0.45),
+    (-0.2, 0.0, 0.48),
+    (-0.26, -0.45, 0.2),
+)
+
 # Thin copper sheets: a pattern on them levels out before the sheet is cold.
 _SHEETS = tuple(
     Surface(one.name, one.shape, Material(390.0, 3.4e6, 0.003, 11.0), one.absorbs, one.color) for one in TABLE_TOP[:6]
@@ -269,6 +293,18 @@ def droplets(grams_per_m3: float) -> float:
     whatever their sizes (Chýlek 1978, J. Atmos. Sci. 35, 296), which gives 3π · 0.3 / (2 · 11 µm) per density of water.
     """
     return 3.0 * math.pi * 0.3 / (2.0 * 11e-6 * 1e6) * grams_per_m3
+
+
+def _stations(corners: tuple[Point, ...], count: int) -> tuple[Point, ...]:
+    """So many points at equal distances along straight lines between corners."""
+    ends = torch.tensor(corners, dtype=torch.float64)
+    lengths = torch.nn.functional.pad(ends.diff(dim=0).norm(dim=1).cumsum(0), (1, 0))
+    stations = []
+    for along in torch.linspace(0.0, float(lengths[-1]), count, dtype=torch.float64):
+        leg = int(torch.searchsorted(lengths, along).clamp(1, len(corners) - 1))
+        share = (along - lengths[leg - 1]) / (lengths[leg] - lengths[leg - 1])
+        stations.append(tuple(torch.lerp(ends[leg - 1], ends[leg], share).tolist()))
+    return tuple(stations)
 
 
 # A camera without any flaw, to which presets add theirs.
@@ -340,6 +376,15 @@ PRESETS: dict[str, Preset] = {
         flaws=replace(_GOOD, drift=0.02, bend=0.25),
         effects=_shows("frame_offset", "tone"),
     ),
+    "swung": Preset(start_k=_WARM, held=True, surfaces=TABLE_TOP, video_hz=30.0),
+    "moving_camera": Preset(
+        start_k=_WARM,
+        held=True,
+        surfaces=TABLE_TOP,
+        video_hz=30.0,
+        flaws=replace(_GOOD, detector=Bolometers(tau_s=0.012, readout_s=0.020)),
+        effects=_shows("thermal_lag", "rolling_readout"),
+    ),
     "mirrors": Preset(
         start_k=_WARM,
         held=True,
@@ -394,6 +439,14 @@ PRESETS: dict[str, Preset] = {
         surfaces=TABLE_TOP,
         flaws=CameraFlaws(stretch=0.3, shift=0.3),
         effects=_shows("agc", "fixed_pattern", "vignetting"),
+    ),
+    "moving_source": Preset(
+        start_k=_LUKEWARM,
+        surfaces=TABLE_TOP,
+        duration_s=900.0,
+        carried=Carried(_stations(_WAY, 25), radius_m=0.05, celsius=400.0),
+        bounds_c=(18.0, 50.0),
+        effects=_shows("relaxation"),
     ),
     "sheets": Preset(start_k=_SMOOTH, surfaces=_SHEETS, diffusivity=1.2e-4, effects=_shows("relaxation", "conduction")),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -38,6 +38,7 @@ class SurfaceHeat:
         material: [n] position of the material in ``Scene.materials``; -1 where there is no surface.
         waves_k: [n, w] parts of ``start_k`` that also level out sideways, or None where nothing flows sideways.
         levelling: [n, w] the rate at which each does, 1/s.
+        carried_w_m2: [n, K] flux from the carried source at each of its stations, or None where there is none.
     """
 
     start_k: Tensor
@@ -45,11 +46,11 @@ class SurfaceHeat:
     material: Tensor
     waves_k: Tensor | None = None
     levelling: Tensor | None = None
+    carried_w_m2: Tensor | None = None
 
     def where(self, keep: Tensor) -> SurfaceHeat:
         """The heat of the points that ``keep`` selects."""
-        sideways = (None, None) if self.waves_k is None else (self.waves_k[keep], self.levelling[keep])
-        return SurfaceHeat(self.start_k[keep], self.flux_w_m2[keep], self.material[keep], *sideways)
+        return SurfaceHeat(*(None if values is None else values[keep] for values in vars(self).values()))
 
 
 class Scene:
@@ -78,6 +79,9 @@ class Scene:
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         waveform = preset.lamp.waveform if preset.lamp else heat.CONSTANT
         self.responses = heat.solve(self.materials, waveform, preset.duration_s)
+        self.carried_responses = preset.carried and preset.carried.responses(self.materials, preset.duration_s)
+        if preset.bounds_c is not None:
+            self.thermal_range = ThermalRange(*preset.bounds_c)
 
     def first_hits(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """First points [n, 3] on rays, and their surfaces [n]; the origin and -1 where there is none.
@@ -130,7 +134,13 @@ class Scene:
             if self.preset.lamp:
                 lit = self._lamp_flux(on, surface.shape.normals(on))
                 result.flux_w_m2[here] = surface.absorbs(local).clamp(0.0, 1.0) * lit
-        return result
+        if self.preset.carried is None:
+            return result
+        there = which >= 0
+        fluxes = points.new_zeros(len(points), len(self.preset.carried.stations))
+        on, normals = points[there], self.normals(points, which)[there]
+        fluxes[there] = self.preset.carried.fluxes(on, normals, self.shapes, self.preset.ambient_c)
+        return replace(result, carried_w_m2=fluxes)
 
     def _lamp_flux(self, points: Tensor, normals: Tensor) -> Tensor:
         """Flux [n] that the lamp at full level sends onto ``points`` [n, 3], shadows included, in W/m²."""
@@ -158,7 +168,25 @@ class Scene:
             levelled = torch.exp(-surface.levelling * times_s[:, None, None]) - 1.0
             start = start + (levelled * surface.waves_k).sum(-1)
         rise = of_point[..., 0] * start + of_point[..., 1] * surface.flux_w_m2
+        if surface.carried_w_m2 is not None:
+            carried, duration_s = self.preset.carried, self.preset.duration_s
+            warming = torch.from_numpy(carried.rises(self.carried_responses, times_s.numpy(), duration_s))
+            for row, of_station in zip(rise, warming, strict=True):
+                row += (of_station.T[surface.material.clamp_min(0)] * surface.carried_w_m2).sum(1)
         return self.preset.ambient_c + rise.T
+
+    def in_front(self, origin: Tensor, directions: Tensor, points: Tensor, which: Tensor, time_s: float) -> Tensor:
+        """Which rays [n] bool meet the carried source before ``points`` [n, 3], what they meet else (``first_hits``).
+
+        Args:
+            origin: [1, 3] where all rays start.
+            time_s: seconds from the start of the record.
+        """
+        if self.preset.carried is None:
+            return torch.zeros(len(directions), dtype=torch.bool)
+        distance = self.preset.carried.ball(time_s / self.preset.duration_s).intersect(origin, directions)
+        beyond = dot(points - origin, directions) / dot(directions, directions)
+        return distance < torch.where(which < 0, math.inf, beyond)
 
     @property
     def mirrors(self) -> bool:
@@ -206,6 +234,21 @@ class Scene:
         """Emissivity and reflectance [n] of the surface nearest to each of ``points`` [n, 3]."""
         emissivity = self.emissivity[self.nearest(points)[1]]
         return {"emissivity": emissivity, "reflectance": 1.0 - emissivity}
+
+    def attributes(self, points: Tensor) -> dict[str, Tensor]:
+        """What the surface nearest to each of ``points`` [n, 3] is made of, by name with unit, each [n]."""
+        which = self.nearest(points)[1]
+        names = {
+            "conductivity_w_m_k": "conductivity",
+            "heat_capacity_j_m3_k": "heat_capacity",
+            "depth_m": "depth_m",
+            "exchange_w_m2_k": "exchange",
+        }
+        known = {
+            name: torch.tensor([getattr(one.material, key) for one in self.preset.surfaces], dtype=torch.float64)[which]
+            for name, key in names.items()
+        }
+        return known | {"emissivity": self.emissivity[which], "reflectance": 1.0 - self.emissivity[which]}
 
     def how_solved(self) -> str:
         """A sentence about the truth, for reports."""

@@ -117,8 +117,7 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     found = []
     for view in scene.train:
         camera, mask = view.camera, view.mask
-        shrink = max(1.0, max(camera.width, camera.height) / SIGHTING_SIZE)
-        coarse = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
+        coarse = camera.within(SIGHTING_SIZE)
         if mask is not None:
             rows = np.arange(coarse.height) * camera.height // coarse.height
             columns = np.arange(coarse.width) * camera.width // coarse.width

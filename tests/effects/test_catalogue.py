@@ -11,7 +11,8 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 
 NAMES = (
     "relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction", "view_dependence", "reflection",
-    "attenuation", "thermal_opacity", "point_spread", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
+    "attenuation", "thermal_opacity", "point_spread", "thermal_lag", "rolling_readout", "fixed_pattern", "vignetting",
+    "frame_offset", "agc", "tone",
 )  # fmt: skip
 
 

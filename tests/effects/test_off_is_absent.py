@@ -94,12 +94,16 @@ class Built:
         self.modules = {"thermal": self.thermal, "sensor": self.sensor}
         self.channels, self.opacities = self.thermal.modality_channels, self.thermal.opacity_channels
         self.declared = self.thermal.per_gaussian(seeds(sum(self.channels)))
+        self.needs_depth = self.sensor.needs_depth
+        for part in self.sensor.parts.values():
+            if part.needs_depth:
+                part.twists *= 1e5  # a camera that takes hours for its way blurs nothing
 
     def features(self, splats, query):
         return self.thermal.features(splats, query)
 
-    def recorded(self, image, frame):
-        return self.sensor(image, frame)
+    def recorded(self, image, frame, depth):
+        return self.sensor(image, frame, depth)
 
     def regularisers(self, splats):
         return [*self.thermal.regularisers(splats).values(), *self.sensor.regularisers().values()]
@@ -109,6 +113,7 @@ class ByHand:
     """A state, parts on the way and parts of the camera, put one after the other."""
 
     channels = opacities = (1,)
+    needs_depth = False
 
     def __init__(self, state, parts=None, chain=None):
         self.state, self.parts, self.chain = state, parts or {}, chain or {}
@@ -127,7 +132,7 @@ class ByHand:
             values = part(values, splats, query)
         return clipped(values, "straight_through") if self.parts else values
 
-    def recorded(self, image, frame):
+    def recorded(self, image, frame, depth):
         for part in self.chain.values():
             image = part(image, frame)
         return image
@@ -184,10 +189,20 @@ class Run:
 
         behind = torch.full((sum(model.channels),), 0.3)
         shown = Renderer("cpu")(
-            splats.means, splats.quats, splats.scales, splats.opacities, emitted, frame.camera, behind, model.opacities
-        ).features
-        image, *companions = shown.split(model.channels, dim=-1)
-        return torch.cat((model.recorded(image, frame), *companions), dim=-1)
+            *(
+                splats.means,
+                splats.quats,
+                splats.scales,
+                splats.opacities,
+                emitted,
+                frame.camera,
+                behind,
+                model.opacities,
+            ),
+            depth=model.needs_depth,
+        )
+        image, *companions = shown.features.split(model.channels, dim=-1)
+        return torch.cat((model.recorded(image, frame, shown.seen_depth), *companions), dim=-1)
 
     def backward(self):
         """The recorded image, after a backward pass from it and from all regularisers."""
@@ -331,6 +346,16 @@ CASES = {
         ("fixed_pattern", "vignetting", "agc"),
         lambda: ByHand(Static(), chain={"calibration": Calibration(), "agc": GainControl()}),
         ("point_spread.", "raw_spread"),
+    ),
+    "thermal_lag": Case(
+        ("point_spread", "frame_offset"),
+        lambda: ByHand(Static(), chain={"point_spread": PointSpread(), "frame_offset": FrameOffset()}),
+        ("thermal_lag.", "twists", "raw_tau", "raw_lead"),
+    ),
+    "rolling_readout": Case(
+        ("relaxation",),
+        lambda: ByHand(NewtonHarmonic(frequencies=0)),
+        ("rolling_readout.", "twists", "raw_readout"),
     ),
 }
 EFFECTS = tuple(CASES)

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from heatsplat.physics import energy_balance
+from heatsplat.physics import marching
 from heatsplat.physics.energy_balance import Climate, Core, Surface, power_excess
+from heatsplat.physics.marching import UNITS
 from tests.physics.weather_reference import drivers, solved
 
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
@@ -48,11 +49,11 @@ def test_linear_physics_is_exact_to_a_millikelvin(climate):
     assert (course(climate.linear_temperature, surface) - truth).abs().max() < 1e-3
 
 
-def test_corrected_physics_is_exact_to_20_millikelvin_from_sheet_metal_to_wet_ground(climate):
+def test_corrected_physics_is_exact_to_a_millikelvin_from_sheet_metal_to_wet_ground(climate):
     surface = bodies(wind=True)
     truth = solved(climate.drivers, surface, MOMENTS)
     assert truth.max() - truth.min() > 40  # the weather does heat
-    assert (course(climate.stepped_temperature, surface) - truth).abs().max() < 0.02
+    assert (course(climate.stepped_temperature, surface) - truth).abs().max() < 1e-3
     linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
     assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
     assert linear[3] < 1.0
@@ -69,15 +70,19 @@ def test_both_agree_where_nothing_is_nonlinear():
 @pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
-    leaves = [x.clone().requires_grad_() for x in surface[:-2]]  # but for a core and heat from within
+    names = (
+        Surface._fields[:-2] if solution == "linear_temperature" else tuple(UNITS)
+    )  # but for a core and heat from within
+    leaves = [getattr(surface, name).clone().requires_grad_() for name in names]
     at = 40_000.0  # the start is still remembered by some
-    gradients = torch.autograd.grad(getattr(climate, solution)(Surface(*leaves), at).sum(), leaves)
-    for number, (name, gradient) in enumerate(zip(Surface._fields[:-2], gradients, strict=True)):
+    live = surface._replace(**dict(zip(names, leaves, strict=True)))
+    gradients = torch.autograd.grad(getattr(climate, solution)(live, at).sum(), leaves)
+    for name, gradient in zip(names, gradients, strict=True):
         for column in range(3) if name == "normals" else (0,):
-            step = torch.zeros_like(surface[number])
+            step = torch.zeros_like(getattr(surface, name))
             step[(..., column) if name == "normals" else ...] = 1e-4
             up, down = (
-                getattr(climate, solution)(surface._replace(**{name: surface[number] + sign * step}), at)
+                getattr(climate, solution)(surface._replace(**{name: getattr(surface, name) + sign * step}), at)
                 for sign in (1, -1)
             )
             ours = gradient[:, column] if name == "normals" else gradient
@@ -102,10 +107,8 @@ def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_
         climate = Climate(replace(drivers(), beams=None))
     else:
         climate = Climate(drivers())
-    columns, integrate = [], energy_balance.kernels.integrate
-    monkeypatch.setattr(
-        energy_balance.kernels, "integrate", lambda *given: (columns.append(given[1].shape[1]), integrate(*given))
-    )
+    columns, march = [], marching.kernels.march
+    monkeypatch.setattr(marching.kernels, "march", lambda *given: (columns.append(given[2].shape[1]), march(*given)))
     whole = bodies(wind=True)
     zeros = {key: torch.zeros_like(getattr(whole, key)) + tensor(*([x] if x == 0 else x)) for key, x in zeroed.items()}
     found = []
@@ -114,10 +117,10 @@ def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_
         x = climate.stepped_temperature(Surface(*leaves), 40_000.0)
         x.sum().backward()
         found.append((x.detach(), leaves))
-    assert columns == [8 - sum(3 if key == "normals" else 1 for key in gone), 8]
+    assert columns == [9 - sum(4 if key == "normals" else 1 for key in gone), 9]
     torch.testing.assert_close(found[0][0], found[1][0], atol=1e-9, rtol=0)
     for one, other in zip(found[0][1], found[1][1], strict=True):
-        if one is not None:
+        if one is not None and one.ndim == 1:
             torch.testing.assert_close(one.grad, other.grad, atol=1e-9, rtol=1e-9)
 
 
@@ -174,7 +177,7 @@ def test_extreme_bodies_stay_finite_in_float32():
         leaves = [x.clone().requires_grad_() for x in surface[:-2]]
         x = solution(Surface(*leaves), 130_000.0)
         assert x.isfinite().all()
-        assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves))
+        assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves[:-1]))
     for rate, coupling in product((1e-7, 0.1), (0.02, 50.0)):
         leaves = [torch.full((4,), value).requires_grad_() for value in (0.0, math.log(rate), coupling)]
         x = climate.linear_temperature(surface._replace(core=Core(*leaves)), 130_000.0)

@@ -109,8 +109,15 @@ def test_dead_pixels_are_masked_in_every_image_and_sound_ones_are_not(tmp_path):
     scene[:, 5, 7], scene[:, 20, 30] = 30.0, 10.0
     frames = read_frames(write_images(tmp_path / "files", {f"{i}.tiff": image for i, image in enumerate(scene)}))
     writer = Writer(tmp_path / "scene", Uncertainty(), False)
-    assert writer.mask_dead_pixels(frames) == 2
+    assert writer.find_dead_pixels(frames) == 2
+    records = [writer.write(frame)[0] for frame in frames]
+    writer.write_masks(frames)
+    writer.finish(frames, records)
     for frame in frames:
         mask = cv2.imread(str(tmp_path / "scene" / "masks" / f"{frame.name}.tiff.png"), cv2.IMREAD_GRAYSCALE)
         assert np.argwhere(mask != 255).tolist() == [[5, 7], [20, 30]] and mask.shape == (24, 32)
-    assert writer.mask_dead_pixels(frames[:3]) == 0  # too few to tell
+    bounds = json.loads((tmp_path / "scene" / "temperature_bounds.json").read_text())
+    assert 19.0 < bounds["absolute_min_temperature"] < bounds["absolute_max_temperature"] < 21.0  # without what is dead
+    few = Writer(tmp_path / "few", Uncertainty(), False)
+    assert few.find_dead_pixels(frames[:3]) == 0  # too few to tell
+    assert few.write(frames[0])[0]["quantiles"][-1] == 30.0

@@ -155,6 +155,7 @@ OWN = {
         "thermal.emission.sh_degree": (3, "sh_degree"),
         "thermal.scales": ([1, 2], "multires of dnerf_default"),
         "thermal.width": (64, "net_width"),
+        "thermal.leak": (0.0, "nn.ReLU in scene/deformation.py"),
         "thermal.smooth_space": (1e-4, "plane_tv_weight"),
         "thermal.smooth_time": (1e-2, "time_smoothness_weight"),
         "thermal.sparse_time": (1e-4, "l1_time_planes"),

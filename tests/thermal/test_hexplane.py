@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, leaky_relu
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
 from heatsplat.physics.units import KELVIN_AT_0_C
@@ -119,7 +119,7 @@ def test_heads_change_the_raw_tensors_and_the_radiance():
     hidden = by_hand(model, splats.means.detach(), 13.7)
     change = {}
     for name, head in model.heads.items():
-        inner = (hidden.relu() @ head[1].weight.double().T + head[1].bias.double()).relu()
+        inner = leaky_relu(leaky_relu(hidden, 0.01) @ head[1].weight.double().T + head[1].bias.double(), 0.01)
         raw = inner @ head[3].weight.double().T + head[3].bias.double()
         change[name] = HEADS[name][1] * torch.tanh(raw / HEADS[name][1])
         assert raw.abs().max() > 0.01
@@ -234,6 +234,17 @@ def test_radiance_learns_what_warms_here_and_cools_there():
         losses[-1].backward()
         optimiser.step()
     assert sum(loss.item() for loss in losses[-3:]) / 3 < 0.03  # values that stay miss by 0.13
+
+
+def test_units_that_no_gaussian_drives_learn_again_unless_the_leak_is_none():
+    def gradient(leak):
+        model, splats = make(disturb=0.3, heads=["radiance"], leak=leak)
+        with torch.no_grad():
+            model.heads["radiance"][1].bias.fill_(-10.0)
+        model.features(splats, query()).sum().backward()
+        return model.time[0].grad.abs().max()
+
+    assert gradient(0.01) > 0 and gradient(0.0) == 0
 
 
 def test_what_cannot_be_is_refused():

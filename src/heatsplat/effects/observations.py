@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import SceneData, View, evenly_spread
+from heatsplat.contracts import Frame, SceneData, View, evenly_spread
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
@@ -66,6 +66,7 @@ class Observations:
 
     Args:
         scene: where it comes from.
+        frames: [F] of the images.
         images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES evenly spread.
         masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
@@ -76,6 +77,7 @@ class Observations:
     """
 
     scene: SceneData
+    frames: tuple[Frame, ...]
     images: Tensor
     masks: Tensor | None
     times_s: Tensor | None
@@ -108,7 +110,9 @@ def observe(scene: SceneData) -> Observations:
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
-        return Observations(scene, nothing, None, None, math.nan, False, None, "no training view has a thermal image")
+        return Observations(
+            scene, (), nothing, None, None, math.nan, False, None, "no training view has a thermal image"
+        )
     shape = views[0].thermal.shape[:2]
     views = [view for view in views if view.thermal.shape[:2] == shape]
     images = torch.stack([view.thermal.mean(2) for view in views]).double()
@@ -136,7 +140,7 @@ def observe(scene: SceneData) -> Observations:
         tracks = tracks_of(scene.points.double(), views, images, noise)
         if tracks is None:
             why = f"no scene point is seen in {MIN_FRAMES} or more training views"
-    return Observations(scene, images, masks, times_s, noise, still, tracks, why)
+    return Observations(scene, tuple(view.frame for view in views), images, masks, times_s, noise, still, tracks, why)
 
 
 def _stands_still(views: list[View], points: Tensor) -> bool:

@@ -18,7 +18,7 @@ and in kelvin above the reference, x = T - R, with w(x) = (T⁴ - R⁴) / (4 R³
 
 ``linear_temperature`` replaces w by its tangent at the surface's own mean temperature and v b x by v b times that mean,
 which leaves one rate per surface and so the response tables (responses.py, sunlight.py): its cost does not depend on the
-record. ``stepped_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
+record. heatsplat.physics.marching solves the equation as it stands, along the record.
 
 A body with depth has a core behind its surface, which only the surface heats (two nodes):
 
@@ -43,9 +43,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from heatsplat.kernels import heat_balance as kernels
+from heatsplat.physics import marching
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,
@@ -299,46 +298,13 @@ class Climate:
         )
 
     def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:
-        """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers.
+        """Temperature x at a moment of the record by the full balance, [n], marched from its beginning.
 
         Raises:
             ValueError: the bodies have two nodes, no end or heat from within, which only ``linear_temperature`` knows.
         """
-        if surface.core is not None or surface.inner is not None or self.semi_infinite:
-            raise ValueError("bodies of two nodes, without an end or heated from within are solved about a mean only")
-        absent = [value is None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
-        columns = [surface.start, surface.log_rate, surface.share, surface.sun, surface.wind]
-        parameters = torch.stack([column for column in columns if column is not None], dim=1)
-        if surface.normals is not None:
-            parameters = torch.cat((parameters, surface.normals), dim=1)
-        return _Stepped.apply(parameters, kernels.Balance(*(not gone for gone in absent)), self, time_s)
-
-
-class _Stepped(torch.autograd.Function):
-    """The kernel on the CPU, which gives derivatives along with values."""
-
-    @staticmethod
-    def forward(ctx, parameters: Tensor, balance: kernels.Balance, climate: Climate, time_s: float) -> Tensor:
-        drivers = climate.drivers
-        rows = parameters.detach().cpu().contiguous()
-        values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
-        up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
-        kernels.integrate(
-            balance,
-            rows.numpy(),
-            drivers.times_s.numpy(),
-            climate.rows.numpy(),
-            up.numpy(),
-            drivers.reference_k,
-            time_s,
-            values.numpy(),
-            slopes.numpy(),
-        )
-        ctx.save_for_backward(slopes.to(parameters.device))
-        return values.to(parameters.device)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, gradient: Tensor):
-        (slopes,) = ctx.saved_tensors
-        return gradient[:, None] * slopes, None, None, None
+        if self.semi_infinite:
+            raise ValueError(
+                "bodies without an end or heated from within are solved about a mean only: use linear_temperature"
+            )
+        return marching.temperature(self, surface, time_s)

@@ -18,11 +18,13 @@ class SensorPart(nn.Module, ABC):
         lr: learning rate of its parameters.
         lr_end: factor on it at the last step of the run, log-linear in between.
         weight: of its penalty.
+        needs_depth: whether its ``forward`` also takes how far away what is seen is (``heatsplat.sensors.moving``).
     """
 
     lr: float = 1e-3
     lr_end: float = 1.0
     weight: float = 0.0
+    needs_depth: bool = False
 
     def prepare(self, scene: SceneData) -> None:
         """Takes sizes (number of frames, image shape) from the scene. Called once, before training."""
@@ -61,10 +63,19 @@ class SensorChain(nn.Module):
         for part in self.parts.values():
             part.prepare(scene)
 
-    def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        """The recorded image [H, W, C] of a clean one."""
+    @property
+    def needs_depth(self) -> bool:
+        """Whether a part needs to know how far away what is seen is."""
+        return any(part.needs_depth for part in self.parts.values())
+
+    def forward(self, image: Tensor, frame: Frame, depth: Tensor | None = None) -> Tensor:
+        """The recorded image [H, W, C] of a clean one.
+
+        Args:
+            depth: [H, W] of what is seen (camera z), infinite where nothing is; where ``needs_depth``.
+        """
         for part in self.parts.values():
-            image = part(image, frame)
+            image = part(image, frame, depth) if part.needs_depth else part(image, frame)
         return image
 
     def regularisers(self) -> dict[str, Tensor]:

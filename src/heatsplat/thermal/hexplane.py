@@ -55,6 +55,8 @@ class HexPlane(Wrapper):
         scales: factors on ``resolution``, one for each scale.
         channels: of every plane.
         width: of φ and of the heads' one hidden layer.
+        leak: slope of the heads' ReLUs below zero. At 0 a hidden layer that no Gaussian drives above zero is dead: it passes
+            no gradient, and the heads say the same of all places and times from then on.
         first_steps: steps of the static first stage.
         smooth_space, smooth_time: weights of the mean squared second difference along the first axis of space planes, and
             along time of time planes.
@@ -78,6 +80,7 @@ class HexPlane(Wrapper):
         scales: Sequence[int] = (1, 2),
         channels: int = 16,
         width: int = 64,
+        leak: float = 0.01,
         first_steps: int = 0,
         smooth_space: float = 1e-4,
         smooth_time: float = 1e-2,
@@ -105,7 +108,9 @@ class HexPlane(Wrapper):
         self.trunk = nn.Linear(channels * len(sizes), width)
         self.heads = nn.ModuleDict(
             {
-                name: nn.Sequential(nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, HEADS[name][0]))
+                name: nn.Sequential(
+                    nn.LeakyReLU(leak), nn.Linear(width, width), nn.LeakyReLU(leak), nn.Linear(width, HEADS[name][0])
+                )
                 for name in HEADS
                 if name in heads
             }

@@ -284,9 +284,11 @@ class SplatTraining(pl.LightningModule):
         self.thermal.on_step(here)
         signs = self.overlap.signs_at(here, len(self.splats), self.seed)
         maps = self.density.maps_at(here)
-        output = self.render(frame, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs)
+        output = self.render(
+            frame, depth=self.sensor.needs_depth, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs
+        )
         image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
-        prediction = self.sensor(image, frame)
+        prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
             prediction,
             view.image(self.modality),
@@ -374,8 +376,9 @@ class SplatTraining(pl.LightningModule):
 
         Last comes "clean", what a camera without the flaws of the sensor chain would record.
         """
-        image, *companions = self.render(frame).features.split(self.thermal.modality_channels, dim=-1)
-        images = (self.sensor(image, frame), *companions, image)
+        output = self.render(frame, depth=self.sensor.needs_depth)
+        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
 

@@ -1,0 +1,173 @@
+"""Scenes of a protocol as plain folders: what a method may know, and apart from it the truth that it is scored by."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from heatsplat.contracts import SceneData, SceneError, View
+from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.weather import write_weather
+
+log = logging.getLogger("heatsplat")
+
+SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
+META, FILES = "meta.json", {"train": "transforms_train.json", "test": "transforms_test.json"}
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # from camera axes of OpenCV to those of OpenGL and back
+
+
+def write_scenes(
+    output_dir: Path | str,
+    protocol: Mapping[str, Any],
+    target: str | None = None,
+    size: str | None = None,
+    scenes: Sequence[str] | None = None,
+    real: Mapping[str, SceneDataModule] | None = None,
+) -> None:
+    """Writes the scenes of a protocol; those that are there already stay.
+
+    Args:
+        output_dir: folder of the study, which gets them where there is no ``target``.
+        protocol: conf/protocol.
+        target: folder that gets scenes/ and truth/.
+        size: of synthetic scenes; None for the protocol's.
+        scenes: names of those that are written; None for all.
+        real: further scenes by name, as their data modules.
+
+    Raises:
+        SceneError: there is no such scene, or the folder holds scenes of another size.
+    """
+    target = Path(target or output_dir).expanduser()
+    known = {
+        name: partial(
+            Synthetic, size=size or protocol["size"], scene_seed=protocol["scene_seed"], split="parts",
+            **{**entry["data"], "parts": {**protocol["parts"], **entry.get("parts", {})}},
+        )
+        for name, entry in protocol["scenes"].items()
+    }  # fmt: skip
+    known |= {name: partial(lambda module: module, module) for name, module in (real or {}).items()}
+    if unknown := set(scenes or ()) - set(known):
+        raise SceneError(f"study.scenes: there is no {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    for name in scenes or known:
+        made_from = {
+            "protocol": protocol["version"],
+            "size": None if name in (real or {}) else size or protocol["size"],
+        }
+        meta = target / SCENES / name / META
+        if meta.exists():
+            there = json.loads(meta.read_text())
+            if {key: there.get(key) for key in made_from} != made_from:
+                raise SceneError(
+                    f"{meta.parent} is of another size or protocol: delete it, or give study.target another folder"
+                )
+            log.info("%s is there already", meta.parent)
+            continue
+        log.info("writing %s", meta.parent)
+        prefix = "near_" if name in (real or {}) else ""
+        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from, prefix)
+
+
+def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any], prefix: str = "") -> None:
+    """Writes one scene: cameras of all views, images of the training views alone; and the truth of the test views.
+
+    meta.json is written last, so that what was stopped half-way is written anew.
+
+    Args:
+        folder: what is handed out.
+        truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count; and images/.
+        also: further keys of meta.json.
+        prefix: what names of test views get, where they do not begin with the part that they belong to.
+
+    Raises:
+        SceneError: its images are no temperatures.
+    """
+    if scene.thermal_range is None:
+        raise SceneError(f"scene {scene.name} has no temperatures, and the protocol scores °C")
+    clock = None if scene.weather is None else scene.weather.notes.get("utc_at_zero_s")
+    for subset, views in (("train", scene.train), ("test", scene.test)):
+        frames = []
+        for view in views:
+            name, camera = prefix * (subset == "test") + Path(view.frame.name).stem, view.camera
+            entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
+            entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
+            K = camera.K
+            entry |= {"w": camera.width, "h": camera.height, "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item()}
+            entry |= {"cx": K[0, 2].item(), "cy": K[1, 2].item()}
+            entry["transform_matrix"] = (np.linalg.inv(camera.viewmat.numpy()) @ OPENGL_AXES).tolist()
+            frames.append(entry)
+            if subset == "train":
+                _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
+            else:
+                _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
+            if view.rgb is not None:
+                place = folder if subset == "train" else truth
+                _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
+        _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
+    points = scene.points.double().numpy()
+    colors = np.full_like(points, 0.5) if scene.point_colors is None else scene.point_colors.double().numpy()
+    colors = (colors * 255.0).round().astype(np.uint8)
+    _ply(folder / "points3D.ply", points, colors)
+    first = scene.train.frames[0].camera
+    lens = ("PINHOLE", [float(first.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))], first.width, first.height)
+    poses = {f"{Path(frame.name).stem}.tiff": frame.camera.viewmat.numpy() for frame in scene.train.frames}
+    write_model(folder / "sparse" / "0", poses, [lens], points, colors)
+    if scene.labels is not None:
+        np.save(folder / "labels.npy", scene.labels.numpy())
+    meta = {
+        **also,
+        "scene": scene.name,
+        "min_value": scene.thermal_range.min_c,
+        "max_value": scene.thermal_range.max_c,
+        "ambient_c": scene.ambient_c,
+        "metres_per_unit": scene.metres_per_unit,
+    }
+    if scene.weather is not None:
+        write_weather(folder / "weather.csv", scene.weather)
+        site = ("latitude", "longitude", "altitude_m", "up", "north")
+        meta |= {key: scene.weather.notes[key] for key in site if key in scene.weather.notes} | {"utc_at_zero_s": clock}
+    if scene.true_attributes is not None:
+        known = scene.true_attributes(scene.points)
+        table = np.stack([*points.T, *(values.double().numpy() for values in known.values())], axis=1)
+        head = ",".join(["x", "y", "z", *known])
+        np.savetxt(truth / "materials.csv", table, fmt="%.7g", delimiter=",", header=head, comments="")
+    _json(folder / META, meta)
+
+
+def _celsius(scene: SceneData, view: View, which: str) -> np.ndarray:
+    celsius = scene.thermal_range.to_celsius(view.image(which)[..., 0].numpy().astype(np.float64)).astype(np.float32)
+    return celsius if view.mask is None else np.where(view.mask.numpy(), celsius, np.float32(np.nan))
+
+
+def _tiff(path: Path, celsius: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(celsius).save(path, format="TIFF")
+
+
+def _png(path: Path, pixels: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, format="PNG")
+
+
+def _json(path: Path, values: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(values, indent=1))
+
+
+def _ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    kinds = [(axis, "f8") for axis in "xyz"] + [(band, "u1") for band in ("red", "green", "blue")]
+    rows = np.empty(len(points), dtype=kinds)
+    for i, axis in enumerate("xyz"):
+        rows[axis] = points[:, i]
+    for i, band in enumerate(("red", "green", "blue")):
+        rows[band] = colors[:, i]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
