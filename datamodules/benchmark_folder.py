@@ -73,10 +73,11 @@ def write_scenes(
             log.info("%s is there already", meta.parent)
             continue
         log.info("writing %s", meta.parent)
-        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from)
+        prefix = "near_" if name in (real or {}) else ""
+        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from, prefix)
 
 
-def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any]) -> None:
+def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any], prefix: str = "") -> None:
     """Writes one scene: cameras of all views, images of the training views alone; and the truth of the test views.
 
     meta.json is written last, so that what was stopped half-way is written anew.
@@ -85,6 +86,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
         folder: what is handed out.
         truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count; and images/.
         also: further keys of meta.json.
+        prefix: what names of test views get, where they do not begin with the part that they belong to.
 
     Raises:
         SceneError: its images are no temperatures.
@@ -95,7 +97,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
     for subset, views in (("train", scene.train), ("test", scene.test)):
         frames = []
         for view in views:
-            name, camera = Path(view.frame.name).stem, view.camera
+            name, camera = prefix * (subset == "test") + Path(view.frame.name).stem, view.camera
             entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
             entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
             K = camera.K

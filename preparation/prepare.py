@@ -65,6 +65,8 @@ def prepare(
         SceneError: what is in the folder cannot be read, or ``target`` lies in ``source``.
     """
     folder = Path(source).expanduser().resolve()
+    if not folder.is_dir():
+        raise SceneError(f"source={source}: there is no such folder")
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = Given(**conditions), Uncertainty(**uncertainty)

@@ -1,6 +1,7 @@
 """Scenes of a protocol on disk: what is handed out, what is kept, and what a reader of COLMAP or nerfstudio makes of it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -40,9 +41,13 @@ def test_what_is_handed_out_holds_no_pixel_of_a_held_out_view(root):
         for subset in ("train", "test")
     }  # fmt: skip
     assert names(scene / "thermal") == names(scene / "images") == listed["train"]
-    assert names(truth) == names(truth / "images") == listed["test"]
+    assert names(truth) - {"materials"} == names(truth / "images") == listed["test"]
     assert {name.rpartition("_")[0] for name in listed["test"]} == {"near", "views", "times"}
     assert sorted(read_model(scene).names) == sorted(f"{name}.tiff" for name in listed["train"])
+    known = np.genfromtxt(truth / "materials.csv", delimiter=",", names=True)
+    assert (
+        set(known["heat_capacity_j_m3_k"]) >= {1.4e6, 1.0e6} and len(known) > 300 and set(known["emissivity"]) == {1.0}
+    )
     meta = json.loads((scene / "meta.json").read_text())
     assert meta["ambient_c"] == 22.0 and meta["metres_per_unit"] == 1.0 and meta["size"] == "tiny"
 
@@ -78,8 +83,6 @@ def test_what_is_there_stays_and_another_size_is_refused(root, tmp_path):
         write_scenes(root, PROTOCOL, size="demo", scenes=["cooling"])
     with pytest.raises(SceneError, match="there is no boiling; there are cooling, coarse_camera"):
         write_scenes(root, PROTOCOL, scenes=["boiling"])
-    from dataclasses import replace
-
     without = replace(Synthetic(scene="static", size="tiny", frames=4).scene, thermal_range=None)
     with pytest.raises(SceneError, match="scene static has no temperatures"):
         write_scene(without, tmp_path / "scene", tmp_path / "truth", {})

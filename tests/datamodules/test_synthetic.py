@@ -63,7 +63,7 @@ SEEN_AS_THEY_ARE = [
     name
     for name, preset in PRESETS.items()
     if not (preset.haze or preset.flaws or preset.gloss or any(one.emissivity < 1 for one in preset.surfaces))
-    and name not in ("weak_texture", "fine_texture")
+    and name not in ("weak_texture", "fine_texture", "swung")
 ]
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,15 @@ from recordings import write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.formats.colmap import read_model, write_model
+from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
+from heatsplat.datamodules.synthetic_scene.film import Size, film
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.io.tiff import read_temperature
+from heatsplat.preparation.features import Sift
 from heatsplat.preparation.frames import read_frames
+from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 from heatsplat.preparation.report import Section
 
@@ -65,6 +72,24 @@ def test_a_target_within_the_source_is_refused(tmp_path):
     for target in (source, source / "scene"):
         with pytest.raises(SceneError, match="give a folder outside of it"):
             prepare(str(source), target, **PLAIN)
+
+
+def test_a_source_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(SceneError, match="source=.*nowhere: there is no such folder"):
+        prepare(str(tmp_path / "nowhere"), tmp_path / "scene", **PLAIN)
+
+
+def test_a_swung_camera_s_frames_become_a_scene_with_cameras_that_share_one_lens(tmp_path):
+    preset = replace(PRESETS["swung"], video_hz=10.0)
+    recording = film(Scene(preset), Size(160, 128, 6, 60), distortion=(0.05, 0.0, 0.0, 0.0))
+    write_camera(recording, tmp_path / "source", Field(dead_pixels=6))
+    page = prepare(str(tmp_path / "source"), tmp_path / "scene", **PLAIN, poses=FindPoses(Sift()))
+    model = read_model(tmp_path / "scene")
+    assert len(model.viewmats) >= 4 and all(lens == model.lenses[0] for lens in model.lenses)
+    assert model.lenses[0].fx == pytest.approx(recording.lens.fx)  # which the files say
+    assert "![cameras over the points](report/cameras.png)" in page.read_text()
+    assert (tmp_path / "scene" / "report" / "cameras.png").is_file()
+    assert len(Colmap(root=str(tmp_path / "scene")).scene.train) >= 3
 
 
 def test_the_doctor_comes_first_and_sees_the_source(tmp_path):

@@ -55,6 +55,6 @@ def run_of(folder: Path, method: str, scene: str, seed: int, off: float | None, 
     RunResults(run={"method": method, "steps": 2000}, cost=cost).write(place / "metrics.json")
 
 
-def board(root: Path, **asked):
+def board(folder: Path, **asked):
     """The board of a folder."""
-    return board_of({**ASKED, "root": str(root), **asked}, ["3dgs", "etgs", "supirgs"])
+    return board_of({**ASKED, "root": str(folder), **asked}, ["3dgs", "etgs", "supirgs"])

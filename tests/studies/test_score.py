@@ -72,11 +72,13 @@ def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path
         (submission / "metrics.json").write_text(told)
         with pytest.raises(SceneError, match=message):
             score_submission(submission, root, SCORES)
-    (submission / "metrics.json").unlink()
-    with pytest.raises(SceneError, match="metrics.json is missing"):
-        score_submission(submission, root, SCORES)
+    (submission / "metrics.json").write_text('{"method": "ours", "scenes": {"cooling": null}}')
+    assert score_submission(submission, root, SCORES)[1]["cooling"].cost == {}
     shutil.rmtree(root / "truth")
     with pytest.raises(SceneError, match="study=scenes"):
         run(tmp_path, str(submission), str(root), PROTOCOL)
+    (submission / "metrics.json").unlink()
+    with pytest.raises(SceneError, match="metrics.json is missing"):
+        score_submission(submission, root, SCORES)
     with pytest.raises(SceneError, match="submission=FOLDER root=FOLDER"):
         run(tmp_path, None, None, PROTOCOL)

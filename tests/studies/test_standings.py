@@ -5,7 +5,7 @@ import json
 import pytest
 from boards import board, hand_in, protocol_folder, run_of
 
-from heatsplat.studies.leaderboard.standings import beside_reference, ranks, standings, usual_spread
+from heatsplat.studies.leaderboard.standings import beside_reference, ranks, spread_of, standings, usual_spread
 
 
 def test_a_difference_within_the_spread_is_a_tie():
@@ -41,6 +41,10 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert found["3dgs", "cooling"].cost("seconds") == 8.0 and found["theirs", "cooling"].cost("seconds") == 99
     assert [found[name, "cooling"].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
     assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
+    assert (
+        spread_of(list(found.values()), asked)
+        == "What ran with one seed is taken to spread by 6.7 %, as the others do."
+    )
     assert found["3dgs", "driven"].reason == "not run yet"
     assert found["supirgs", "driven"].reason.startswith("made for coarse images")
     beside = beside_reference(list(found.values()), asked)

@@ -143,7 +143,7 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
         return {name: {"on": True} | settings for name, settings in simulated.items()}
     described = {}
     for name, verdict in verdicts.items():
-        described[name] = {key: verdict[key] for key in ("on", "statistic", "threshold", "reason")}
+        described[name] = {key: verdict[key] for key in ("on", "told", "statistic", "threshold", "gain_db", "reason")}
         priced = "ms_per_step" in verdict
         described[name]["parameters"] = (
             verdict["shared"] + verdict["per_gaussian"] * len(module.splats) if priced else None if verdict["on"] else 0
@@ -282,8 +282,9 @@ def _learned_section(folder: Path) -> list[str]:
 
 
 EFFECTS_NOTE = (
-    "An effect is simulated where its statistic exceeds the threshold; no number stands where it "
-    "was asked for or the data cannot say. What is off is absent: no parameter, no operation. Parameters are those of the "
+    "An effect is simulated where its statistic exceeds the threshold and the images can tell it; no number stands where it "
+    "was asked for or the data cannot say. Decibels: what it gains on observations that it was not fitted to. What is off is "
+    "absent: no parameter, no operation. Parameters are those of the "
     "Gaussians at the end. Milliseconds per step: whole training steps on the Gaussians of the start, with all effects and "
     "without the one (and what stands on it), by turns; quickest against quickest, so a few hundredths are noise."
 )
@@ -308,10 +309,12 @@ def effects_table(effects: Mapping[str, Any]) -> list[str]:
             "–" if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
             for key in ("statistic", "threshold", "parameters", "ms_per_step")
         )
-        on = "**yes**" if effect["on"] else "no"
-        rows.append((name, on, statistic, threshold, effect["reason"], parameters, milliseconds))
-    head = ("effect", "simulated", "statistic", "threshold", "reason", "parameters", "ms per step")
-    return markdown_table(head, rows, align="llrrlrr")
+        on = "**yes**" if effect["on"] else "no" if effect["told"] else "cannot be told"
+        gain, cost = effect["gain_db"], effect["ms_per_step"]
+        gains = ("–" if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else "–")
+        rows.append((name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds))
+    head = ("effect", "simulated", "statistic", "threshold", "dB", "dB per ms", "reason", "parameters", "ms per step")
+    return markdown_table(head, rows, align="llrrrrlrr")
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:

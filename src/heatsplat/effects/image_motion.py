@@ -63,7 +63,7 @@ class Delays:
         positions = obs.tracks.positions + self.velocities * (2.0 * seconds[1] * self.rows[..., None] / size)
         values = []
         for f, image in enumerate(obs.images):
-            here = torch.cat([image[..., None], _gradient(image)], 2)
+            here = torch.cat([image[..., None], gradient(image)], 2)
             value, slope = between(here, positions[:, f]).split([1, 2], dim=1)
             values.append(value[:, 0] - seconds[0] * (slope * self.velocities[:, f]).sum(1))
         return replace(obs.tracks, values=torch.stack(values, 1))
@@ -93,14 +93,14 @@ def delays(obs: Observations) -> Delays | None:
         nearness = 1.0 / to_camera(tracks.points, frame.camera.viewmat)[:, 2].clamp_min(1e-9)
         velocities.append(screen_velocity(pixels, nearness, frame.camera.K, turning[frame.frame_id]))
         rows.append(0.5 * position[:, 1])
-        columns.append((between(_gradient(image), position) * velocities[-1]).sum(1))
+        columns.append((between(gradient(image), position) * velocities[-1]).sum(1))
     velocities, rows, columns = (torch.stack(found, 1) for found in (velocities, rows, columns))
     fast = velocities.norm(dim=2)[tracks.weights > 0].quantile(FAST)
     found = _fitted(obs, torch.stack([columns, -rows * columns], 2))
     return None if found is None else Delays(*found, float(fast), velocities, rows)
 
 
-def _gradient(image: Tensor) -> Tensor:
+def gradient(image: Tensor) -> Tensor:
     """Slopes [H, W, 2] along x and y of an image [H, W], per pixel."""
     wide = functional.pad(image[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     across, down = wide[1:-1, 2:] - wide[1:-1, :-2], wide[2:, 1:-1] - wide[:-2, 1:-1]
@@ -116,7 +116,7 @@ def _fitted(obs: Observations, columns: Tensor) -> tuple[Tensor, Tensor] | None:
     weights = tracks.weights / errors**2
     everything = torch.cat([tracks.values[..., None], columns], 2)
     for _ in range(ROUNDS):
-        values, about = _centred(everything, weights).split([1, 2], dim=2)
+        values, about = centred(everything, weights).split([1, 2], dim=2)
         inner = torch.einsum("pf,pfi,pfj->ij", weights, about, about)
         if not bool(torch.linalg.matrix_rank(inner) == 2):
             return None
@@ -130,7 +130,7 @@ def _fitted(obs: Observations, columns: Tensor) -> tuple[Tensor, Tensor] | None:
     return seconds, torch.maximum(*variances).sqrt()
 
 
-def _centred(values: Tensor, weights: Tensor) -> Tensor:
+def centred(values: Tensor, weights: Tensor) -> Tensor:
     """Values [P, F, c] without the mean of each point, and of each frame."""
     for _ in range(3):
         for axis in (0, 1):

@@ -81,7 +81,7 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
             torch.from_numpy(bounds.to_unit(image.astype(np.float64))).float()[..., None] for image in images
         )
         found = scorer(prediction.clamp(0, 1), target)
-        rows.append({"name": name, "part": name.rpartition("_")[0], **{score: found[score] for score in scores}})
+        rows.append({"name": name, "part": name.partition("_")[0], **{score: found[score] for score in scores}})
     return SceneScore(rows)
 
 

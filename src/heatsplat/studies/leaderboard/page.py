@@ -15,7 +15,7 @@ from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, beside_reference, summary
+from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, beside_reference, spread_of, summary
 from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -43,6 +43,7 @@ def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
         "seeds": list(board.seeds),
         "sizes": board.sizes,
         "note": board.note,
+        "spread": spread_of(entries, board),
         "scenes": [
             {"name": name, "shows": board.protocol["scenes"].get(name, {}).get("shows", "a recording"),
              "pictures": _pictures([one for one in entries if one.scene == name], board)}

@@ -12,11 +12,12 @@ from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import Entry, beside_reference, standings, summary
+from heatsplat.studies.leaderboard.standings import Entry, beside_reference, spread_of, standings, summary
 
 log = logging.getLogger("heatsplat")
 
 TABLE_FILE, CSV_FILE, PAGE_FILE = "leaderboard.md", "leaderboard.csv", "leaderboard.html"
+TIES = "methods whose difference is below two of its standard errors are tied, and share their ranks."
 DIGITS = {"psnr": 2, "ssim": 4, "mae_c": 3}
 
 
@@ -48,10 +49,11 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
         f"{', '.join(board.sizes)}; {told['runs']} runs, {told['hours']:.2f} h of {_clock(board)} together; seeds "
         f"{', '.join(map(str, board.seeds))}. {board.note}".rstrip(),
         "",
-        f"A cell is {score} ({unit}) of the held-out views, mean over seeds, with the ranks that the seeds allow: methods whose "
-        "difference is below two of its standard errors are tied, and share their ranks. What ran with one seed is taken to "
-        f"spread as much as the others do on average. `x {board.protocol['reference']}` is the geometric mean of a method's "
-        "error as a multiple of that method's, over the scenes that both ran on.",
+        f"The [page]({PAGE_FILE}) beside it sorts, draws error against seconds, and shows renders beside the truth.",
+        "",
+        f"A cell is {score} ({unit}) of the held-out views, mean over seeds, with the ranks that the seeds allow: {TIES} "
+        f"{spread_of(entries, board)} `x {board.protocol['reference']}` is the geometric mean of a method's error as a multiple "
+        "of that method's, over the scenes that both ran on.",
         "",
     ]
     for track in board.tracks:
@@ -142,7 +144,7 @@ def _reasons(entries: Sequence[Entry]) -> list[str]:
 
 def _short(entry: Entry) -> str:
     """The reason without the name of the scene, so that scenes of one reason stand together."""
-    return entry.reason.replace(f"'{entry.scene}'", "").replace(f"scene {entry.scene}", "the scene")
+    return entry.reason.replace(f"scene '{entry.scene}'", "the scene")
 
 
 def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object]]:

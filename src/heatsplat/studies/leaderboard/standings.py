@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -108,7 +109,7 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
     if entry is None or int(overrides.get("seed", 0)) not in board.seeds:
         return
     if not (folder / METRICS_FILE).exists():
-        entry.reason = reason_of(folder)
+        entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
         return
     try:
         score = scored_once(folder, entry.scene, board)
@@ -152,6 +153,17 @@ def usual_spread(values: Sequence[Sequence[float]]) -> float | None:
         statistics.stdev(own) / statistics.fmean(own) for own in values if len(own) > 1 and statistics.fmean(own) > 0
     ]
     return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
+
+
+def spread_of(entries: Sequence[Entry], board: Board) -> str:
+    """A sentence on what is taken for the spread of what ran with one seed."""
+    values = [entry.values(board.protocol["scores"][0]) for entry in entries]
+    if not any(len(own) == 1 for own in values):
+        return ""
+    usual = usual_spread(values)
+    if usual is None:
+        return "All ran with one seed, which tells no spread: ranks are those of the bare numbers."
+    return f"What ran with one seed is taken to spread by {100 * usual:.1f} %, as the others do."
 
 
 def ranks(values: Sequence[Sequence[float]], usual: float | None, higher: bool = False) -> list[tuple[int, int]]:
