@@ -17,7 +17,7 @@ def test_cooling_is_taken_away_and_leaps_that_all_share_are_left():
     left, weights = beside_courses(cooling, torch.ones_like(cooling), material)
     assert left.abs().max() < 0.02 * 10.0 and weights.all()
     left, _ = beside_courses(cooling + leaps, torch.ones_like(cooling), material)
-    assert (left - left[:1]).abs().max() < 0.05 and left[0].std() > 0.5 * leaps.std()
+    assert (left - left[:1]).abs().max() < 0.2 and left[0].std() > 0.5 * leaps.std()
 
 
 def test_points_that_are_seen_too_seldom_do_not_count_and_without_times_a_point_has_a_level():
