@@ -51,8 +51,9 @@ lint: $(READY)  ## check style and formatting
 format: $(READY)  ## mend style and formatting
 	@$(RUN) -m ruff check --fix -q . ; $(RUN) -m ruff format -q .
 
-bench: $(READY)  ## time the renderer against its peers and its floor
-	@$(RUN) src/study.py study=renderer $(ARGS)
+bench: $(READY)  ## time the renderer against its peers and its floor; adds a line to benchmarks/history.jsonl and draws it
+	@$(RUN) src/study.py study=renderer study.history=$(CURDIR)/benchmarks/history.jsonl $(ARGS)
+	@$(RUN) src/study.py study=history
 
 stability: $(READY)  ## measure the hard cases of arithmetic and write docs/stability.md
 	@$(RUN) src/study.py study=stability $(ARGS)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.training.machine import cores
 
@@ -26,10 +29,17 @@ HEAD = """# Effects: what a scene may call for, and how that is told
 
 This page is generated: `python src/study.py study=evidence`.
 
-An effect is simulated where its evidence exceeds its threshold. Evidence is a statistic on the training images that stays
-below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint fit of all of
-them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion in the
-presence of the others. Where metadata is missing an effect is off, and the reason says so.
+An effect is simulated where its evidence exceeds its threshold and images can tell it. Evidence is a statistic on the training
+images that stays below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint
+fit of all of them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion
+in the presence of the others. Where metadata is missing an effect is off, and the reason says so.
+
+What was taken in has to show it where it was not fitted (`effects/joint/certainty.py`): on observations that were left out, a
+quarter at a time, it has to gain 0.3 dB, and 3.5 standard errors over the images; images whose departures are shuffled must not
+gain as much; and what an image has in common must be common to all of its points. Sun, sky and wind are judged by balances of
+heat fitted with and without them (`effects/weathered.py`). What fails, what would take its place, and what the record has too
+few frames for **cannot be told**: it is off, and its reason says what would be needed. A run's table has the decibels beside
+the milliseconds that they cost; `effects.least_db_per_ms` asks for a least ratio of the two.
 
 `method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing.
 `effects.<name>=on|off|auto` overrules any of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what
@@ -58,6 +68,22 @@ Nothing else changes. The file says:
 `effects/physical/tone.py` is a short one to start from, `tests/effects/test_new_effect.py` adds one. The part itself is a class
 in `thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` asks for a case of each effect: off, nothing of it is left.
 """
+DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
+CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
+    "in a room": lambda scene: scene.weather is None,
+    "under the sky": lambda scene: scene.weather is not None,
+    "under the sky at night": lambda scene: (
+        scene.weather is not None and float(scene.weather.irradiance_w_m2.max()) < 1
+    ),
+    "10 training frames or fewer": lambda scene: len(scene.train) <= 10,
+    "11 to 20": lambda scene: 10 < len(scene.train) <= 20,
+    "more": lambda scene: len(scene.train) > 20,
+    "8 bits": lambda scene: scene.notes["bits"] == 8,
+    "noise of 0.15 K or more": lambda scene: scene.notes["noise_k"] >= 0.15,
+    "poses off by half a pixel or more": lambda scene: scene.notes["pose_error_px"] >= 0.5,
+    "with gain control": lambda scene: "agc" in scene.notes["effects"],
+}
+MISSED, TAKEN, UNTOLD = (attrgetter(name) for name in ("missed", "taken", "untold"))
 COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
 
 
@@ -70,6 +96,7 @@ class Outcome:
         present: names of the effects that it shows in truth.
         verdicts: by name.
         seconds: what deciding took.
+        conditions: in which it was recorded.
     """
 
     scene: str
@@ -78,6 +105,7 @@ class Outcome:
     present: frozenset[str]
     verdicts: Mapping[str, Verdict]
     seconds: float
+    conditions: tuple[str, ...] = ()
 
     @property
     def found(self) -> frozenset[str]:
@@ -85,9 +113,24 @@ class Outcome:
         return frozenset(name for name, verdict in self.verdicts.items() if verdict.on)
 
     @property
+    def untold(self) -> frozenset[str]:
+        """Names of the effects that cannot be told."""
+        return frozenset(name for name, verdict in self.verdicts.items() if not verdict.told)
+
+    @property
+    def missed(self) -> frozenset[str]:
+        """Names of the effects that are there and were told not to be."""
+        return self.present - self.found - self.untold
+
+    @property
+    def taken(self) -> frozenset[str]:
+        """Names of the effects that were told to be there and are not."""
+        return self.found - self.present
+
+    @property
     def wrong(self) -> int:
         """How many verdicts are wrong."""
-        return len(self.found ^ self.present)
+        return len(self.missed) + len(self.taken)
 
 
 def run(
@@ -97,10 +140,13 @@ def run(
     sizes: Sequence[str] = ("tiny",),
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     unseen: Sequence[int] = (),
+    drawn: Mapping[str, Sequence[int]] | None = None,
     document: str | None = None,
     jobs: int | None = 1,
 ) -> str:
     """The page, also written to effects.md in ``output_dir`` and to ``document``.
+
+    Verdicts that are in ``output_dir`` already are taken from there.
 
     Args:
         output_dir: folder of the results.
@@ -108,19 +154,25 @@ def run(
         scenes, sizes: verdicts are asked for every pair of them.
         seeds: of the recordings of each.
         unseen: of further ones, which no threshold was set on; they are counted apart.
+        drawn: first number and count of scenes that are drawn at random, by what they are called; they are of the first size.
         document: file that is written besides; None for none.
         jobs: recordings that are worked on side by side, with one thread each; None: one for each core.
     """
+    numbers = {name: range(first, first + count) for name, (first, count) in (drawn or {}).items()}
     cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
-    outcomes = []
-    for outcome in _outcomes(data, cases, cores() if jobs is None else jobs):
-        outcomes.append(outcome)
-        log.info("%d of %d: %s %s %d", len(outcomes), len(cases), outcome.scene, outcome.size, outcome.seed)
-        for name in sorted(outcome.found ^ outcome.present):
+    cases += [(f"{DRAWN}{number}", sizes[0], number) for these in numbers.values() for number in these]
+    folder = Path(output_dir) / "verdicts"
+    folder.mkdir(parents=True, exist_ok=True)
+    known = {case: folder / f"{'_'.join(map(str, case))}.json" for case in cases}
+    waiting = [case for case in cases if not known[case].exists()]
+    for done, outcome in enumerate(_outcomes(data, waiting, cores() if jobs is None else jobs), start=1):
+        write_atomically(known[outcome.scene, outcome.size, outcome.seed], json.dumps(_plain(outcome), indent=1))
+        log.info("%d of %d: %s %s %d", done, len(waiting), outcome.scene, outcome.size, outcome.seed)
+        for name in sorted(outcome.missed | outcome.taken):
             log.info("    %s is %s", name, "missed" if name in outcome.present else "not there")
             log.info("    %s", outcome.verdicts[name].reason)
-    text = written(outcomes, frozenset(unseen))
-    Path(output_dir).mkdir(parents=True, exist_ok=True)
+    outcomes = [_read(path) for path in known.values()]
+    text = written(outcomes, frozenset(unseen), numbers)
     for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
         path.write_text(text, encoding="utf-8")
     log.info("%s", text)
@@ -129,6 +181,8 @@ def run(
 
 def _outcomes(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], jobs: int) -> Iterator[Outcome]:
     """The outcomes of cases (scene, size, seed), in their order."""
+    if not cases:
+        return
     if jobs == 1:
         torch.set_num_threads(1)  # small tensors
         yield from (outcome_of(data, *case) for case in cases)
@@ -151,11 +205,33 @@ def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Ou
         )
     start = time.perf_counter()
     verdicts = decide(recorded)
-    return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    conditions = tuple(name for name, holds in CONDITIONS.items() if holds(recorded))
+    return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, seconds, conditions)
 
 
-def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -> str:
-    """The page; recordings of the seeds in ``unseen`` have tables of their own."""
+def _plain(outcome: Outcome) -> dict[str, Any]:
+    return {**asdict(outcome), "present": sorted(outcome.present)}
+
+
+def _read(path: Path) -> Outcome:
+    said = json.loads(path.read_text(encoding="utf-8"))
+    verdicts = {name: Verdict(**verdict) for name, verdict in said["verdicts"].items()}
+    sets = {"present": frozenset(said["present"]), "conditions": tuple(said["conditions"])}
+    return Outcome(**{**said, "verdicts": verdicts, **sets})
+
+
+def written(
+    outcomes: Sequence[Outcome],
+    unseen: frozenset[int] = frozenset(),
+    drawn: Mapping[str, Collection[int]] | None = None,
+) -> str:
+    """The page; recordings of the seeds in ``unseen``, and scenes ``drawn`` at random, have tables of their own."""
+    of_numbers = {
+        name: [one for one in outcomes if one.scene.startswith(DRAWN) and one.seed in numbers]
+        for name, numbers in (drawn or {}).items()
+    }
+    outcomes = [one for one in outcomes if not one.scene.startswith(DRAWN)]
     rows = [
         (
             effect.name, effect.stage, effect.summary, effect.source, ", ".join(sorted(effect.needs)) or "images",
@@ -168,36 +244,73 @@ def written(outcomes: Sequence[Outcome], unseen: frozenset[int] = frozenset()) -
         for which, wanted in ((size, False), (f"{size}, on recordings that no threshold was set on", True)):
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
             lines += _confusion(which, these) if these else []
+    for name, these in of_numbers.items():
+        lines += _of_drawn(name, these) if these else []
     return "\n".join(lines) + "\n"
 
 
 def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:
     """How verdicts and truth agree: one table by effect, one by scene."""
-    cases = len(outcomes) * len(CATALOGUE)
-    right = cases - sum(outcome.wrong for outcome in outcomes)
-    clean = sum(outcome.wrong == 0 for outcome in outcomes)
-    seconds = sorted(outcome.seconds for outcome in outcomes)[len(outcomes) // 2]
-    lines = [
-        f"\n## Verdicts against truth, {which}\n",
-        f"{right} of {cases} verdicts are right ({100 * right / cases:.1f} %); {clean} of {len(outcomes)} scenes have not a "
-        f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
-    ]
-    by_effect, by_scene = [], []
-    for effect in CATALOGUE:
-        with_it = [effect.name in outcome.found for outcome in outcomes if effect.name in outcome.present]
-        without = [effect.name in outcome.found for outcome in outcomes if effect.name not in outcome.present]
-        counts = (sum(with_it), len(with_it) - sum(with_it), len(without) - sum(without), sum(without))
-        by_effect.append((effect.name, *counts))
+    by_scene = []
     for scene in dict.fromkeys(outcome.scene for outcome in outcomes):
         these = [outcome for outcome in outcomes if outcome.scene == scene]
-        missed = [name for outcome in these for name in sorted(outcome.present - outcome.found)]
-        taken = [name for outcome in these for name in sorted(outcome.found - outcome.present)]
+        lists = ([name for one in these for name in sorted(names(one))] for names in (MISSED, TAKEN, UNTOLD))
         shows = ", ".join(sorted(these[0].present)) or "nothing"
         good = sum(outcome.wrong == 0 for outcome in these)
-        by_scene.append((scene, shows, f"{good} of {len(these)}", _counted(missed), _counted(taken)))
-    agreement = ("effect", "present: found", "present: missed", "absent: left out", "absent: taken in")
-    lines += [*markdown_table(agreement, by_effect), ""]
-    return lines + markdown_table(("scene", "shows", "right", "missed", "taken in"), by_scene)
+        by_scene.append((scene, shows, f"{good} of {len(these)}", *map(_counted, lists)))
+    head = ("scene", "shows", "nothing wrong", "missed", "taken in", "cannot be told")
+    return [*_by_effect(f"Verdicts against truth, {which}", outcomes), *markdown_table(head, by_scene)]
+
+
+def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """How verdicts and truth agree on scenes drawn at random: one table by effect, one by how they were recorded."""
+    numbers = sorted(outcome.seed for outcome in outcomes)
+    title = f"Verdicts against truth, scenes drawn at random, {name} ({DRAWN}{numbers[0]} to {DRAWN}{numbers[-1]})"
+    rows = []
+    for condition in CONDITIONS:
+        these = [outcome for outcome in outcomes if condition in outcome.conditions]
+        if these:
+            rows.append((condition, len(these), *_shares(these)))
+    head = ("recorded", "scenes", "right %", "cannot be told %", "wrong %")
+    return [*_by_effect(title, outcomes), *markdown_table(head, rows)]
+
+
+def _shares(outcomes: Sequence[Outcome]) -> tuple[str, str, str]:
+    """Of the verdicts, how many hundredths are right, cannot be told, and are wrong."""
+    cases = len(outcomes) * len(CATALOGUE)
+    untold, wrong = (sum(count) for count in zip(*((len(one.untold), one.wrong) for one in outcomes), strict=True))
+    return tuple(f"{100 * count / cases:.1f}" for count in (cases - untold - wrong, untold, wrong))
+
+
+def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """How verdicts and truth agree in words, and a table by effect."""
+    right, untold, wrong = _shares(outcomes)
+    clean = sum(outcome.wrong == 0 for outcome in outcomes)
+    seconds = sorted(outcome.seconds for outcome in outcomes)[len(outcomes) // 2]
+    sought = [
+        verdict for one in outcomes for verdict in one.verdicts.values() if "lacks" not in verdict.reason or verdict.on
+    ]
+    rows = []
+    for effect in CATALOGUE:
+        groups = []
+        for there in (True, False):
+            these = [outcome for outcome in outcomes if (effect.name in outcome.present) == there]
+            on = sum(effect.name in outcome.found for outcome in these)
+            unsure = sum(effect.name in outcome.untold for outcome in these)
+            groups.append((on, len(these) - on - unsure, unsure))
+        rows.append((effect.name, *groups[0], groups[1][1], groups[1][0], groups[1][2]))
+    head = (
+        "effect", "present: found", "present: missed", "present: cannot be told", "absent: left out", "absent: taken in",
+        "absent: cannot be told",
+    )  # fmt: skip
+    return [
+        f"\n## {title}\n",
+        f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % say that it cannot be told, {wrong} % are "
+        f"wrong ({len(sought)} verdicts are on effects whose metadata are there). {clean} of {len(outcomes)} scenes have not a "
+        f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
+        *markdown_table(head, rows),
+        "",
+    ]
 
 
 def _counted(names: Sequence[str]) -> str:

@@ -75,7 +75,8 @@ class Benchmark(OutdoorDataModule):
     ) -> RawFrame:
         thermal = Path(frame["thermal_file_path"])
         image = folder / thermal if subset == "train" else truth / thermal.name
-        seen = self.rgb and subset == "train" and frame["file_path"] != frame["thermal_file_path"]
+        visible = (folder if subset == "train" else truth) / frame["file_path"]
+        seen = self.rgb and visible.suffix == ".png" and visible.is_file()
         time = frame.get("time_s")
         where = f"{transforms.path}: time_s of {thermal.name}"
         clock = meta.get("utc_at_zero_s") or 0.0
@@ -85,6 +86,6 @@ class Benchmark(OutdoorDataModule):
             lens=lens_in(transforms, frame, lambda: read_image(image).shape[1::-1]),
             read=partial(read_image, image),
             time_s=None if time is None else clock + finite(time, where, "a number of seconds"),
-            read_rgb=partial(read_image, folder / frame["file_path"]) if seen else None,
+            read_rgb=partial(read_image, visible) if seen else None,
             subset=subset,
         )

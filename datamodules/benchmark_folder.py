@@ -73,18 +73,20 @@ def write_scenes(
             log.info("%s is there already", meta.parent)
             continue
         log.info("writing %s", meta.parent)
-        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from)
+        prefix = "near_" if name in (real or {}) else ""
+        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from, prefix)
 
 
-def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any]) -> None:
+def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any], prefix: str = "") -> None:
     """Writes one scene: cameras of all views, images of the training views alone; and the truth of the test views.
 
     meta.json is written last, so that what was stopped half-way is written anew.
 
     Args:
         folder: what is handed out.
-        truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count.
+        truth: what is not: float32 TIFF in °C by the name of the view, NaN where a pixel does not count; and images/.
         also: further keys of meta.json.
+        prefix: what names of test views get, where they do not begin with the part that they belong to.
 
     Raises:
         SceneError: its images are no temperatures.
@@ -95,7 +97,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
     for subset, views in (("train", scene.train), ("test", scene.test)):
         frames = []
         for view in views:
-            name, camera = Path(view.frame.name).stem, view.camera
+            name, camera = prefix * (subset == "test") + Path(view.frame.name).stem, view.camera
             entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
             entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
             K = camera.K
@@ -105,10 +107,11 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
             frames.append(entry)
             if subset == "train":
                 _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
-                if view.rgb is not None:
-                    _png(folder / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
             else:
                 _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
+            if view.rgb is not None:
+                place = folder if subset == "train" else truth
+                _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
         _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
     points = scene.points.double().numpy()
     colors = np.full_like(points, 0.5) if scene.point_colors is None else scene.point_colors.double().numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,17 @@ from heatsplat.datamodules.formats.radiometric import has_temperatures, read_cel
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
+META_FILE = "meta.csv"  # of a published flight: file, latitude and more of each frame
+
+
+def _positions(folder: Path) -> Path | None:
+    """The first table beside the scene that has a latitude."""
+    for path in (folder / FRAMES_FILE, folder / META_FILE, folder.parent / META_FILE):
+        if path.is_file():
+            with open(path, encoding="utf-8", errors="replace") as file:
+                if "lat" in file.readline().lower():
+                    return path
+    return None
 
 
 class Colmap(SceneDataModule):
@@ -118,7 +130,7 @@ class Colmap(SceneDataModule):
             notes["masks"] = f"{masked} of {len(frames)} images have a mask in {self.masks}/ ({self.mask_keep} counts)"
         if rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
-        return self.finish(
+        scene = self.finish(
             folder.name,
             frames,
             model.points,
@@ -129,6 +141,7 @@ class Colmap(SceneDataModule):
             metres_per_unit=self.metres_per_unit,
             notes=notes,
         )
+        return replace(scene, positions=_positions(folder))
 
     def _reader(
         self, raw: ImageIndex | None, index: ImageIndex, files: Sequence[str]

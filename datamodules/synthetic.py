@@ -13,8 +13,15 @@ import torch
 from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.raw_scene import RawFrame
-from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, own_threads
-from heatsplat.datamodules.synthetic_scene.outdoor import SKIES, OutdoorScene, in_weather, training_frames
+from heatsplat.datamodules.synthetic_scene.drawn import DRAWN, Drawn, drawn
+from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, misplaced, own_threads
+from heatsplat.datamodules.synthetic_scene.outdoor import (
+    SKIES,
+    OutdoorPreset,
+    OutdoorScene,
+    in_weather,
+    training_frames,
+)
 from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, YARDS
 from heatsplat.datamodules.synthetic_scene.parts import TRAIN, parts_of, rules
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
@@ -23,16 +30,22 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics.units import DAY_S
 
+STORED = {8: np.uint8, 16: np.uint16}  # integer type of images by their bits
+
 
 class Synthetic(SceneDataModule):
     """A scene that is solved, ray-traced and filmed when it is loaded; nothing is read from disk.
 
     Args:
-        scene: outdoor, outdoor_true, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
-            cooling, ..., or room_0, room_1 and so on, rooms furnished at random.
+        scene: outdoor, outdoor_true, facade, the name of a preset (``heatsplat.datamodules.synthetic_scene.presets``): static,
+            cooling, ..., room_0, room_1 and so on, rooms furnished at random, or drawn_0 and so on, which draw everything.
         size: tiny, demo, benchmark or large.
-        frames: number of frames; None for that of the size.
-        noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images.
+        frames: number of frames; None for that of the size, or as drawn.
+        noise_k: standard deviation of the camera's noise per pixel in kelvin (NETD); 0 for clean images; None for 0.05, or as
+            drawn.
+        bits: of the stored images, 8 or 16; None for 16, or as drawn.
+        pose_error_px: by which cameras are turned from where they looked, standard deviation along each side of the image, in
+            pixels; None for 0, or as drawn.
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
         only: name of a surface; only its pixels count. None: all do.
         weather: outdoors: fair (None), calm, windy or overcast; all start from the same midnight.
@@ -50,7 +63,9 @@ class Synthetic(SceneDataModule):
         scene: str = "cooling",
         size: str = "demo",
         frames: int | None = None,
-        noise_k: float = 0.05,
+        noise_k: float | None = None,
+        bits: int | None = None,
+        pose_error_px: float | None = None,
         scene_seed: int = 0,
         only: str | None = None,
         weather: str | None = None,
@@ -60,28 +75,40 @@ class Synthetic(SceneDataModule):
         root: str | None = None,
         **options,
     ) -> None:
-        own_split = "json" if scene in YARDS or split == "parts" else "every_8th"
+        number = number_of(scene, DRAWN)
+        self.drawn = None if number is None else drawn(number)
+        outdoors = scene in YARDS or self.drawn is not None and isinstance(self.drawn.preset, OutdoorPreset)
         in_parts = split == "parts"
+        own_split = YARDS[scene][1].split if scene in YARDS else "json" if in_parts else "every_8th"
         super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
-        if scene not in PRESETS and scene not in YARDS and number_of(scene) is None:
-            known = ", ".join((*PRESETS, *YARDS, f"{ROOM}0, {ROOM}1 and so on"))
+        if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
+            known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
         if days is not None and (scene != "outdoor_true" or not 2 <= days <= MOST_DAYS):
             raise SceneError(
                 f"data.days={days}: outdoor_true lasts 2 to {MOST_DAYS} days, other scenes are as long as they are"
             )
         if weather is not None and scene not in YARDS:
-            raise SceneError(f"data.weather={weather}: scene '{scene}' lies in a room without weather; leave it null")
+            raise SceneError(f"data.weather={weather}: scene '{scene}' has no weather, or its own; leave it null")
         if weather is not None and weather not in SKIES:
             raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
         if size not in SIZES:
             raise SceneError(f"data.size={size}: choose one of {', '.join(SIZES)}")
         if frames is not None and frames < 2:
             raise SceneError(f"data.frames={frames}: a scene needs at least 2 frames, one to train and one to test")
-        if not noise_k >= 0:
+        usual = self.drawn or Drawn(None, SIZES[size].frames, noise_k=0.05, bits=16, pose_error_px=0.0)
+        self.size = replace(SIZES[size], frames=usual.frames if frames is None else frames)
+        self.noise_k = usual.noise_k if noise_k is None else noise_k
+        self.bits = usual.bits if bits is None else bits
+        self.pose_error_px = usual.pose_error_px if pose_error_px is None else pose_error_px
+        if not self.noise_k >= 0:
             raise SceneError(f"data.noise_k={noise_k}: the noise is a standard deviation in kelvin, 0 or more")
-        self.size = SIZES[size] if frames is None else replace(SIZES[size], frames=frames)
-        self.noise_k = noise_k
+        if self.bits not in STORED:
+            raise SceneError(f"data.bits={bits}: images are stored in 8 or 16 bits")
+        if not self.pose_error_px >= 0:
+            raise SceneError(
+                f"data.pose_error_px={pose_error_px}: the error is a standard deviation in pixels, 0 or more"
+            )
         self.scene_seed = scene_seed
         self.only = only
         self.weather, self.days = weather, days
@@ -89,13 +116,13 @@ class Synthetic(SceneDataModule):
 
     def load(self) -> SceneData:
         """The recording as a scene; its truth and probes come from the solver."""
-        world, outdoors = None, self.scene_name in YARDS
-        if outdoors:
-            solved, known = YARDS[self.scene_name]
-            known = in_weather(known, self.weather)
-            world = solved(known if self.days is None else replace(known, duration_s=self.days * DAY_S))
-        number = number_of(self.scene_name)
-        indoors = None if outdoors else Scene(PRESETS[self.scene_name] if number is None else room(number))
+        world = self._yard()
+        outdoors, number = world is not None, number_of(self.scene_name, ROOM)
+        if self.drawn is not None:
+            inside = self.drawn.preset
+        else:
+            inside = PRESETS.get(self.scene_name) if number is None else room(number)
+        indoors = None if outdoors else Scene(inside)
         recording = film(world or indoors, self.size, self.scene_seed, self.noise_k)
         preset, count = recording.scene.preset, len(recording.times_s)
         parts = ["frame"] * count
@@ -106,14 +133,15 @@ class Synthetic(SceneDataModule):
             raise SceneError(f"data.only={self.only}: scene '{self.scene_name}' has {', '.join(names)}")
         with own_threads():
             probes, probe_names = probe_points(recording)
+        viewmats = misplaced(recording, self.pose_error_px, self.scene_seed)
         scene = self.finish(
             self.scene_name,
             [
                 RawFrame(
                     name=f"{parts[frame]}_{frame:05d}.png",
-                    viewmat=recording.viewmats[frame],
+                    viewmat=viewmats[frame],
                     lens=recording.lens,
-                    read=partial(recording.grey, frame, np.uint16),
+                    read=partial(recording.grey, frame, STORED[self.bits]),
                     read_rgb=partial(recording.rgb.__getitem__, frame),
                     read_mask=None if self.only is None else partial(recording.shows, frame, self.only),
                     time_s=float(time_s),
@@ -129,6 +157,8 @@ class Synthetic(SceneDataModule):
             notes={
                 "source": f"synthetic preset {self.scene_name}, scene_seed {self.scene_seed}",
                 "noise_k": self.noise_k,
+                "bits": self.bits,
+                "pose_error_px": self.pose_error_px,
                 "effects": sorted(preset.effects),
                 "heat": recording.scene.how_solved(),
                 "probes": probe_names,
@@ -136,13 +166,28 @@ class Synthetic(SceneDataModule):
             probes=probes,
             truth=recording.scene.truth,
             **(_of_the_yard(world, recording) if outdoors else {}),
-            **({"true_attributes": recording.scene.grey_bodies} if indoors and indoors.mirrors else {}),
+            **self._of_the_room(indoors),
         )
         return scene if recording.clean is None and self.parts is None else _with_clean(scene, recording)
+
+    def _of_the_room(self, room: Scene | None) -> dict[str, Any]:
+        """True properties of an indoor scene: of mirroring surfaces, and with ``parts`` of all."""
+        if room is None or not (room.mirrors or self.parts is not None):
+            return {}
+        return {"true_attributes": room.grey_bodies if self.parts is None else room.attributes}
 
     def _subset(self, part: str, frame: int, count: int) -> str:
         trains = frame < training_frames(count) if self.parts is None else part == TRAIN
         return "train" if trains else "test"
+
+    def _yard(self) -> OutdoorScene | None:
+        """The solved scene under the sky; None where this one lies in a room."""
+        if self.scene_name in YARDS:
+            solved, known = YARDS[self.scene_name]
+            known = in_weather(known, self.weather)
+            return solved(known if self.days is None else replace(known, duration_s=self.days * DAY_S))
+        preset = None if self.drawn is None else self.drawn.preset
+        return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else None
 
 
 def _of_the_yard(world: OutdoorScene, recording: Recording) -> dict[str, Any]:

@@ -8,7 +8,10 @@ from omegaconf import DictConfig
 
 from heatsplat.composition import compose, composed
 
-TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", "threads=2")
+NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks.report.html=false")
+TINY = (
+    "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES, "threads=2",
+)  # fmt: skip
 
 
 def compose_run(output_dir: Path, *overrides: str, config_name: str = "train") -> DictConfig:

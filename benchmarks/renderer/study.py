@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.history import add_line
 from benchmarks.renderer import peers as other
 from benchmarks.renderer.clocks import interleaved, set_threads
 from benchmarks.renderer.floors import Machine
@@ -47,6 +48,7 @@ def run(
     garden: str | None = None,
     training: dict[str, Any] | None = None,
     memory: Sequence[int] | None = (300_000, 720, 480),
+    history: str | None = None,
 ) -> dict[str, list[Row]]:
     """Rows by table, which are also written as CSV, Markdown and a picture into ``output_dir``.
 
@@ -62,6 +64,7 @@ def run(
         garden: file of real points (npz with means3d, viewmats, Ks, width, height), or None; left out where it is not.
         training: what ``steps.training_rows`` takes beside machine, threads and folder, or None to leave training steps out.
         memory: [N, width, height] at which memory is measured in a process of its own, or None.
+        history: file that gets a line with the ratios of this commit and machine, or None.
     """
     output_dir = Path(output_dir)
     output_dir.mkdir(parents=True, exist_ok=True)
@@ -84,6 +87,8 @@ def run(
     if training is not None:
         tables["training"] = training_rows(machines[most], most, **training, output_dir=output_dir)
     write(tables, output_dir, machines)
+    if history is not None:
+        add_line(Path(history), tables)
     log.info("the study took %.0f s", time.perf_counter() - begin)
     return tables
 

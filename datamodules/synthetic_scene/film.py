@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from heatsplat.contracts import ThermalRange
@@ -190,6 +191,20 @@ def _lens(size: Size, distortion: Sequence[float], pixel_aspect: float) -> Lens:
         distortion=tuple(distortion),
         model="OPENCV" if distortion else "PINHOLE",
     )
+
+
+def misplaced(recording: Recording, error_px: float, seed: int) -> np.ndarray:
+    """World-to-camera matrices [F, 4, 4] as structure from motion gives them: turned by so many pixels along each side of the
+    image, standard deviation."""
+    if not error_px:
+        return recording.viewmats
+    lens, count = recording.lens, len(recording.viewmats)
+    drawn = torch.randn(count, 2, generator=generator_for(seed, 0, "pose error"), dtype=torch.float64).numpy()
+    turns = np.zeros((count, 3))
+    turns[:, 0], turns[:, 1] = error_px / lens.fy * drawn[:, 0], error_px / lens.fx * drawn[:, 1]
+    wrong = recording.viewmats.copy()
+    wrong[:, :3] = Rotation.from_rotvec(turns).as_matrix() @ wrong[:, :3]
+    return wrong
 
 
 def pixel_centres(lens: Lens) -> Tensor:

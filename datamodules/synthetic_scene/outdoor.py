@@ -36,6 +36,7 @@ START_UTC = "2024-07-11T00:00:00+00:00"
 START_UTC_S = 1720656000.0
 DURATION_S = 2.0 * DAY_S
 SAMPLE_S = 600.0
+NIGHT_S = (19.7 * 3600.0, 27.4 * 3600.0)  # from sunset to sunrise
 # Weather before the record, so that its start finds the surfaces in the middle of things and not at one temperature.
 _BEFORE_S = 0.5 * DAY_S
 
@@ -157,6 +158,8 @@ class OutdoorPreset(Preset):
         weather: name of its weather in ``SKIES``.
         bounds_c: temperatures of black and white, the same in every weather, so that one model serves them all.
         labels: names of the classes.
+        hours: part of the solved record that is filmed, and whose weather is known, in seconds; None: all of it.
+        split: rule by which frames are held out (``datamodules.splits``); json: the last day.
     """
 
     surfaces: tuple[OutdoorSurface, ...] = YARD
@@ -167,6 +170,8 @@ class OutdoorPreset(Preset):
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES
+    hours: tuple[float, float] | None = None
+    split: str = "json"
 
 
 OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}
@@ -209,6 +214,13 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
             "utc_at_zero_s": START_UTC_S,
         },
     )
+
+
+def _within(weather: Weather, hours: tuple[float, float]) -> Weather:
+    """The samples of a record between two times in seconds, and one more on either side."""
+    kept = (weather.times_s >= hours[0] - SAMPLE_S) & (weather.times_s <= hours[1] + SAMPLE_S)
+    series = {name: value[kept] for name, value in vars(weather).items() if name not in ("up", "notes")}
+    return replace(weather, **series)
 
 
 def _drift(purpose: str, times_s: np.ndarray, periods_h: tuple[float, ...]) -> np.ndarray:
@@ -295,6 +307,8 @@ class OutdoorScene(Scene):
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
         self.weather = outdoor_weather(preset.weather)
+        if preset.hours is not None:
+            self.weather = _within(self.weather, preset.hours)
         # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
         faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
         self.face_surface = torch.tensor([number for number, _ in faces])
@@ -379,6 +393,9 @@ class OutdoorScene(Scene):
         slot = np.concatenate([days * np.arange(first) / first, days + np.arange(frames - first) / (frames - first)])
         width = np.where(np.arange(frames) < first, days / first, 1.0 / (frames - first))
         times = np.round(DAY_S * (slot + width * (0.2 + 0.6 * jitter)), 3)
+        if self.preset.hours is not None:
+            start_s, end_s = self.preset.hours
+            times = np.round(start_s + (end_s - start_s) * (np.arange(frames) + 0.2 + 0.6 * jitter) / frames, 3)
 
         wobble = torch.rand(frames, 4, generator=generator_for(seed, 0, "flight path"), dtype=torch.float64)
         number = torch.arange(frames, dtype=torch.float64)

@@ -38,6 +38,10 @@ def parts_of(
     share = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-12)
     parts = [TRAIN] * len(share)
     for name, bounds in stretches.items():
+        if "_" in name:
+            raise SceneError(
+                f"data.parts.{name}: names of views begin with that of their part and _, so it may hold none"
+            )
         for start, end in bounds:
             if not 0 <= start < end <= 1:
                 raise SceneError(f"data.parts.{name}: [{start}, {end}] is no stretch of the record from 0 to 1")

@@ -27,10 +27,10 @@ _MATERIALS = (ALUMINIUM, CERAMIC, PLASTIC, RUBBER, STEEL, WOOD)
 _PLACES = tuple((x, y) for y in (-0.4, 0.0, 0.4) for x in (-0.6, -0.2, 0.2, 0.6))
 
 
-def number_of(name: str) -> int | None:
-    """The number in the name of a room, or None for another name."""
-    number = name.removeprefix(ROOM)
-    return int(number) if name.startswith(ROOM) and number.isdecimal() else None
+def number_of(name: str, begins: str) -> int | None:
+    """The number in the name of a scene that begins so (``ROOM``), or None for another name."""
+    number = name.removeprefix(begins)
+    return int(number) if name.startswith(begins) and number.isdecimal() else None
 
 
 def room(number: int) -> Preset:

@@ -235,6 +235,21 @@ class Scene:
         emissivity = self.emissivity[self.nearest(points)[1]]
         return {"emissivity": emissivity, "reflectance": 1.0 - emissivity}
 
+    def attributes(self, points: Tensor) -> dict[str, Tensor]:
+        """What the surface nearest to each of ``points`` [n, 3] is made of, by name with unit, each [n]."""
+        which = self.nearest(points)[1]
+        names = {
+            "conductivity_w_m_k": "conductivity",
+            "heat_capacity_j_m3_k": "heat_capacity",
+            "depth_m": "depth_m",
+            "exchange_w_m2_k": "exchange",
+        }
+        known = {
+            name: torch.tensor([getattr(one.material, key) for one in self.preset.surfaces], dtype=torch.float64)[which]
+            for name, key in names.items()
+        }
+        return known | {"emissivity": self.emissivity[which], "reflectance": 1.0 - self.emissivity[which]}
+
     def how_solved(self) -> str:
         """A sentence about the truth, for reports."""
         return (

@@ -266,6 +266,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.runs.run import UNSEEN, load
     from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
     from heatsplat.training.session import prepare_machine
+    from heatsplat.uncertainty import Uncertainty
 
     check_option("unseen", config["unseen"], UNSEEN, SceneError)
     check_option("codec", config["codec"], CODECS, SceneError)
@@ -286,6 +287,9 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         (trained.images(frame, names), None if keep else trained.seen(frame)) for frame in track(frames, "rendering")
     )
     options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c", "codec", "figures")}
+    if config["uncertainty"]:
+        told = Uncertainty(trained.module)
+        options |= {"deviation": told.deviation, "widest": told.widest}
     written = write_shot(images, frames, trained.scene, output_dir, **options)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -98,6 +99,11 @@ class Camera:
         """The same camera on a grid of ``width`` x ``height`` pixels; intrinsics scale by the actual pixel counts."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)
         return Camera(self.viewmat, self.K * scale[:, None], width, height)
+
+    def within(self, longest: int) -> Camera:
+        """The same view with at most ``longest`` pixels on its longer side."""
+        shrink = max(1.0, max(self.width, self.height) / longest)
+        return self.resized(max(1, round(self.width / shrink)), max(1, round(self.height / shrink)))
 
 
 @dataclass(frozen=True)
@@ -299,6 +305,7 @@ class SceneData:
         truth: function (points [n, 3], times_s [F]) -> °C [n, F] on synthetic scenes, or None.
         true_attributes: function (points [n, 3]) -> properties of the surface there by name with unit, each [n], on
             synthetic scenes, or None.
+        positions: table of where the cameras stood on the earth (``export.place``), or None.
     """
 
     name: str
@@ -317,6 +324,7 @@ class SceneData:
     probes: Tensor | None = None
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
     true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
+    positions: Path | None = None
 
     @property
     def bulk(self) -> tuple[Tensor, float]:

@@ -22,6 +22,8 @@ from heatsplat.io.video import video as film
 
 log = logging.getLogger("heatsplat")
 
+DEVIATION = "viridis"  # colours of standard deviations: not those of temperatures
+
 TRAJECTORIES = ("orbit", "path", "test", "train", "view")
 
 
@@ -115,8 +117,7 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     found = []
     for view in scene.train:
         camera, mask = view.camera, view.mask
-        shrink = max(1.0, max(camera.width, camera.height) / SIGHTING_SIZE)
-        coarse = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
+        coarse = camera.within(SIGHTING_SIZE)
         if mask is not None:
             rows = np.arange(coarse.height) * camera.height // coarse.height
             columns = np.arange(coarse.width) * camera.width // coarse.width
@@ -156,6 +157,8 @@ def write_shot(
     range_c: Sequence[float] | None = None,
     codec: str = "auto",
     figures: str | None = None,
+    deviation: Callable[[Frame], Tensor] | None = None,
+    widest: float = 1.0,
 ) -> list[Path]:
     """Paths of the files written for a shot: TIFF in °C, PNG with a bar, a video of each image, and ``frames.csv``.
 
@@ -180,6 +183,9 @@ def write_shot(
         range_c: °C at the ends of the colours; None takes the scene's range.
         codec: of videos (``io.video.video``).
         figures: "pdf" or "svg" writes a figure for print of each frame, all its images in a row, into figures; None none.
+        deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
+            and png_uncertainty, also of what was not seen; None writes none.
+        widest: of these, at the end of the colours.
     """
     bounds = scene.thermal_range
     if bounds is None:
@@ -221,6 +227,16 @@ def write_shot(
                         written.append(output_dir / f"video{suffix}.mp4")
                         films[name] = open_videos.enter_context(film(written[-1], fps, codec))
                     films[name](picture)
+            if deviation is not None:
+                spread = deviation(frame)
+                ends = Bar(0.0, widest, bar.unit, DEVIATION)
+                panels.append(Panel(colorize(spread, 0.0, widest, DEVIATION), "uncertainty", ends))
+                if tiff:
+                    written.append(output_dir / "tiff_uncertainty" / f"{stem}.tiff")
+                    write_temperature(written[-1], spread)
+                if png:
+                    written.append(output_dir / "png_uncertainty" / f"{stem}.png")
+                    write_png(written[-1], compose([replace(panels[-1], title=f"{title}   uncertainty")]))
             if figures is not None:
                 written.append(output_dir / "figures" / f"{stem}.{figures}")
                 write_figure(written[-1], panels, title)

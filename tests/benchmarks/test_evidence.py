@@ -43,17 +43,34 @@ def test_the_page_counts_what_was_decided(outcomes):
     for effect in CATALOGUE:
         assert f"| {effect.name} | {effect.stage} |" in text
     row = next(line for line in text.splitlines() if line.startswith("| frame_offset |") and "sensor" not in line)
-    counts = [int(cell) for cell in row.split("|")[2:6]]
-    assert sum(counts) == len(outcomes) and counts[0] + counts[1] == 2
+    counts = [int(cell) for cell in row.split("|")[2:8]]
+    assert sum(counts) == len(outcomes) and sum(counts[:3]) == 2
 
 
 def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
     last = outcomes[-1].seed
     fresh = [outcome for outcome in outcomes if outcome.seed == last]
     text = written(outcomes, frozenset({last}))
-    cases = [int(line.split()[2]) for line in text.splitlines() if "verdicts are right" in line]
+    cases = [int(line.split()[1]) for line in text.splitlines() if line.startswith("Of ")]
     assert cases == [len(CATALOGUE) * (len(outcomes) - len(fresh)), len(CATALOGUE) * len(fresh)]
     assert "## Verdicts against truth, tiny, on recordings that no threshold was set on" in text
+
+
+def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path):
+    asked = []
+
+    def data(**options):
+        asked.append(options["scene"])
+        return Synthetic(**options)
+
+    drawn = {"looked at": [2, 1], "unseen": [5, 1]}
+    text = run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1)
+    assert asked == ["static", "drawn_2", "drawn_5"]
+    assert "scenes drawn at random, looked at (drawn_2 to drawn_2)" in text
+    assert "scenes drawn at random, unseen (drawn_5 to drawn_5)" in text
+    (tmp_path / "verdicts" / "drawn_5_tiny_5.json").unlink()
+    assert run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1).split("took")[0] == text.split("took")[0]
+    assert asked[3:] == ["drawn_5"]
 
 
 def test_scenes_without_a_known_truth_are_refused(tmp_path):

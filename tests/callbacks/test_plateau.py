@@ -74,6 +74,11 @@ def test_a_run_that_goes_on_gaining_is_left_alone():
     assert module.density.cap_max == 1000
 
 
+def test_errors_that_rise_are_no_plateau():
+    module, _ = trained(lambda share: 0.1 + 0.05 * share)
+    assert module.schedule.end == STEPS
+
+
 def test_what_is_below_the_noise_of_the_camera_is_not_waited_for():
     """The error falls by a fifth in every tenth, but all of it is noise that no model can learn."""
     module, _ = trained(lambda share: NOISE * (1.0 - 0.5 * share))

@@ -26,8 +26,8 @@ def test_objects_stand_on_the_floor_apart_from_each_other():
 
 
 def test_names_of_rooms():
-    assert number_of("room_17") == 17
-    assert [number_of(name) for name in ("room_", "room_x", "room_-1", "static")] == [None] * 4
+    assert number_of("room_17", "room_") == 17
+    assert [number_of(name, "room_") for name in ("room_", "room_x", "room_-1", "static")] == [None] * 4
     with pytest.raises(SceneError, match="room_0, room_1 and so on"):
         Synthetic(scene="room_x")
 

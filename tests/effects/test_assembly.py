@@ -219,12 +219,25 @@ def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
 
 
 def test_the_log_tells_verdict_statistic_price_and_reason():
-    told = assembly.verdicts_as_dicts(verdicts("agc"), {"agc": Price(2, 10, 0.256)})
+    known = verdicts("agc")
+    known["agc"], known["tone"] = replace(known["agc"], gain_db=2.34), replace(known["tone"], told=False)
+    told = assembly.verdicts_as_dicts(known, {"agc": Price(2, 10, 0.256)})
     head, *rows = assembly.verdict_table(told)
-    assert head.split() == ["effect", "statistic", "ms/step", "numbers", "reason"] and len(rows) == len(assembly.NAMES)
+    assert head.split() == ["effect", "statistic", "dB", "ms/step", "numbers", "reason"] and len(rows) == len(
+        assembly.NAMES
+    )
     of = {row.split()[0]: row.split() for row in rows}
-    assert of["agc"] == ["agc", "on", "3", ">", "1", "+0.26", "+2", "N", "+10", "as", "measured"]
-    assert of["tone"] == ["tone", "off", "0.5", "≤", "1", "as", "measured"]
+    assert of["agc"] == ["agc", "on", "3", ">", "1", "+2.3", "+0.26", "+2", "N", "+10", "as", "measured"]
+    assert of["tone"] == ["tone", "?", "0.5", "≤", "1", "as", "measured"]
+
+
+def test_an_effect_that_costs_more_than_it_brings_is_left_out_when_that_is_asked():
+    known = {name: replace(one, gain_db=1.0) for name, one in verdicts("relaxation", "conduction", "agc").items()}
+    prices = {"relaxation": Price(2, 0, 4.0), "conduction": Price(0, 1, 0.1), "agc": Price(0, 9, -0.01)}
+    of = {least: assembly.affordable(known, prices, least) for least in (0.0, 0.2, 0.5)}
+    assert of[0.0] == of[0.2] == known
+    assert {name for name, one in of[0.5].items() if one.on} == {"agc"}  # conduction stands on relaxation
+    assert "1.0 dB for 4.00 ms a step" in of[0.5]["relaxation"].reason
 
 
 # Choices ---------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Where a scene lies: by positions that are known exactly, and by its cameras."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -34,6 +35,15 @@ def test_positions_give_the_projection_the_scale_and_the_turn(cooling, tmp_path)
     turn = math.radians(30.0)
     expected = [[5e5, 5.2e6, 100.0], [5e5 + 2 * math.cos(turn), 5.2e6 + 2 * math.sin(turn), 101.0]]
     assert (found - torch.tensor(expected, dtype=torch.float64)).abs().max() < 1e-3
+
+
+def test_the_scene_s_own_table_is_taken_unless_it_places_nothing(cooling, tmp_path, caplog):
+    scene = replace(cooling.module.scene, positions=table(cooling.module.scene, tmp_path / "frames.csv"))
+    assert place_of(scene, "auto").crs == "EPSG:32632" and place_of(scene).crs is None
+    assert place_of(scene, "auto", torch.tensor([0.0, 0.0, 1.0])).crs is None
+    (tmp_path / "few.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
+    assert place_of(replace(scene, positions=tmp_path / "few.csv"), "auto").crs is None
+    assert "has positions of 0 of the training images" in caplog.text and "no place on the earth" in caplog.text
 
 
 def test_without_positions_up_is_known_and_axes_are_at_right_angles(cooling):

@@ -59,6 +59,20 @@ def test_what_depends_on_the_view_is_said(tmp_path):
     assert "depends on the view" in said and "°C" in said
 
 
+def test_parts_of_the_heat_can_be_left_out(tmp_path):
+    module = started(tmp_path, "method=auto", "effects=none", "effects.attenuation=on", "data.scene=haze")
+    seen = snapshot(module)
+    (without,) = (layer for layer in seen.layers if layer.name == "without attenuation")
+    frame = module.scene.train.frames[0]
+    with torch.no_grad(), module.thermal.without("attenuation"):
+        bare = module.emissions(module.splats, frame)[:, 0]
+    with torch.no_grad():
+        whole = module.emissions(module.splats, frame)[:, 0]
+    assert without.label == "without attenuation" and not torch.allclose(bare, whole, atol=1e-3)
+    assert (shown(without, frame.time_s) - bare.clamp(0, 1)).abs().max() < 1e-3
+    assert list(module.thermal.parts) == ["attenuation"]  # and it is back
+
+
 def test_visible_light_comes_with_its_own_opacity(tmp_path):
     module = started(tmp_path, "method=ravigs")
     with torch.no_grad():

@@ -2,6 +2,7 @@
 
 import math
 
+import mpmath
 import pytest
 import torch
 
@@ -72,3 +73,34 @@ def test_dew_point_inverts_the_vapour_pressure():
     vapour = vapour_pressure_hpa(tensor(293.15), tensor(100.0))
     assert vapour.item() == pytest.approx(23.3, abs=0.2)
     assert dew_point_c(vapour).item() == pytest.approx(20.0, abs=1e-9)
+
+
+def semi_infinite(table, a, time):
+    """Responses [J] of a body without an end."""
+    return responses.interpolate(table.at(time), *responses.grid_position(tensor(a).log(), table.log_rates))[0]
+
+
+def test_bodies_without_an_end_follow_steps_and_ramps_as_in_closed_form():
+    times = torch.linspace(0, 2e5, 401, dtype=torch.float64)
+    table = responses.SemiInfiniteTable(times, torch.stack((torch.ones_like(times), times / 1e5), 1))
+    for a, time in ((1e-7, 500.0), (1e-5, 4e4), (1e-4, 1.5e5), (3e-3, 1.5e5)):
+        z = mpmath.sqrt(a * time)
+        left = mpmath.exp(z * z) * mpmath.erfc(z)
+        ramp = time - (left - 1) / a - 2 * mpmath.sqrt(time / (mpmath.pi * a))
+        truth = tensor(float(1 - left), float(ramp / 1e5))
+        torch.testing.assert_close(semi_infinite(table, a, time), truth, atol=1e-6, rtol=0)
+
+
+def test_effusivity_sets_what_a_flux_does_to_a_massive_wall():
+    """Into a wall that hardly gives heat back: 2 q √(t/π) / b after a step, q / (b √ω) of a wave, an eighth of it late."""
+    b, exchange, q, omega = 1000.0, 0.2, 100.0, 2 * math.pi / 86400
+    a, hours = (exchange / b) ** 2, 3600.0
+    times = torch.linspace(0, 40 * 86400, 5761, dtype=torch.float64)
+    table = responses.SemiInfiniteTable(times, torch.stack((q + 0 * times, q * torch.sin(omega * times)), 1) / exchange)
+    step = 2 * q * math.sqrt(2 * hours / math.pi) / b
+    assert float(semi_infinite(table, a, 2 * hours)[0]) == pytest.approx(step, rel=0.02)
+    day = 39 * 86400 + torch.arange(0, 24, dtype=torch.float64) * hours
+    wave = torch.stack([semi_infinite(table, a, float(time))[1] for time in day])
+    sine, cosine = (2 / 24 * (wave * part).sum() for part in (torch.sin(omega * day), torch.cos(omega * day)))
+    assert float(torch.hypot(sine, cosine)) == pytest.approx(q / (b * math.sqrt(omega)), rel=0.03)
+    assert math.degrees(math.atan2(-float(cosine), float(sine))) == pytest.approx(45.0, abs=1.5)

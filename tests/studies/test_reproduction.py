@@ -338,8 +338,8 @@ def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
     )
     line = next(line for line in compare(reproduction, found) if line.method == "3dgs")
     assert line.ours == {"train_min": 15.0, "fps": 20.0} and line.label == "(scenes not named) (2 of 20)"
-    direct = [run for run in reproduction.runs if run.method == "3dgs"]
-    assert len(direct) == 3 and direct[0].overrides[0] == "method=direct_3dgs"
+    small = [run for run in reproduction.runs if run.method == "3dgs"]
+    assert len(small) == 3 and small[0].overrides[:2] == ("method=3dgs", "data.degrade=lr4")
     tones = reproduced("supirgs_1", root)
     found = (
         results("apples", "supirgs", psnr=30.0)

@@ -215,6 +215,9 @@ def test_a_night_only_record_works_without_sun():
         ({"clip": "soft"}, "clip must be one of"),
         ({"nodes": 3}, "nodes must be one of 1, 2, got '3'"),
         ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
+        ({"inner": True, "solution": "corrected"}, "inner is solved about a mean only: give solution=linear"),
+        ({"nodes": 2, "semi_infinite": True}, "no end or two nodes, not both"),
+        ({"indoor_c": 20.0}, "indoor_c tells nothing without heat from within: give inner=true"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )
@@ -249,3 +252,20 @@ def test_a_core_is_there_only_where_it_is_asked_for_and_stays_warm_after_dusk():
     told = model.attributes(splats, Query(time_s=0.0))
     torch.testing.assert_close(told["core_coupling"], torch.full((6,), 3.0))
     torch.testing.assert_close(told["core_time_constant_h"], torch.full((6,), 6.0))
+
+
+def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
+    plain, without = ready()
+    model, splats = ready(semi_infinite=True, inner=True, indoor_c=40.0)
+    assert set(splats.names) - set(without.names) == {"inner_rise"}
+    assert "from_within" in model.effects()["convection"] and "from_within" not in plain.effects()["convection"]
+    with torch.no_grad():
+        splats["inner_rise"].fill_(2.0 / 60.0)
+    model.features(splats, Query(time_s=12 * HOUR)).sum().backward()
+    assert all((splats[name].grad != 0).all() for name in ("inner_rise", "log_rate"))
+    told = model.attributes(splats, Query(time_s=0.0))
+    exchange = told["convection_w_m2_k"] / (1 - told["radiation_share"])
+    torch.testing.assert_close(told["heat_loss_w_m2"], 2 * exchange)
+    torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())
+    assert (told["u_value_w_m2_k"] > 0.5).all() and not {"time_constant_h", "areal_heat_capacity_kj_m2_k"} & set(told)
+    assert "u_value_w_m2_k" not in plain.attributes(without, Query(time_s=0.0))

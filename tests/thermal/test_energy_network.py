@@ -17,7 +17,7 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.energy_network import LIMITS, TERMS, EnergyNetwork
 from heatsplat.thermal.land_cover import ATTRIBUTES, TABLE, typical
-from heatsplat.thermal.weather_drive import columns_at, source_of_sunlight, sunlight_at
+from heatsplat.thermal.weather_drive import columns_at, remembered, source_of_sunlight, sunlight_at
 
 ALL = {"smooth": 1.0, "physical": 0.01, "ode": 0.01, "pinn": 1.0}
 
@@ -179,7 +179,7 @@ def test_the_rate_is_the_balance_of_ellipsoid_sun_and_air():
     ids = torch.arange(40)
     units = torch.linspace(0.1, 0.9, 40)
     hidden = model.network(model._base(splats, ids), model._moment(time_s))
-    body = model._body(splats, ids, hidden)
+    body = model._body(splats, ids, model._base(splats, ids), hidden)
     areas = model.balance.areas(splats, ids, 1.0)
     rate = model._rate(units, body, areas, time_s) * 60.0  # the network's range is 60 K
 
@@ -435,3 +435,84 @@ def test_the_table_needs_a_class_for_every_point():
 def test_unknown_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         EnergyNetwork(**options)
+
+
+# Beyond the paper ---------------------------------------------------------------------------------------
+
+
+def on_slabs(**options):
+    """A model of one-sided slabs, whose Gaussians face up or east by turns."""
+    model, splats = make(body="surface", disturb=0.5, **options)
+    splats["normals"].data.copy_(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).repeat(20, 1))
+    return model, splats
+
+
+def test_constant_attributes_are_the_same_at_every_moment():
+    model, splats = make(disturb=1.0, attributes="constant")
+    morning, night = (model.attributes(splats, query(hours * HOUR_S)) for hours in (2, 9))
+    for name in ATTRIBUTES:
+        torch.testing.assert_close(morning[name], night[name], rtol=0, atol=0)
+        assert morning[name].std() > 0
+    free, splats = make(disturb=1.0)
+    morning, night = (free.attributes(splats, query(hours * HOUR_S)) for hours in (2, 9))
+    assert (morning["convection"] - night["convection"]).abs().max() > 1e-3
+
+
+def test_the_balance_is_asked_over_the_whole_record(monkeypatch):
+    asked = {}
+    for collocation in ("view", "record"):
+        model, splats = make(collocation=collocation)
+        rate, times = model._rate, []
+        monkeypatch.setattr(model, "_rate", lambda *args, rate=rate, times=times: times.append(args[-1]) or rate(*args))
+        for step in range(60):
+            penalties(model, splats, step)
+        asked[collocation] = torch.tensor(times)
+    assert (asked["view"] - HOUR_S).abs().max() <= 600
+    shares = (asked["record"] + 2 * HOUR_S) / (22 * HOUR_S)
+    assert shares.min() < 0.05 and shares.max() > 0.95
+    assert shares.histc(10, 0.0, 1.0).min() > 0
+
+
+def test_the_slab_is_lit_from_its_front_and_half_its_sky_is_the_ground():
+    model, splats = on_slabs(sky="swinbank", depth_m=0.03)
+    time_s, ids = 2.5 * HOUR_S, torch.arange(40)
+    areas = model.balance.areas(splats, ids, 1.0)
+    body = dict(zip(ATTRIBUTES, torch.tensor([[0.9, 0.7, 12.0, 2e6]]).expand(40, -1).T, strict=True))
+    warm_k = torch.full((40,), 300.0)
+    rate = model.balance.rate(warm_k, body, areas, model.weather, time_s)
+    now = model.weather.at(time_s)
+    (sun, direct), (_, diffuse) = sunlight_at(model.weather, time_s)
+    air_k = now.air_c + KELVIN_AT_0_C
+    sky_k = 0.0552 * air_k**1.5
+    for first, (facing, share) in enumerate(((float(sun[2]), 1.0), (max(float(sun[0]), 0.0), 0.5))):
+        around = share * sky_k**4 + (1 - share) * air_k**4
+        watts = 0.7 * (direct * facing + diffuse * share) - 12.0 * (300.0 - air_k)
+        watts -= 0.9 * STEFAN_BOLTZMANN * (300.0**4 - around)
+        torch.testing.assert_close(rate[first::2], torch.full((20,), watts / (2e6 * 0.03)), rtol=1e-4, atol=0)
+
+
+def test_past_weather_is_seen_as_fading_means():
+    weather = make_weather()
+    step = replace(weather, air_c=torch.where(weather.times_s < 0, 10.0, 20.0).double())
+    past = remembered(step, [3.0])
+    known = float(past[0, 0]) + (20 - float(past[0, 0])) * (1 - math.exp(-10 / 3))
+    at_ten = int((weather.times_s == 10 * HOUR_S).nonzero())
+    assert abs(float(past[at_ten, 0]) - known) < 1.0  # two hours of 10 °C come first
+    steady = remembered(replace(weather, air_c=torch.full_like(weather.air_c, 7.0)), [1.0, 12.0])
+    assert steady.shape == (len(weather.times_s), 10)
+    torch.testing.assert_close(steady[:, [0, 5]], torch.full((len(steady), 2), 7.0, dtype=torch.float64))
+
+    model, splats = make(disturb=1.0, past_h=[4.0], time="none")
+    before = model.features(splats, query(6 * HOUR_S))
+    warmer = torch.where(weather.times_s < 5 * HOUR_S, weather.air_c + 8.0, weather.air_c)
+    model._past = remembered(replace(weather, air_c=warmer), model.past_h)
+    assert (model.features(splats, query(6 * HOUR_S)) - before).abs().max() > 1e-3
+
+
+def test_slabs_train():
+    model, splats = on_slabs(sky="swinbank", attributes="constant", collocation="record", past_h=[1.0, 12.0])
+    terms = penalties(model, splats)
+    sum(terms.values()).backward()
+    assert set(terms) == set(TERMS)
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+    assert model.network.heads["attributes"].weight.grad.abs().max() > 0

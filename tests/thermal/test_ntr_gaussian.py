@@ -132,3 +132,28 @@ def test_what_cannot_be_is_refused():
         NtrGaussian(nodes=1)
     with pytest.raises(SceneError, match="NtrGaussian needs time, which scene"):
         NtrGaussian().check(make_scene(times=(None, None, None)))
+
+
+def test_attribute_networks_are_normalised_and_learn_at_their_own_rate():
+    model, splats, _ = make(normalised=True, lr_attributes=1.6e-2, lr=1e-3)
+    rates = {name: model.rate_of(name)[0] for name, _ in model.named_parameters()}
+    fast = {name for name, rate in rates.items() if rate == 1.6e-2}
+    assert {name.split(".")[0] for name in fast} == {
+        "of_feature",
+        "of_place",
+        "of_state",
+        "attribute_heads",
+        "attribute_norm",
+    }
+    with torch.no_grad():
+        model.attribute_heads.fill_(1.0)
+        before = model.features(splats, at(HOUR_S))
+        model.of_state.weight.mul_(50.0)  # of normalised values only their pattern counts
+        model.of_state.bias.mul_(50.0)
+        model.of_feature.weight.mul_(50.0)
+        model.of_feature.bias.mul_(50.0)
+        model.of_place.weight.mul_(50.0)
+        model.of_place.bias.mul_(50.0)
+        torch.testing.assert_close(model.features(splats, at(HOUR_S)), before, rtol=1e-3, atol=1e-4)
+    plain, _, _ = make()
+    assert not any("norm" in name for name, _ in plain.named_parameters())

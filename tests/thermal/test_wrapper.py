@@ -16,10 +16,12 @@ from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.conduction import Conducting
+from heatsplat.thermal.embedded import Embedded
 from heatsplat.thermal.hexplane import HexPlane
 from heatsplat.thermal.imaging_field import ImagingField
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.radiative import Radiative
+from heatsplat.thermal.radiative_transfer import RadiativeTransfer
 from heatsplat.thermal.reflection import Reflection
 from heatsplat.thermal.static import Static
 from heatsplat.thermal.through_air import ThroughAir
@@ -101,7 +103,9 @@ AROUND = {
     "Conducting": lambda inner: Conducting(inner, neighbours=2),
     "Composed": lambda inner: Composed(inner, {"reflection": Reflection()}),
     "Composed with a companion": lambda inner: Composed(inner, companion=Static(channels=3, modality="rgb")),
+    "Embedded": Embedded,
     "Radiative": Radiative,
+    "RadiativeTransfer": lambda inner: RadiativeTransfer(inner, Attenuation()),
     "ThroughAir": lambda inner: ThroughAir(inner, Attenuation()),
     "two of them": lambda inner: ImagingField(Conducting(inner, neighbours=2)),
 }

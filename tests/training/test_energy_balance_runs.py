@@ -43,9 +43,13 @@ def test_a_run_learns_tells_its_effects_and_answers_in_other_weather(tmp_path):
     torch.testing.assert_close(module.thermal.temperature(module.splats, moment), before)
 
 
-def test_the_full_balance_trains_too(tmp_path):
-    module, _ = run(
-        tmp_path, *SHORT, "max_steps=6", "thermal.solution=corrected", "trainer.val_check_interval=6", "test=false"
-    )
+def test_the_full_balance_goes_on_from_a_checkpoint_bit_for_bit(tmp_path):
+    """Stopped between marches, after splits: what was marched when is part of the state."""
+    overrides = (*SHORT, "max_steps=120", "thermal.solution=corrected", "trainer.val_check_interval=120", "test=false")
+    overrides += ("callbacks.checkpoint.every_n_train_steps=57",)
+    module, _ = run(tmp_path / "whole", *overrides)
     assert module.thermal.effects()["radiation"]["power"] == "T⁴"
-    assert all(parameter.isfinite().all() for parameter in module.splats.parameters())
+    resumed, _ = run(tmp_path / "on", *overrides, f"ckpt={tmp_path / 'whole/checkpoints/step_000057.ckpt'}")
+    whole = module.splats.state_dict()
+    assert all(torch.equal(tensor, whole[name]) for name, tensor in resumed.splats.state_dict().items())
+    assert (whole["raw.marched_at"][:, 1] - module.splats["log_rate"]).abs().max() > 1e-3

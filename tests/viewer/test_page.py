@@ -1,11 +1,14 @@
 """viewer.html in a real browser: it loads, what it says agrees with the renderer, and the keyboard alone suffices."""
 
+import re
+
 import numpy as np
 import pytest
 from running import run
 from viewer.browser import open_browser, opened, wait_until
 
 from heatsplat.contracts import evenly_spread
+from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
 from heatsplat.viewer.page import FILE
 
@@ -69,6 +72,34 @@ def test_it_loads_without_an_error_and_shows_the_scene(page):
     assert pixels(page).std(axis=0).max() > 20
     assert "Gaussians" in page.find_element("id", "facts").text
     assert "Worst error" in page.find_element("id", "notes").get_attribute("textContent")
+
+
+def test_the_report_is_one_page_with_all_its_pictures(browser, folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*\.(?:png|webp|js|css)"', text)
+    browser.get((folder / "report.html").as_uri())
+    names = wait_until(
+        browser,
+        "[...document.images].every((i) => i.complete && i.naturalWidth > 0) && [...document.images].map((i) => i.alt)",
+    )
+    assert {"the scene, turning", "numbered surfaces", "scores", "maps of what was learned"} <= set(names)
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+    titles = [title.text for title in browser.find_elements("css selector", "h2, summary")]
+    assert {"Hottest and coldest surfaces", "What was learned", "How to cite", "Scores and what they cost"} <= set(
+        titles
+    )
+    assert "m²" in browser.page_source and "Zhongwen Wang" in browser.page_source
+    assert all(link.startswith("#") or (folder / link).exists() for link in re.findall(r'<a href="([^"]*)"', text))
+    browser.set_window_size(390, 800)
+    try:
+        assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+    finally:
+        browser.set_window_size(800, 560)
+    learned = {row["name"]: row for row in read_csv(folder / "learned.csv")}
+    assert learned["time constant"]["unit"] == "s" and learned["source"]["unit"] == "°C/h"
+    assert all(row["low"] <= row["median"] <= row["high"] for row in learned.values())
+    hot, *_, cold = read_csv(folder / "surfaces.csv")
+    assert hot["kind"] == "hottest" and cold["kind"] == "coldest" and hot["mean_c"] > cold["mean_c"] and hot["area"] > 0
 
 
 def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trained):

@@ -11,8 +11,12 @@ from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import file_stem
 from heatsplat.contracts import Frame, evenly_spread
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
+from heatsplat.io.quantities import words_and_unit
+from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
+from heatsplat.shots import at_time
 
+LEARNED_FILE = "learned.csv"
 COLORMAP = "viridis"  # not that of temperatures
 
 
@@ -71,6 +75,43 @@ class AttributeErrors(pl.Callback):
         found = errors | {f"{name}, table": error for name, error in table.items() if name in errors}
         if found:
             module.results.data["attribute_errors"] = found
+
+
+class LearnedValues(pl.Callback):
+    """Writes learned.csv at the end of the test: of each attribute its unit, and what the median Gaussian and nine in ten have.
+
+    Gaussians count by their opacity and the area of their largest section, and at one moment, the middle of the record.
+    """
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        scene, frame = module.scene, module.scene.train.frames[0]
+        if frame.time_s is not None:
+            start, span = scene.record
+            frame = at_time(scene, frame, start + span / 2)
+        told = module.attributes(frame)
+        if not told:
+            return
+        sizes = module.splats.scales.detach().sort(dim=1).values[:, 1:].prod(1)
+        weights = (module.splats.opacities[0].detach() * sizes).double().cpu().numpy()
+        rows = []
+        for name, values in told.items():
+            words, unit = words_and_unit(name)
+            ends = _quantiles(values.double().cpu().numpy(), weights, (0.05, 0.5, 0.95))
+            if ends is not None:
+                low, median, high = (float(f"{end:.6g}") for end in ends)
+                rows.append({"name": words, "unit": unit, "median": median, "low": low, "high": high})
+        write_csv(module.output_dir / LEARNED_FILE, rows, ("name", "unit", "median", "low", "high"))
+
+
+def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray | None:
+    """Weighted quantiles of the values that are known; None where none is."""
+    known = np.isfinite(values) & (weights > 0)
+    if not known.any():
+        return None
+    order = values[known].argsort()
+    reached = weights[known][order].cumsum()
+    places = np.searchsorted(reached, np.array(shares) * reached[-1])
+    return values[known][order][places.clip(max=len(order) - 1)]
 
 
 def attribute_picture(module: pl.LightningModule, frame: Frame) -> np.ndarray | None:

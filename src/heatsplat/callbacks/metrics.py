@@ -26,15 +26,16 @@ from heatsplat.metrics import (
 log = logging.getLogger("heatsplat")
 
 TEST_FILE = "test_per_image.csv"
-CURVE_COLUMNS = ("step", "train_seconds", "cpu_seconds", "gaussians", *DEFINITIONS)
+CURVE_COLUMNS = ("step", "train_seconds", "cpu_seconds", "gaussians", "loss", *DEFINITIONS)
 
 
 class QualityMetrics(pl.Callback):
     """Scores what the camera would record, clamped to [0, 1], against what it did record.
 
     Validation: means over the views as ``val/*`` against steps and as ``val_by_seconds/*`` against seconds of training
-    (evaluation excluded), and a row in curve.csv. Test: means into ``module.results.test``, every image's scores into
-    test_per_image.csv, what the scores mean into ``module.results.definitions``.
+    (evaluation excluded), and a row in curve.csv, with the mean loss since the row before. Test: means into
+    ``module.results.test``, every image's scores into test_per_image.csv, what the scores mean into
+    ``module.results.definitions``.
 
     Images that a model explains besides (its companions) are scored as images, under names such as ``rgb_psnr``;
     methods without companions have no such scores. Where the camera has flaws that a sensor chain explains or the scene
@@ -63,6 +64,8 @@ class QualityMetrics(pl.Callback):
         self._rows: list[dict[str, Any]] = []
         self._empty = 0  # images that have one value everywhere
         self._no_lpips = "not asked for"
+        self._losses: Tensor | float = 0.0  # of the steps since the last row of the curve
+        self._steps = 0
 
     # Scores of one image ---------------------------------------------------------------------------------------------
 
@@ -103,6 +106,10 @@ class QualityMetrics(pl.Callback):
 
     # Validation ------------------------------------------------------------------------------------------------------
 
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
+        self._losses = self._losses + outputs["loss"].detach()
+        self._steps += 1
+
     def on_validation_epoch_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         self._begin(module, self.lpips_in_validation)
 
@@ -118,8 +125,11 @@ class QualityMetrics(pl.Callback):
         self._log(module, "val", means, step)
         if clocks["train_seconds"] is not None:
             self._log(module, "val_by_seconds", means, round(clocks["train_seconds"]))
+        before = self.curve[-1].get("loss") if self.curve and self.curve[-1]["step"] == step else None
+        loss = float(self._losses) / self._steps if self._steps else before
+        self._losses, self._steps = 0.0, 0
         self.curve = [row for row in self.curve if row["step"] < step]
-        self.curve.append({"step": step, **clocks, "gaussians": len(module.splats), **means})
+        self.curve.append({"step": step, **clocks, "gaussians": len(module.splats), "loss": loss, **means})
         write_csv(module.output_dir / CURVE_FILE, self.curve, tuple(self.curve[-1]))
 
     # Test ------------------------------------------------------------------------------------------------------------
@@ -198,10 +208,12 @@ class QualityMetrics(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"curve": [dict(row) for row in self.curve]}
+        curve = [dict(row) for row in self.curve]
+        return {"curve": curve, "losses": float(self._losses), "steps": self._steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.curve = [dict(row) for row in state["curve"]]
+        self._losses, self._steps = state.get("losses", 0.0), state.get("steps", 0)  # files of 0.1.0 have none
 
 
 def _scores_of(companion: str) -> tuple[str, ...]:

@@ -23,8 +23,9 @@ class Plateau(pl.Callback):
 
     After every tenth of the planned steps, each training view's mean squared error in it is set against that in the tenth
     before. The camera's variance, judged from the images, is no error of the model and is taken away from both. The run is on
-    a plateau where what was gained and one standard error of it (over the views) are below ``min_gain`` of what is left, or
-    where what is left is below ``min_gain`` of the camera's variance: held-out images of this camera would not show it.
+    a plateau where what was gained or lost and one standard error of it (over the views) are below ``min_gain`` of what is left
+    (errors that rise are no plateau: Gaussians or the camera are still being rearranged), or where what is left is below
+    ``min_gain`` of the camera's variance: held-out images of this camera would not show it.
     Learning rates are still high then. So the rest of the plan is spread over ``tail`` (``Schedule.end_at``), and no Gaussians
     are added in it.
 
@@ -86,7 +87,7 @@ class Plateau(pl.Callback):
         gains = torch.tensor([self._before[frame] - now[frame] for frame in both], dtype=torch.float64)
         left = max(sum(now[frame] for frame in both) / len(both) - self._variance, 0.0)
         gain, unsure = gains.mean().item(), (gains.std() / math.sqrt(len(both))).item()
-        flat = gain + unsure < self.min_gain * left
+        flat = abs(gain) + unsure < self.min_gain * left
         hidden = left < self.min_gain * self._variance
         if not (flat or hidden):
             return

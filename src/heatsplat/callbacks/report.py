@@ -13,13 +13,19 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.board import board
 from heatsplat.callbacks.metrics import TEST_FILE
+from heatsplat.callbacks.page import PAGE_FILE, write_page
+from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
+from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.contracts import SceneData, evenly_spread
+from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
 from heatsplat.io.tables import markdown_table, read_csv
 from heatsplat.metrics import DEFINITIONS
+from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 REPORT_FILE = "report.md"
 CURVES_FILE = "renders/curves.png"
@@ -47,6 +53,7 @@ class Report(pl.Callback):
 
     * metrics.json: every number, or null with the reason (``heatsplat.io.results``).
     * report.md: the same for people, with pictures, readable without any tool.
+    * report.html: that in one file, pictures and all (``callbacks.page``).
     * TensorBoard's table of hyperparameters with the final scores and costs, so that runs can be compared; and, from the
       start, the table of effects where they were chosen.
     * The table on the screen.
@@ -54,10 +61,11 @@ class Report(pl.Callback):
     Args:
         pictures: test pictures in the report.
         show: print the table.
+        html: write report.html.
     """
 
-    def __init__(self, pictures: int = 4, show: bool = True) -> None:
-        self.pictures, self.show = pictures, show
+    def __init__(self, pictures: int = 4, show: bool = True, html: bool = True) -> None:
+        self.pictures, self.show, self.html = pictures, show, html
 
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         writer = board(module)
@@ -74,10 +82,10 @@ class Report(pl.Callback):
         curves = draw_curves(folder)
         pictures = sorted((folder / "renders" / "test").glob("*.png"))
         shown = [pictures[i] for i in evenly_spread(len(pictures), self.pictures)]
-        probes = folder / "renders" / "probes.png"
-        write_atomically(
-            folder / REPORT_FILE, report(results, folder, shown, curves, probes if probes.exists() else None)
-        )
+        text = report(results, folder, shown, curves)
+        write_atomically(folder / REPORT_FILE, text)
+        if self.html:
+            write_page(folder / PAGE_FILE, text)
         if trainer.logger is not None:
             scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
             finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
@@ -135,7 +143,7 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
         return {name: {"on": True} | settings for name, settings in simulated.items()}
     described = {}
     for name, verdict in verdicts.items():
-        described[name] = {key: verdict[key] for key in ("on", "statistic", "threshold", "reason")}
+        described[name] = {key: verdict[key] for key in ("on", "told", "statistic", "threshold", "gain_db", "reason")}
         priced = "ms_per_step" in verdict
         described[name]["parameters"] = (
             verdict["shared"] + verdict["per_gaussian"] * len(module.splats) if priced else None if verdict["on"] else 0
@@ -171,25 +179,26 @@ def draw_curves(folder: Path) -> Path | None:
     if not (folder / CURVE_FILE).exists():
         return None
     rows = [row for row in read_csv(folder / CURVE_FILE) if row["train_seconds"] is not None]
-    scores = [("psnr", "PSNR (dB)"), ("ssim", "SSIM"), ("mae_c", "MAE (°C)")]
-    scores = [(name, label) for name, label in scores if any(row[name] is not None for row in rows)]
+    scores = [("psnr", "PSNR (dB)"), ("ssim", "SSIM"), ("mae_c", "MAE (°C)"), ("loss", "loss, training")]
+    scores = [(name, label) for name, label in scores if any(row.get(name) is not None for row in rows)]
     if len(rows) < 2 or not scores:
         return None
-    figure = Figure(figsize=(3.6 * len(scores), 3), dpi=110, layout="constrained")
+    figure = Figure(figsize=(2.9 * len(scores), 2.6), dpi=110, layout="constrained")
     for i, (name, label) in enumerate(scores):
         axes = figure.add_subplot(1, len(scores), i + 1)
-        points = [(row["train_seconds"], row[name]) for row in rows if row[name] is not None]
+        points = [(row["train_seconds"], row[name]) for row in rows if row.get(name) is not None]
         axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=f"C{i}")
-        axes.set(xlabel="seconds of training", ylabel=f"{label}, validation")
+        axes.set(xlabel="seconds of training", ylabel=label if name == "loss" else f"{label}, validation")
         axes.grid(alpha=0.25)
     write_png(folder / CURVES_FILE, figure_picture(figure))
     return folder / CURVES_FILE
 
 
-def report(
-    results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None, probes: Path | None
-) -> str:
-    """report.md: scores beside cost, the course, pictures by relative path, data, effects, versions."""
+def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None) -> str:
+    """report.md: scores beside cost, the course, pictures by relative path, what was found and learned, data, versions.
+
+    What other callbacks did not leave in the folder is left out.
+    """
     content = results.as_json()
     run, reasons = content["run"], content["reasons"]
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
@@ -199,33 +208,83 @@ def report(
     missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
     if missing:
         lines += ["", "Not to be had:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
-    if curves is not None:
-        lines += [
-            "",
-            "## Quality against time",
-            "",
-            f"![scores against seconds]({curves.relative_to(folder).as_posix()})",
-        ]
-        lines += ["", f"The numbers are in [{CURVE_FILE}]({CURVE_FILE})."]
+    if (folder / VIEWER_FILE).exists():
+        lines += ["", f"The scene itself, to turn and to measure in: [{VIEWER_FILE}]({VIEWER_FILE})."]
     if pictures:
         lines += ["", "## Test views", ""]
         for path in pictures:
             lines += [f"![{path.stem}]({path.relative_to(folder).as_posix()})", ""]
         if (folder / TEST_FILE).exists():
             lines.append(f"Every test image's scores are in [{TEST_FILE}]({TEST_FILE}).")
-    if probes is not None:
-        lines += ["", "## Temperature over time", "", f"![probes]({probes.relative_to(folder).as_posix()})"]
+    lines += _picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning")
+    if curves is not None:
+        lines += ["", "## Quality against time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
+        lines += ["", f"The numbers are in [{CURVE_FILE}]({CURVE_FILE})."]
+    lines += _picture_section("Temperature over time", folder, "renders/probes.png", "probes")
+    lines += _surfaces_section(folder)
+    lines += _learned_section(folder)
     lines += ["", "## The run", "", *_bullets(run)]
     lines += _effects_section(content["effects"])
     lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
     lines += ["", "## What the scores mean", "", *_bullets(content["definitions"])]
-    lines += ["", "## Versions", "", *_bullets(content["versions"]), ""]
+    lines += ["", "## Versions", "", *_bullets(content["versions"])]
+    lines += ["", "## How to cite", "", *(f"- {entry}" for entry in citations(run.get("method"))), ""]
     return "\n".join(lines)
 
 
+def _picture_section(title: str, folder: Path, name: str, alternative: str) -> list[str]:
+    return ["", f"## {title}", "", f"![{alternative}]({name})"] if (folder / name).exists() else []
+
+
+def _surfaces_section(folder: Path) -> list[str]:
+    """Hottest and coldest surfaces (``callbacks.surfaces``)."""
+    if not (folder / SURFACES_FILE).exists():
+        return []
+    found = read_csv(folder / SURFACES_FILE)
+    rows = [
+        (
+            f"{row['kind'][0].upper()}{row['number']:.0f}",
+            f"{row['mean_c']:.1f} °C",
+            f"{row['most_c']:.1f} °C",
+            f"{row['area']:g} {row['unit']}",
+            ", ".join(f"{row[axis]:.2f}" for axis in "xyz"),
+        )
+        for row in found
+    ]
+    moment = found[0]["time_s"]
+    when = "" if moment is None else f", {moment:.6g} s after the first training frame"
+    note = (
+        f"Connected surfaces that training views see, as the model renders them{when}: H the hottest, C the coldest. "
+        f"The centre is in coordinates of the scene; the table is [{SURFACES_FILE}]({SURFACES_FILE})."
+    )
+    table = markdown_table(("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z"), rows, "lrrrr")
+    picture = [f"![numbered surfaces]({SURFACES_PICTURE})", ""] if (folder / SURFACES_PICTURE).exists() else []
+    return ["", "## Hottest and coldest surfaces", "", *picture, *table, "", note]
+
+
+def _learned_section(folder: Path) -> list[str]:
+    """What the Gaussians have beside their temperature (``callbacks.attributes``)."""
+    found = read_csv(folder / LEARNED_FILE) if (folder / LEARNED_FILE).exists() else []
+    if not found:
+        return []
+    rows = [
+        (row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}", row["unit"] or "")
+        for row in found
+    ]
+    note = (
+        "Nine in ten Gaussians, weighted by opacity and area, lie in the interval: how the scene varies, not how uncertain a "
+        f"value is. The table is [{LEARNED_FILE}]({LEARNED_FILE})."
+    )
+    pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
+    maps = [f"![maps of what was learned]({path.relative_to(folder).as_posix()})" for path in pictures]
+    table = markdown_table(("", "median", "nine in ten", "unit"), rows, "lrrl")
+    return ["", "## What was learned", "", *table, "", note, "", *maps]
+
+
 EFFECTS_NOTE = (
-    "An effect is simulated where its statistic exceeds the threshold; no number stands where it "
-    "was asked for or the data cannot say. What is off is absent: no parameter, no operation. Parameters are those of the "
+    "An effect is simulated where its statistic exceeds the threshold and the images can tell it; no number stands where it "
+    "was asked for or the data cannot say. Decibels: what it gains on observations that it was not fitted to. What is off is "
+    "absent: no parameter, no operation. Parameters are those of the "
     "Gaussians at the end. Milliseconds per step: whole training steps on the Gaussians of the start, with all effects and "
     "without the one (and what stands on it), by turns; quickest against quickest, so a few hundredths are noise."
 )
@@ -250,10 +309,12 @@ def effects_table(effects: Mapping[str, Any]) -> list[str]:
             "–" if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
             for key in ("statistic", "threshold", "parameters", "ms_per_step")
         )
-        on = "**yes**" if effect["on"] else "no"
-        rows.append((name, on, statistic, threshold, effect["reason"], parameters, milliseconds))
-    head = ("effect", "simulated", "statistic", "threshold", "reason", "parameters", "ms per step")
-    return markdown_table(head, rows, align="llrrlrr")
+        on = "**yes**" if effect["on"] else "no" if effect["told"] else "cannot be told"
+        gain, cost = effect["gain_db"], effect["ms_per_step"]
+        gains = ("–" if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else "–")
+        rows.append((name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds))
+    head = ("effect", "simulated", "statistic", "threshold", "dB", "dB per ms", "reason", "parameters", "ms per step")
+    return markdown_table(head, rows, align="llrrrrlrr")
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
@@ -303,6 +364,7 @@ def show(results: RunResults, folder: Path, picture: Path | None, console: Conso
     for score, cost in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", "")):
         table.add_row(*score, *cost)
     console.print(table)
-    console.print(f"report:  {folder / REPORT_FILE}", soft_wrap=True)
+    page = folder / PAGE_FILE
+    console.print(f"report:  {page if page.exists() else folder / REPORT_FILE}", soft_wrap=True)
     if picture is not None:
         console.print(f"picture: {picture}", soft_wrap=True)

@@ -138,6 +138,22 @@ def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
     return {other: replace(verdict, on=verdict.on and other not in gone) for other, verdict in verdicts.items()}
 
 
+def affordable(
+    verdicts: Mapping[str, Verdict], prices: Mapping[str, Any], least_db_per_ms: float
+) -> dict[str, Verdict]:
+    """The verdicts without the effects that gain less on held-out observations than so many decibels per millisecond that a
+    step of training takes longer; 0 keeps all."""
+    found = dict(verdicts)
+    for name in _on(verdicts):
+        gain, price = verdicts[name].gain_db, prices.get(name)
+        if gain is None or price is None or gain >= least_db_per_ms * price.ms_per_step or not found[name].on:
+            continue
+        why = f"{gain:.1f} dB for {price.ms_per_step:.2f} ms a step are less than effects.least_db_per_ms={least_db_per_ms:g}"
+        found = without(found, name)
+        found[name] = replace(found[name], reason=why)
+    return found
+
+
 def assemble(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """ "thermal", "sensor" and further terms of the "loss" as plain containers, of the effects that are on.
 
@@ -206,7 +222,7 @@ def _set(template: Mapping[str, Any], verdicts: Sequence[Verdict]) -> dict[str, 
 
 def asked(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a run's configuration, as composed, says of effects, their parts and the loss; pricing decides nothing."""
-    effects = {key: value for key, value in config["effects"].items() if key != "price"}
+    effects = {key: value for key, value in config["effects"].items() if key not in ("price", "least_db_per_ms")}
     return deepcopy({"effects": effects, "loss": config["loss"]})
 
 
@@ -259,8 +275,8 @@ def verdicts_as_dicts(verdicts: Mapping[str, Verdict], prices: Mapping[str, Any]
 
 
 def verdict_table(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A table for the log of what ``verdicts_as_dicts`` says: effect, verdict, statistic and threshold, price, reason."""
-    rows = [("effect", "", "statistic", "ms/step", "numbers", "reason")]
+    """A table for the log of what ``verdicts_as_dicts`` says: effect, verdict, statistic and threshold, gain, price, reason."""
+    rows = [("effect", "", "statistic", "dB", "ms/step", "numbers", "reason")]
     for name, verdict in verdicts.items():
         measured = verdict["statistic"] is not None
         sign = ">" if measured and verdict["statistic"] > verdict["threshold"] else "≤"
@@ -268,10 +284,12 @@ def verdict_table(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
         priced = "ms_per_step" in verdict
         numbers = f"{verdict['per_gaussian']:+d} N {verdict['shared']:+d}" if priced else ""
         milliseconds = f"{verdict['ms_per_step']:+.2f}" if priced else ""
-        rows.append((name, "on" if verdict["on"] else "off", statistic, milliseconds, numbers, verdict["reason"]))
-    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+        on = "on" if verdict["on"] else "off" if verdict["told"] else "?"
+        gain = "" if verdict["gain_db"] is None else f"{verdict['gain_db']:+.1f}"
+        rows.append((name, on, statistic, gain, milliseconds, numbers, verdict["reason"]))
+    widths = [max(len(row[i]) for row in rows) for i in range(6)]
     return [
-        "  ".join([*(cell.ljust(width) for cell, width in zip(row[:5], widths, strict=True)), row[5]]) for row in rows
+        "  ".join([*(cell.ljust(width) for cell, width in zip(row[:6], widths, strict=True)), row[6]]) for row in rows
     ]
 
 

@@ -39,11 +39,15 @@ class Evidence:
             is missing, no time, one modality).
         reason: the sentence behind it, with the figures in their units.
         settings: what the effect should start from or be limited to, such as {"frequencies": 8}.
+        told: False where the data do not say whether the effect is there; the reason says what would be needed.
+        gain_db: what the effect gains on observations that it was not fitted to, in decibels of their squared error.
     """
 
     statistic: float | None
     reason: str
     settings: dict[str, Any] = field(default_factory=dict)
+    told: bool = True
+    gain_db: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,8 @@ class Verdict:
         statistic, threshold: of its evidence; None where it was forced or nothing could be measured.
         reason: in a sentence.
         settings: what it starts from, handed to the configuration.
+        told: False where the data do not say whether it is there; it is then off.
+        gain_db: on observations that it was not fitted to (``Evidence``).
     """
 
     name: str
@@ -119,3 +125,5 @@ class Verdict:
     threshold: float | None
     reason: str
     settings: dict[str, Any] = field(default_factory=dict)
+    told: bool = True
+    gain_db: float | None = None

@@ -60,7 +60,7 @@ def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
     if choice == "on":
         return Verdict(effect.name, True, None, None, f"effects.{effect.name}=on", evidence.settings)
     known = evidence.statistic is not None and math.isfinite(evidence.statistic)
-    on = known and evidence.statistic > effect.threshold
+    on = known and evidence.told and evidence.statistic > effect.threshold
     statistic = float(evidence.statistic) if known else None
     return Verdict(
         effect.name,
@@ -69,4 +69,6 @@ def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
         effect.threshold if known else None,
         evidence.reason,
         evidence.settings if on else {},
+        evidence.told,
+        evidence.gain_db,
     )

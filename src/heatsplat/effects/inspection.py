@@ -9,12 +9,14 @@ from heatsplat.contracts import SceneData
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect
 from heatsplat.effects.image_motion import Delays, delays
+from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.fit import Fit, fit_of
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import selected
 from heatsplat.effects.observations import Observations, observe
 from heatsplat.effects.surface import normals
+from heatsplat.effects.weathered import Weathered
 
 
 class Inspection:
@@ -45,6 +47,29 @@ class Inspection:
         tracks = obs.tracks if self.delays is None else self.delays.undone(obs)
         fit = fit_of(Data(terms, tracks, obs.times_s, obs.ambient, obs.noise, normals(obs), drivers))
         return selected(fit) if fit.observations > 0 else None
+
+    @cached_property
+    def certainty(self) -> Certainty | None:
+        """What can be told from the joint fit; None where there is none."""
+        return None if self.joint is None else Certainty(*self.joint)
+
+    @cached_property
+    def weathered(self) -> Weathered | None:
+        """The tracks, without what the camera adds, under the weather record; None without either, or air temperature."""
+        weather, bounds = self.scene.weather, self.scene.thermal_range
+        if self.joint is None or weather is None or weather.air_c is None or bounds is None or self.obs.times_s is None:
+            return None
+        fit, model = self.joint
+        certain = [added for name, added in fit.contributions(model).items() if name not in self.certainty.doubts]
+        values = fit.data.tracks.values - sum(certain)
+        return Weathered(
+            weather,
+            self.obs.times_s,
+            bounds.to_celsius(values),
+            bounds.span_k * fit.errors,
+            fit.weights,
+            fit.data.normals,
+        )
 
     @cached_property
     def delays(self) -> Delays | None:

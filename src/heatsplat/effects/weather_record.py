@@ -38,10 +38,10 @@ def of_the_air(obs: Observations) -> Tensor:
 
 
 def at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:
-    """A series of the record at times within it, linear between samples; its ends beyond."""
+    """A series [T, ...] of the record at times [F] within it, linear between samples; its ends beyond."""
     above = torch.searchsorted(weather.times_s, times_s).clamp(1, len(weather.times_s) - 1)
     before, after = weather.times_s[above - 1], weather.times_s[above]
-    share = ((times_s - before) / (after - before)).clamp(0, 1)
+    share = ((times_s - before) / (after - before)).clamp(0, 1).reshape(-1, *[1] * (series.ndim - 1))
     return series[above - 1] * (1 - share) + series[above] * share
 
 

@@ -13,7 +13,9 @@ from torch.nn.functional import normalize
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.export.formats.base import optional
+from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
+from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices
 from heatsplat.geometry.trajectories import upward
 
 log = logging.getLogger("heatsplat")
@@ -23,6 +25,7 @@ NAMES = ("file", "name", "image")
 LATITUDES = ("latitude_deg", "latitude", "gps_lat", "lat")
 LONGITUDES = ("longitude_deg", "longitude", "gps_lon", "lon")
 HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
+AUTO = "auto"
 LEAST_SPREAD = 0.02  # positions whose second extent is below this share of the first lie on a line
 ONE_WAY = 0.95  # length of the mean viewing direction from which on all cameras look the same way
 
@@ -55,8 +58,9 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
 
     Args:
         scene: with its training cameras.
-        gps: CSV with the name, latitude and longitude (WGS 84, degrees) and height (metres) of camera positions.
-        above: [3] direction that counts as up, in place of the scene's own; not with ``gps``. None: that of its weather;
+        gps: CSV with the name, latitude and longitude (WGS 84, degrees) and height (metres) of camera positions; "auto" takes
+            the scene's own, where it has one that places its cameras and ``above`` does not say otherwise; None takes none.
+        above: [3] direction that counts as up, in place of the scene's own; not with a table. None: that of its weather;
             else where all cameras look the same way (a drone that looks down, a wall seen from the front) back towards
             them; else upward in their images.
 
@@ -64,7 +68,13 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
         SceneError: the table cannot be read, or its positions do not place the cameras.
         ImportError: rasterio, which knows map projections, is not installed.
     """
-    if gps is not None:
+    if gps == AUTO:
+        if scene.positions is not None and above is None:
+            try:
+                return _placed(scene, scene.positions)
+            except SceneError as error:
+                log.warning("%s: what is written has no place on the earth", error)
+    elif gps is not None:
         return _placed(scene, Path(gps).expanduser())
     cameras = [frame.camera for frame in scene.train.frames]
     forward = torch.stack([camera.viewmat[2, :3] for camera in cameras]).mean(0)
@@ -90,6 +100,19 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
 
 
+def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
+    """Means [N, 3], rotations [N, 4] wxyz and scales [N, 3] with y up and z towards the south (or the viewer), in metres.
+
+    The axes of glTF and of SPZ; in units of the scene where it has no scale.
+    """
+    place = place_of(moment.module.scene)
+    scale, rotation, _ = place.similarity
+    axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+    turned = axes @ rotation @ quats_to_matrices(moment.seen.quats.double())
+    means = place(moment.seen.means) @ axes.T
+    return means.float(), matrices_to_quats(turned).float(), moment.seen.scales * float(scale)
+
+
 def _placed(scene: SceneData, path: Path) -> Place:
     """By the similarity that brings the training cameras closest to their positions."""
     positions = _positions(path)
@@ -109,7 +132,9 @@ def _placed(scene: SceneData, path: Path) -> Place:
     target = torch.tensor([east, north, degrees[:, 2].tolist()], dtype=torch.float64).T
     spread = torch.linalg.svdvals(target - target.mean(0))
     if spread[1] < LEAST_SPREAD * spread[0]:
-        raise SceneError(f"{path}: the positions lie on a line, which leaves the turn about it open; leave gps out")
+        raise SceneError(
+            f"{path}: the positions lie on a line, which leaves the turn about it open; give what.gps=null"
+        )
     source = torch.stack(list(found)).double()
     similarity = similarity_between(source, target)
     residual = (similarity(source) - target).square().sum(1).mean().sqrt().item()
@@ -123,12 +148,12 @@ def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
         with open(path, newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"what.gps={path} cannot be read: {error}") from error
+        raise SceneError(f"{path} cannot be read: {error}") from error
     columns = []
     for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
         there = next((name for name in wanted if rows and name in rows[0]), None)
         if there is None:
-            raise SceneError(f"what.gps={path} has no column {' or '.join(wanted)}")
+            raise SceneError(f"{path} has no column {' or '.join(wanted)}")
         columns.append(there)
     name, *numbers = columns
     try:
@@ -136,4 +161,4 @@ def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
             Path(row[name]).stem: tuple(float(row[n]) for n in numbers) for row in rows if all(row[n] for n in numbers)
         }
     except ValueError as error:
-        raise SceneError(f"what.gps={path}: {error} in {', '.join(numbers)}") from error
+        raise SceneError(f"{path}: {error} in {', '.join(numbers)}") from error

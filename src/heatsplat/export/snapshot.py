@@ -29,8 +29,8 @@ class Layer:
     """One quantity of the Gaussians over time, in the units in which splats are blended.
 
     Args:
-        name: "camera" (what they send to a camera), "surface" (their temperature, without what lies in between) or
-            "truth" (of a synthetic scene).
+        name: "camera" (what they send to a camera), "surface" (their temperature, without what lies in between),
+            "without <part>" (as "camera", with a part of the model taken out) or "truth" (of a synthetic scene).
         label: for people.
         basis: its values.
         worst: largest error of the basis in the scene's unit.
@@ -139,6 +139,15 @@ def snapshot(module: Any) -> Snapshot:
     layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope, most), clipped=clipped)]
     if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
         layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope, most))
+    for part in module.thermal.removable:
+
+        def without(time_s: float | None, part: str = part) -> Tensor:
+            with module.thermal.without(part):
+                return camera(time_s)
+
+        if not _alike(without, camera, span, tolerance / slope):
+            label = f"without {part.replace('_', ' ')}"
+            layers.append(_layer(f"without {part}", label, without, span, tolerance, slope, most))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
         layers.append(_layer("truth", "truth", truth, span, tolerance, slope, FEW_TIMES))
@@ -193,8 +202,10 @@ def _inside(values_at: Callable) -> Callable:
     return lambda time: values_at(time).clamp(0, 1)
 
 
-def _alike(one: Callable, other: Callable, span: tuple[float, float], tolerance: float) -> bool:
+def _alike(one: Callable, other: Callable, span: tuple[float, float] | None, tolerance: float) -> bool:
     """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
+    if span is None:
+        return bool((one(None) - other(None)).abs().max() <= 0.1 * tolerance)
     moments = (span[0] + share * (span[1] - span[0]) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
     return all((one(moment) - other(moment)).abs().max() <= 0.1 * tolerance for moment in moments)
 

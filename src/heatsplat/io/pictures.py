@@ -6,6 +6,8 @@ tenths of a second; the colour maps and the tick positions are matplotlib's.
 
 from __future__ import annotations
 
+import base64
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -230,6 +232,7 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
     each = FIGURE_PANEL * width / height
     barred = sum(panel.bar is not None for panel in panels)
     size = (each * len(panels) + 0.7 * barred + 0.2, FIGURE_PANEL + 0.35 + (0.2 if title else 0))
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # which lists the tables of every font it embeds
     settings = {"font.size": 8, "pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "heatsplat"}
     with matplotlib.rc_context(settings):
         figure = Figure(figsize=size, layout="constrained")
@@ -247,6 +250,11 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
         figure.savefig(path, metadata={date: None})
 
 
+def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
+    """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
+    draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
+
+
 def figure_picture(figure: Figure) -> np.ndarray:
     """A matplotlib figure as pixels, uint8 RGB. Make it as an object (``Figure(...)``): pyplot keeps global state."""
     canvas = FigureCanvasAgg(figure)
@@ -260,6 +268,14 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
         raise OSError(f"cannot write {path}")
+
+
+def data_uri(picture: np.ndarray, quality: int = 85) -> str:
+    """An RGB picture [H, W, 3] uint8 as the ``src`` of an image in a page (WebP). Raises OSError where OpenCV lacks it."""
+    done, encoded = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_WEBP_QUALITY, quality])
+    if not done:
+        raise OSError("this OpenCV has no WebP encoder")
+    return f"data:image/webp;base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
 def _ticks(bar: Bar) -> list[tuple[float, str]]:

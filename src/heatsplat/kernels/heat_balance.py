@@ -1,8 +1,8 @@
-"""Heat balances of surfaces, integrated along a record of weather: one Gaussian at a time, in float64, with sensitivities.
+"""Heat balances of surfaces, integrated along a record of weather, with sensitivities.
 
-heatsplat.physics.energy_balance and heatsplat.physics.sunlight say what the symbols mean and drive these kernels. A value
+heatsplat.physics.marching and heatsplat.physics.sunlight say what the symbols mean and drive these kernels. A value
 comes with its derivatives by all parameters, which obey linear equations with the same exponentials and cost a few
-multiply-adds each; nothing is stored along the way. Results do not depend on the number of threads.
+multiply-adds each. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.compile_time import compile_time, constant
 from heatsplat.kernels.scheduling import parallel_for
+from heatsplat.kernels.simd import LANES, bits, exp, floor, load_vector, maximum, minimum, select, store_vector
 
 BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
-MEMORY = 15.0  # time constants after which a body has forgotten: e^-15 of 50 K is 2e-5 K
 SUBSTEPS = 8  # of an interval between samples, at most: of bodies that settle within it
 STEP = 0.35  # of y that one substep covers, if they suffice
+FORGOTTEN = 1e-20  # share of the start that counts as none
 
-# Rows of the drivers of ``integrate``; those of effects that are off are not read.
+# Rows of the drivers of ``march``; those of effects that are off are not read.
 AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z = range(8)
 START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 
@@ -28,19 +31,21 @@ START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 @compile_time
 @dataclass(frozen=True)
 class Balance:
-    """Which effects a heat balance has beside the air; ``integrate`` is compiled for each, without a trace of the others.
+    """Which effects a heat balance has beside the air; ``march`` is compiled for each, without a trace of the others.
 
     Args:
         radiates: with the share p of exchange that is radiation.
         sunny: with absorptance g.
         windy: with sensitivity v to wind.
         oriented: with normals; without them surfaces lie level.
+        sensitive: derivatives come with values.
     """
 
     radiates: bool
     sunny: bool
     windy: bool
     oriented: bool
+    sensitive: bool
 
     @property
     def share_column(self) -> int:
@@ -59,12 +64,12 @@ class Balance:
 
     @property
     def normal_column(self) -> int:
-        """First of the three columns of the unit normal."""
+        """First of the three columns of the unit normal, behind which comes f, the share of sky in what a surface sees."""
         return self.wind_column + self.windy
 
 
 radiates, sunny = constant("radiates"), constant("sunny")
-windy, oriented = constant("windy"), constant("oriented")
+windy, oriented, sensitive = constant("windy"), constant("oriented"), constant("sensitive")
 share_column, sun_column = constant("share_column"), constant("sun_column")
 wind_column, normal_column = constant("wind_column"), constant("normal_column")
 
@@ -147,231 +152,203 @@ def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, v
 
 
 @inline
-def power(x, reference):
-    """(T⁴ - R⁴) / (4 R³) of T = R + x, and its derivative (T / R)³."""
-    z = x / reference
+def power(x, inverse):
+    """(T⁴ - R⁴) / (4 R³) of T = R + x, and its derivative (T / R)³; of 1 / R."""
+    z = x * inverse
     return x * (1.0 + z * (1.5 + z * (1.0 + 0.25 * z))), (1.0 + z) * (1.0 + z) * (1.0 + z)
 
 
 @inline
-def integrate_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities):
-    """``integrate`` for the Gaussian ``i``; ``final`` is the sample before ``time``."""
-    r = math.exp(float(parameters[i, LOG_RATE]))
-    p, g, v, f = 0.0, 0.0, 0.0, 1.0
-    nx, ny, nz = 0.0, 0.0, 0.0
-    if radiates(balance):
-        p = float(parameters[i, share_column(balance)])
-    if sunny(balance):
-        g = float(parameters[i, sun_column(balance)])
-    if windy(balance):
-        v = float(parameters[i, wind_column(balance)])
-    if oriented(balance):
-        column = normal_column(balance)
-        nx, ny = float(parameters[i, column]), float(parameters[i, column + 1])
-        nz = float(parameters[i, column + 2])
-        f = 0.5 * (1.0 + nx * up[0] + ny * up[1] + nz * up[2])
-    x = float(parameters[i, START])
-    # Start at the last sample that is MEMORY time constants old (0.7: of T³ in kelvin, down to -10 % of T).
-    k, age = final, 0.0
-    while k > 0 and age < MEMORY:
-        k -= 1
-        slowest = 1.0
-        if windy(balance):
-            slowest += v * min(drivers[WIND_ANOMALY, k], drivers[WIND_ANOMALY, k + 1])
-        if radiates(balance):
-            slowest = (1.0 - p) * slowest + 0.7 * p
-        age += r * slowest * (times[k + 1] - times[k])
-    remembers = k == 0 and age < MEMORY
-    air = drivers[AIR, k]
-    c, tilt, sky, light, sun, w, w_slope = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    wind_anomaly, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-    if windy(balance):
-        wind_anomaly = drivers[WIND_ANOMALY, k]
-        c = 1.0 + v * wind_anomaly
-    if sunny(balance):
-        light = drivers[LIGHT, k]
-        sun = f * light
-        if oriented(balance):
-            bx, by, bz = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
-            beam = nx * bx + ny * by + nz * bz
-            if beam <= 0.0:
-                beam, bx, by, bz = 0.0, 0.0, 0.0, 0.0
-            sun += beam
-    if not remembers:
-        x = air
-        if sunny(balance):
-            x += g * sun
-    if radiates(balance):
-        c *= 1.0 - p
-        tilt = drivers[SKY, k] - drivers[AROUND, k]
-        sky = drivers[AROUND, k] + f * tilt
-        w, w_slope = power(x, reference)
-    d_start, d_rate, d_share, d_sun, d_wind, dx, dy, dz = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    while k <= final:
-        interval = times[k + 1] - times[k]
-        ending = 1.0
-        if k == final:
-            ending = (time - times[k]) / interval
-        seconds = interval * ending
-        # Differences to the end of the interval, and the fastest that the body can be within it.
-        d_air = drivers[AIR, k + 1] - air
-        d_wind_anomaly, d_tilt, d_sky, d_level, d_light = 0.0, 0.0, 0.0, 0.0, 0.0
-        ex, ey, ez = 0.0, 0.0, 0.0
-        fastest = 1.0
-        if windy(balance):
-            d_wind_anomaly = drivers[WIND_ANOMALY, k + 1] - wind_anomaly
-            fastest += v * max(wind_anomaly, wind_anomaly + d_wind_anomaly)
-        if radiates(balance):
-            fastest = (1.0 - p) * fastest + p * w_slope
-            tilt_2 = drivers[SKY, k + 1] - drivers[AROUND, k + 1]
-            d_tilt, d_sky = tilt_2 - tilt, drivers[AROUND, k + 1] + f * tilt_2 - sky
-        if sunny(balance):
-            light_2 = drivers[LIGHT, k + 1]
-            sun_2 = f * light_2
-            if oriented(balance):
-                cx, cy, cz = drivers[BEAM_X, k + 1], drivers[BEAM_Y, k + 1], drivers[BEAM_Z, k + 1]
-                beam = nx * cx + ny * cy + nz * cz
-                if beam <= 0.0:
-                    beam, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
-                sun_2 += beam
-                ex, ey, ez = cx - bx, cy - by, cz - bz
-            d_level, d_light = light_2 - light, sun_2 - sun
-        substeps = min(SUBSTEPS, 1 + int(r * fastest * seconds / STEP))
-        share = ending / substeps
-        h = seconds / substeps
-        for _ in range(substeps):
-            # Linear part: the slope of w here, and the wind halfway.
-            air_2, c_2 = air + share * d_air, c
-            wind_anomaly_2, tilt_2, sky_2, light_2, sun_2 = wind_anomaly, tilt, sky, light, sun
-            if windy(balance):
-                wind_anomaly_2 = wind_anomaly + share * d_wind_anomaly
-                c_2 = 1.0 + v * wind_anomaly_2
-                if radiates(balance):
-                    c_2 *= 1.0 - p
-            slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
-            if sunny(balance):
-                light_2, sun_2 = light + share * d_level, sun + share * d_light
-                force += g * sun
-                ahead += g * sun_2
-            if radiates(balance):
-                tilt_2, sky_2 = tilt + share * d_tilt, sky + share * d_sky
-                slope += p * w_slope
-                force += p * (sky - w)
-                ahead += p * (sky_2 - w)
-            decay, phi, second, third = weights(r * slope * h)
-            new = x + h * r * (phi * force + second * (ahead - force))
-            rest = (slope - c_2) * (new - x)
-            w_2, slope_2 = 0.0, 0.0
-            if radiates(balance):
-                w_2, slope_2 = power(new, reference)
-                rest -= p * (w_2 - w)
-            if windy(balance) or radiates(balance):
-                new += 2.0 * third * h * r * rest
-            slope = c + c_2
-            if radiates(balance):
-                w_2, slope_2 = power(new, reference)
-                slope += p * (w_slope + slope_2)
-            # Sensitivities: the linearised balance, along the trajectory from its beginning to its end.
-            decay, phi, second, _ = weights(h * r * 0.5 * slope)
-            one, two = h * r * (phi - second), h * r * second
-            change = c_2 * (air_2 - new)
-            if sunny(balance):
-                change += g * sun_2
-            if radiates(balance):
-                change += p * (sky_2 - w_2)
-            d_rate = decay * d_rate + one * force + two * change
-            d_start *= decay
-            if radiates(balance):
-                calm, calm_2 = air - x, air_2 - new
-                if windy(balance):
-                    calm *= 1.0 + v * wind_anomaly
-                    calm_2 *= 1.0 + v * wind_anomaly_2
-                d_share = decay * d_share + one * (sky - w - calm) + two * (sky_2 - w_2 - calm_2)
-            if sunny(balance):
-                d_sun = decay * d_sun + one * sun + two * sun_2
-            if windy(balance):
-                gust = one * wind_anomaly * (air - x) + two * wind_anomaly_2 * (air_2 - new)
-                if radiates(balance):
-                    gust *= 1.0 - p
-                d_wind = decay * d_wind + gust
-            if oriented(balance):
-                lean = 0.0
-                if radiates(balance):
-                    lean += p * (one * tilt + two * tilt_2)
-                if sunny(balance):
-                    lean += g * (one * light + two * light_2)
-                lean *= 0.5
-                dx = decay * dx + lean * up[0]
-                dy = decay * dy + lean * up[1]
-                dz = decay * dz + lean * up[2]
-                if sunny(balance):
-                    cx, cy, cz = bx + share * ex, by + share * ey, bz + share * ez
-                    dx += g * (one * bx + two * cx)
-                    dy += g * (one * by + two * cy)
-                    dz += g * (one * bz + two * cz)
-                    bx, by, bz = cx, cy, cz
-            x, air, c = new, air_2, c_2
-            w, w_slope, wind_anomaly, tilt, sky, light, sun = (
-                w_2,
-                slope_2,
-                wind_anomaly_2,
-                tilt_2,
-                sky_2,
-                light_2,
-                sun_2,
-            )
-        k += 1
-    temperatures[i] = x
-    sensitivities[i, START] = d_start if remembers else 0.0
-    sensitivities[i, LOG_RATE] = d_rate
-    if radiates(balance):
-        sensitivities[i, share_column(balance)] = d_share
-    if sunny(balance):
-        sensitivities[i, sun_column(balance)] = d_sun
-    if windy(balance):
-        sensitivities[i, wind_column(balance)] = d_wind
-    if oriented(balance):
-        column = normal_column(balance)
-        sensitivities[i, column], sensitivities[i, column + 1] = dx, dy
-        sensitivities[i, column + 2] = dz
+def weights_of_lanes(y):
+    """``weights`` of lanes; where all are slow, without an exponential."""
+    third = 1 / 40320 + y * (-1 / 362880 + y * (1 / 3628800 + y * (-1 / 39916800)))
+    third = 1 / 6 + y * (-1 / 24 + y * (1 / 120 + y * (-1 / 720 + y * (1 / 5040 + y * -third))))
+    second = 0.5 - y * third
+    first = 1.0 - y * second
+    decay = 1.0 - y * first
+    large = y >= 1.0
+    if bits(large) != 0:
+        fast = exp(-y)
+        a = (1.0 - fast) / y
+        b = (1.0 - a) / y
+        decay, first, second = select(large, fast, decay), select(large, a, first), select(large, b, second)
+        third = select(large, (0.5 - b) / y, third)
+    return decay, first, second, third
 
 
 @inline
-def _integrate_block(
-    block, balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities
-):
-    """``integrate`` of BLOCK Gaussians; ``final`` is the sample before ``time``."""
-    count = parameters.shape[0]
-    for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-        integrate_one(balance, i, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities)
+def _march_group(group, balance, first, parameters, rows, times, drivers, reference, moments, found):
+    """``march`` of LANES Gaussians."""
+    count = rows.shape[0]
+    body = np.empty((parameters.shape[1], LANES), parameters.dtype)
+    for j in range(LANES):
+        i = min(group * LANES + j, count - 1)
+        for column in range(parameters.shape[1]):
+            body[column, j] = parameters[i, column]
+    told = np.empty((found.shape[2], LANES), parameters.dtype)
+    x = load_vector(body, START)
+    nothing = x * 0.0
+    one = nothing + 1.0
+    r = exp(load_vector(body, LOG_RATE))
+    p, g, v, f, nx, ny, nz = nothing, nothing, nothing, one, nothing, nothing, nothing
+    if radiates(balance):
+        p = load_vector(body, share_column(balance))
+    if sunny(balance):
+        g = load_vector(body, sun_column(balance))
+    if windy(balance):
+        v = load_vector(body, wind_column(balance))
+    if oriented(balance):
+        column = normal_column(balance)
+        f = load_vector(body, column + 3)
+        nx, ny, nz = load_vector(body, column), load_vector(body, column + 1), load_vector(body, column + 2)
+    d_start, d_rate, d_share, d_sun, d_wind = one, nothing, nothing, nothing, nothing
+    k, moment, inverse = first, 0, 1.0 / reference
+    while moment < moments.shape[0]:
+        # To the end of the interval; to a moment within it on the way, after which the state is that of before.
+        interval = times[k + 1] - times[k]
+        aside = moments[moment] <= times[k + 1]
+        ending = 1.0
+        if aside:
+            ending = (moments[moment] - times[k]) / interval
+        seconds = interval * ending
+        kept, kept_start, kept_rate, kept_share, kept_sun, kept_wind = x, d_start, d_rate, d_share, d_sun, d_wind
+        # Drivers at its beginning, and what they change until its end.
+        air_1, air_d = drivers[AIR, k], ending * (drivers[AIR, k + 1] - drivers[AIR, k])
+        wind_1, wind_d, sky_1, sky_d, sun_1, sun_d = 0.0, 0.0, nothing, nothing, nothing, nothing
+        fastest = one
+        if windy(balance):
+            wind_1, wind_d = (
+                drivers[WIND_ANOMALY, k],
+                ending * (drivers[WIND_ANOMALY, k + 1] - drivers[WIND_ANOMALY, k]),
+            )
+            fastest = fastest + v * max(wind_1, wind_1 + wind_d)
+        if radiates(balance):
+            _, steep = power(x, inverse)
+            fastest = (1.0 - p) * fastest + p * steep
+            sky_1 = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
+            sky_d = drivers[AROUND, k + 1] + f * (drivers[SKY, k + 1] - drivers[AROUND, k + 1]) - sky_1
+            sky_d = ending * sky_d
+        if sunny(balance):
+            sun_1, sun_d = f * drivers[LIGHT, k], f * drivers[LIGHT, k + 1]
+            if oriented(balance):
+                beam = nx * drivers[BEAM_X, k] + ny * drivers[BEAM_Y, k] + nz * drivers[BEAM_Z, k]
+                sun_1 = sun_1 + maximum(beam, 0.0)
+                beam = nx * drivers[BEAM_X, k + 1] + ny * drivers[BEAM_Y, k + 1] + nz * drivers[BEAM_Z, k + 1]
+                sun_d = sun_d + maximum(beam, 0.0)
+            sun_d = ending * (sun_d - sun_1)
+        substeps = minimum(1.0 + floor(r * fastest * (seconds / STEP)), SUBSTEPS)
+        share = 1.0 / substeps
+        passed, rh = nothing, r * share * seconds
+        for substep in range(SUBSTEPS):
+            going = substeps > substep
+            if bits(going) == 0:
+                break
+            # Linear part: the slope of w here, and the wind halfway.
+            later = passed + share
+            air, air_2, c, c_2 = air_1 + passed * air_d, air_1 + later * air_d, one, one
+            w, steep, sky, sky_2, sun, sun_2 = nothing, nothing, nothing, nothing, nothing, nothing
+            wind, wind_2 = nothing, nothing
+            if windy(balance):
+                wind, wind_2 = wind_1 + passed * wind_d, wind_1 + later * wind_d
+                c, c_2 = 1.0 + v * wind, 1.0 + v * wind_2
+            if radiates(balance):
+                c, c_2 = (1.0 - p) * c, (1.0 - p) * c_2
+            slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
+            if sunny(balance):
+                sun, sun_2 = sun_1 + passed * sun_d, sun_1 + later * sun_d
+                force, ahead = force + g * sun, ahead + g * sun_2
+            if radiates(balance):
+                sky, sky_2 = sky_1 + passed * sky_d, sky_1 + later * sky_d
+                w, steep = power(x, inverse)
+                slope, force, ahead = slope + p * steep, force + p * (sky - w), ahead + p * (sky_2 - w)
+            decay, phi, second, third = weights_of_lanes(slope * rh)
+            new = x + rh * (phi * force + second * (ahead - force))
+            w_2 = w
+            if windy(balance) or radiates(balance):
+                # What is not linear in time or in x: the products of wind and air, and of wind and x, and T⁴.
+                rest, bent = nothing, 2.0 * third
+                if windy(balance):
+                    rest = (c_2 - c) * ((air_2 - air) * (bent - second) - (new - x) * (bent - 0.5 * second))
+                if radiates(balance):
+                    w_2, _ = power(new, inverse)
+                    rest = rest + bent * p * (steep * (new - x) - (w_2 - w))
+                new = new + rh * rest
+            if sensitive(balance):
+                # The linearised balance, along the trajectory from its beginning to its end. Decays at the slope of its
+                # beginning, which takes 0.2 % from what derivatives are, and no second exponential.
+                change = c_2 * (air_2 - new)
+                if radiates(balance):
+                    w_2, _ = power(new, inverse)
+                    change = change + p * (sky_2 - w_2)
+                if sunny(balance):
+                    change = change + g * sun_2
+                before, after = rh * (phi - second), rh * second
+                d_rate = select(going, decay * d_rate + before * force + after * change, d_rate)
+                # Nothing of the start is left long before digits run out; what is below them is slow to compute with.
+                d_start = select(going, select(d_start > FORGOTTEN, decay * d_start, 0.0), d_start)
+                if radiates(balance):
+                    calm, calm_2 = air - x, air_2 - new
+                    if windy(balance):
+                        calm, calm_2 = calm * (1.0 + v * wind), calm_2 * (1.0 + v * wind_2)
+                    lean = before * (sky - w - calm) + after * (sky_2 - w_2 - calm_2)
+                    d_share = select(going, decay * d_share + lean, d_share)
+                if sunny(balance):
+                    d_sun = select(going, decay * d_sun + before * sun + after * sun_2, d_sun)
+                if windy(balance):
+                    gust = before * wind * (air - x) + after * wind_2 * (air_2 - new)
+                    if radiates(balance):
+                        gust = (1.0 - p) * gust
+                    d_wind = select(going, decay * d_wind + gust, d_wind)
+            x = select(going, new, x)
+            passed = later
+        if not aside:
+            k += 1
+            continue
+        store_vector(told, 0, x)
+        if sensitive(balance):
+            store_vector(told, 1 + START, d_start)
+            store_vector(told, 1 + LOG_RATE, d_rate)
+            if radiates(balance):
+                store_vector(told, 1 + share_column(balance), d_share)
+            if sunny(balance):
+                store_vector(told, 1 + sun_column(balance), d_sun)
+            if windy(balance):
+                store_vector(told, 1 + wind_column(balance), d_wind)
+        for j in range(min(LANES, count - group * LANES)):
+            for column in range(found.shape[2]):
+                found[moment, rows[group * LANES + j], column] = told[column, j]
+        moment += 1
+        if ending == 1.0:
+            k += 1
+        else:
+            x, d_start, d_rate, d_share, d_sun, d_wind = kept, kept_start, kept_rate, kept_share, kept_sun, kept_wind
 
 
 @kernel
-def integrate(balance, parameters, times, drivers, up, reference, time, temperatures, sensitivities):
-    """Temperatures at a time under the full balance: T⁴ as it is, wind as it blows.
+def march(balance, first, parameters, rows, times, drivers, reference, moments, found):
+    """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
     dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v wind_anomaly), G = light f +
-    max(n · beam, 0), s = f sky + (1 - f) around and f = (1 + n · up) / 2. Exponential Rosenbrock steps of third order
-    (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. A
-    body starts where it can still be remembered.
+    max(n · beam, 0) and s = f sky + (1 - f) around. Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and
+    Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. Lanes are Gaussians; what is
+    found of one depends neither on the others nor on the other moments.
 
     Args:
         balance: the effects that there are; without an effect its terms are left out, and with f = 1 where surfaces lie
             level.
-        parameters: [n, P] x at the first sample in kelvin above the reference, log r, then those of ``balance``.
+        first: sample from which they start.
+        parameters: [n, P] x at that sample in kelvin above the reference, log r, then those of ``balance``; float32 or
+            float64, in which all is computed. Neighbours of like rates are quickest.
+        rows: [n] int64 rows of ``found`` that they fill.
         times: [T] float64 samples.
         drivers: [8, T] float64.
-        up: [3] direction away from the ground.
         reference: R in kelvin.
-        time: moment asked for, within the samples.
-        temperatures: [n] filled with x.
-        sensitivities: [n, P] filled with the derivatives of x by the parameters.
+        moments: [F] float64, increasing, within the samples from ``first`` on.
+        found: [F, N, 1] filled with x; or, of a balance that is sensitive, [F, N, 1 + Q] with its derivatives by the
+            parameters before the normal behind it.
     """
-    final = times.shape[0] - 2
-    while final > 0 and times[final] >= time:
-        final -= 1
     parallel_for(
-        _integrate_block,
-        (parameters.shape[0] + BLOCK - 1) // BLOCK,
-        (balance, parameters, times, drivers, up, reference, time, final, temperatures, sensitivities),
+        _march_group,
+        (rows.shape[0] + LANES - 1) // LANES,
+        (balance, first, parameters, rows, times, drivers, reference, moments, found),
     )

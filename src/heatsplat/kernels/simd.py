@@ -313,12 +313,10 @@ def lane(typing_context, x, index):
 def _unary(name: str):
     @intrinsic
     def function(typing_context, x):
-        if x != float32x16:
+        if x not in _FLOATS:
             return None
-        vector = _vector(LANES)
-        return x(x), lambda context, builder, signature, values: _llvm(
-            builder, f"llvm.{name}.v16f32", vector, values[0]
-        )
+        called, vector = f"llvm.{name}.v16{_SUFFIXES[x]}", _vector(LANES, x.element)
+        return x(x), lambda context, builder, signature, values: _llvm(builder, called, vector, values[0])
 
     return function
 

@@ -18,7 +18,7 @@ and in kelvin above the reference, x = T - R, with w(x) = (T⁴ - R⁴) / (4 R³
 
 ``linear_temperature`` replaces w by its tangent at the surface's own mean temperature and v b x by v b times that mean,
 which leaves one rate per surface and so the response tables (responses.py, sunlight.py): its cost does not depend on the
-record. ``stepped_temperature`` solves the equation as it stands, along the record as far as the surface remembers.
+record. heatsplat.physics.marching solves the equation as it stands, along the record.
 
 A body with depth has a core behind its surface, which only the surface heats (two nodes):
 
@@ -27,6 +27,11 @@ A body with depth has a core behind its surface, which only the surface heats (t
 with κ the conductance between them over H and μ that conductance over the capacity of the core. With the stiffness s that
 linearising leaves, both relax at two rates a₁ > μ > a₂, and x is a mean of the responses of one node at those rates: two
 looks at the same tables, nothing is stepped.
+
+A body without an end (massive wall, ground) takes the heat in by its effusivity b = √(k ρ c), and a = (H / b)² in 1/s stands
+in the place of r: it follows the same drivers, through the table of ``responses.SemiInfiniteTable``.
+
+A constant heat q from within (a heated room behind a wall) adds f = q / H, in kelvin, to the drivers.
 
 **Convention:** kelvin above the reference, kW/m², seconds; every driver is linear between its samples.
 """
@@ -38,14 +43,21 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from heatsplat.kernels import heat_balance as kernels
-from heatsplat.physics.responses import ResponseTable, driver_means, grid_position, interpolate
+from heatsplat.physics import marching
+from heatsplat.physics.responses import (
+    ResponseTable,
+    SemiInfiniteTable,
+    driver_means,
+    grid_position,
+    interpolate,
+    semi_infinite_weights,
+)
 from heatsplat.physics.sunlight import SunlightTable
 
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
+_BEAM_RATES, _FARTHEST = 20, 14.0  # of the sun on semi-infinite bodies: how many, and how far from a in log rate
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
 
 
@@ -104,6 +116,7 @@ class Surface(NamedTuple):
         wind: v, or None where wind is not known.
         normals: [n, 3] unit vectors, or None for surfaces that lie level.
         core: what lies behind, or None for bodies of one node.
+        inner: f in kelvin, or None where nothing is heated from within.
     """
 
     start: Tensor
@@ -113,6 +126,7 @@ class Surface(NamedTuple):
     wind: Tensor | None = None
     normals: Tensor | None = None
     core: Core | None = None
+    inner: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -149,10 +163,15 @@ def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
 
 
 class Climate:
-    """A record of drivers with its tables: all that the temperature of a surface needs beside its own parameters."""
+    """A record of drivers with its tables: all that the temperature of a surface needs beside its own parameters.
 
-    def __init__(self, drivers: Drivers) -> None:
-        self.drivers = drivers
+    Args:
+        drivers: the record.
+        semi_infinite: bodies have no end; log rates are those of a.
+    """
+
+    def __init__(self, drivers: Drivers, semi_infinite: bool = False) -> None:
+        self.drivers, self.semi_infinite = drivers, semi_infinite
         zero = torch.zeros_like(drivers.air)
         columns = {"air": drivers.air, "light": drivers.light, "sky": drivers.sky, "around": drivers.around}
         self.wind_anomaly_mean = 0.0
@@ -163,7 +182,7 @@ class Climate:
         columns = {name: series for name, series in columns.items() if series is not None}
         self.columns = {name: j for j, name in enumerate(columns)}
         series = torch.stack(list(columns.values()), dim=1)
-        self.table = ResponseTable(drivers.times_s, series)
+        self.table = (SemiInfiniteTable if semi_infinite else ResponseTable)(drivers.times_s, series)
         self.means = driver_means(drivers.times_s, series).float()
         self.beam = None if drivers.beams is None else SunlightTable(drivers.times_s, drivers.beams)
         rows = [columns.get(name, zero) for name in ("air", "sky", "around", "light")]
@@ -214,13 +233,16 @@ class Climate:
         means = self.means.to(surface.log_rate)
         if surface.share is None:
             forced, convection = self.forcing(surface, means, beam, 0.0), self._convection(surface)
+            forced = forced if surface.inner is None else forced + surface.inner
             return forced if convection is None else forced / convection
 
         def step(x: Tensor, surface: Surface) -> Tensor:
             stiffness = self._convection(surface)
             slope = stiffness.detach() + surface.share.detach() * (1 + x.detach() / self.drivers.reference_k) ** 3
             radiated = surface.share * power_excess(x, self.drivers.reference_k)
-            rest = self.forcing(surface, means, beam, 0.0) - stiffness * x - radiated
+            forced = self.forcing(surface, means, beam, 0.0)
+            forced = forced if surface.inner is None else forced + surface.inner
+            rest = forced - stiffness * x - radiated
             return (x + rest / slope.clamp(min=MIN_STIFFNESS)).clamp(-HALF_RANGE_K, HALF_RANGE_K)
 
         with torch.no_grad():
@@ -232,22 +254,29 @@ class Climate:
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
         stiffness = self._convection(surface)
-        mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), None
+        mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), surface.inner
         if surface.share is not None:
             steep = (1 + mean / self.drivers.reference_k) ** 3
-            constant = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
+            bent = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
+            constant = bent if constant is None else constant + bent
             stiffness = (stiffness + surface.share * steep).clamp(min=MIN_STIFFNESS)
+        elapsed = time_s - float(self.drivers.times_s[0])
 
         def response(log_rate: Tensor) -> tuple[Tensor, Tensor]:
             """What a body of this one rate follows, before it is divided by its stiffness, and what it keeps of its start."""
             settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
-            beam = 0.0 if self.beam is None else self.beam.response(time_s, surface.normals, log_rate).to(log_rate)
-            kept = torch.exp(-log_rate.exp() * (time_s - float(self.drivers.times_s[0])))
+            beam = 0.0 if self.beam is None else self._beam(time_s, surface.normals, log_rate).to(log_rate)
+            if self.semi_infinite:
+                kept = torch.special.erfcx(torch.exp(0.5 * log_rate) * elapsed**0.5)
+            else:
+                kept = torch.exp(-log_rate.exp() * elapsed)
             forced = self.forcing(surface, settled, beam, mean)
             return forced if constant is None else forced + constant * (1 - kept), kept
 
         if surface.core is None:
-            forced, kept = response(surface.log_rate if stiffness is None else surface.log_rate + stiffness.log())
+            power = 2 if self.semi_infinite else 1  # of H in its rate
+            log_rate = surface.log_rate if stiffness is None else surface.log_rate + power * stiffness.log()
+            forced, kept = response(log_rate)
             left = surface.start * kept
         else:
             rates = _two_rates(surface.core, surface.log_rate, 1.0 if stiffness is None else stiffness)
@@ -257,47 +286,25 @@ class Climate:
             left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
         return left + (forced if stiffness is None else forced / stiffness)
 
+    def _beam(self, time_s: float, normals: Tensor, log_rate: Tensor) -> Tensor:
+        """Response [n] to the sun's beam; that of a semi-infinite body from so few rates that 0.3 % of it are missed."""
+        if not self.semi_infinite:
+            return self.beam.response(time_s, normals, log_rate)
+        distances = torch.linspace(-_FARTHEST, _FARTHEST, _BEAM_RATES, dtype=torch.float64)
+        weights = semi_infinite_weights(distances, 2 * _FARTHEST / (_BEAM_RATES - 1)).tolist()
+        rates = (log_rate + distance for distance in distances.tolist())
+        return sum(
+            weight * self.beam.response(time_s, normals, rate) for weight, rate in zip(weights, rates, strict=True)
+        )
+
     def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:
-        """Temperature x at a moment of the record by the full balance, [n]; costs the steps a surface remembers.
+        """Temperature x at a moment of the record by the full balance, [n], marched from its beginning.
 
         Raises:
-            ValueError: the bodies have two nodes, which only ``linear_temperature`` knows.
+            ValueError: the bodies have two nodes, no end or heat from within, which only ``linear_temperature`` knows.
         """
-        if surface.core is not None:
-            raise ValueError("bodies of two nodes are solved about a mean only: use linear_temperature")
-        absent = [value is None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
-        columns = [surface.start, surface.log_rate, surface.share, surface.sun, surface.wind]
-        parameters = torch.stack([column for column in columns if column is not None], dim=1)
-        if surface.normals is not None:
-            parameters = torch.cat((parameters, surface.normals), dim=1)
-        return _Stepped.apply(parameters, kernels.Balance(*(not gone for gone in absent)), self, time_s)
-
-
-class _Stepped(torch.autograd.Function):
-    """The kernel on the CPU, which gives derivatives along with values."""
-
-    @staticmethod
-    def forward(ctx, parameters: Tensor, balance: kernels.Balance, climate: Climate, time_s: float) -> Tensor:
-        drivers = climate.drivers
-        rows = parameters.detach().cpu().contiguous()
-        values, slopes = torch.empty(len(rows), dtype=rows.dtype), torch.empty_like(rows)
-        up = torch.zeros(3, dtype=torch.float64) if drivers.up is None else drivers.up
-        kernels.integrate(
-            balance,
-            rows.numpy(),
-            drivers.times_s.numpy(),
-            climate.rows.numpy(),
-            up.numpy(),
-            drivers.reference_k,
-            time_s,
-            values.numpy(),
-            slopes.numpy(),
-        )
-        ctx.save_for_backward(slopes.to(parameters.device))
-        return values.to(parameters.device)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, gradient: Tensor):
-        (slopes,) = ctx.saved_tensors
-        return gradient[:, None] * slopes, None, None, None
+        if self.semi_infinite:
+            raise ValueError(
+                "bodies without an end or heated from within are solved about a mean only: use linear_temperature"
+            )
+        return marching.temperature(self, surface, time_s)

@@ -6,8 +6,8 @@ moment on a grid of log rates, in float64 by the exact recursion
 
     Y(t + Δ) = E Y(t) + (φ - E) u(t) + (1 - φ) u(t + Δ),   E = e^{-aΔ},   φ = (1 - E) / (aΔ),
 
-and interpolated per body by cubics in log a. Any record then costs a few multiply-adds per body, however long it is. (A
-state of its own at the first sample only adds that state times e^{-at}.)
+and interpolated per body by cubics in log a (bodies without an end: ``SemiInfiniteTable``). Any record then costs a few
+multiply-adds per body, however long it is. (A state of its own at the first sample only adds that state times e^{-at}.)
 
 **Error:** 1 mK at drivers of 50 K against a stiff solver over two days of weather, most of it the solver's.
 
@@ -23,6 +23,7 @@ from torch import Tensor
 
 LOWEST_RATE, HIGHEST_RATE = 1e-8, 1.0  # 1/s: time constants from 3 years to a second
 RATES = 129  # the cubics then err by 2e-5 of the driver's range over two days of weather (65: 3e-4)
+_BEYOND = 24.0  # on each side of the grid, in log rate: less than 1e-5 of a semi-infinite body lies farther out
 MOMENTS_KEPT = 4096  # tables of this many moments stay in memory: 50 MB for six drivers
 
 
@@ -86,6 +87,44 @@ class ResponseTable:
                 self._tables.clear()
             self._tables[time_s] = cubics(self.exact(time_s))
         return self._tables[time_s]
+
+
+class SemiInfiniteTable(ResponseTable):
+    """Responses of bodies without an end behind a surface that exchanges heat, such as massive walls and ground.
+
+    Of effusivity b = √(k ρ c) and exchange H such a body follows a driver u by u / (1 + √(s / a)) (Laplace), a = (H / b)²:
+    it settles like 1 - e^{at} erfc √(at) (Carslaw and Jaeger, Conduction of Heat in Solids, 2.7). That is a mean of the
+    responses of bodies of one rate, over all rates, with density 1 / (2π cosh(x / 2)) where x is the logarithm of their rate
+    over a (its Stieltjes integral): nothing but the table of those is needed. The integral is a sum over an even grid, whose
+    error is exponentially small; what lies beyond its ends counts at them.
+
+    Args: as ``ResponseTable``; the rates of the table are those a.
+    """
+
+    def __init__(self, times_s: Tensor, drivers: Tensor) -> None:
+        grid = log_rate_grid()
+        step = float(grid[1] - grid[0])
+        beyond = round(_BEYOND / step)
+        wide = grid[0] + step * torch.arange(-beyond, len(grid) + beyond, dtype=torch.float64)
+        super().__init__(times_s, drivers, wide)
+        self.log_rates = grid
+        self._weights = semi_infinite_weights(wide - grid[:, None], step)
+
+    def exact(self, time_s: float) -> Tensor:
+        return self._weights @ super().exact(time_s)
+
+
+def semi_infinite_weights(distances: Tensor, step: float) -> Tensor:
+    """How much bodies of one rate count in a semi-infinite one, [..., Q], adding up to one.
+
+    Args:
+        distances: [..., Q] logarithms of their rates over a, rising evenly by ``step``.
+    """
+    weights = step / (2 * math.pi * torch.cosh(0.5 * distances))
+    for end, sign in ((0, -1), (-1, 1)):  # beyond half a step from the end, 2/π arctan e^{-x/2}
+        outside = sign * distances[..., end] + 0.5 * step
+        weights[..., end] += 2 / math.pi * torch.atan(torch.exp(-0.5 * outside))
+    return weights
 
 
 def cubics(values: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from heatsplat.training.module import CHECKPOINT_KEY
 log = logging.getLogger("heatsplat")
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
-NOT_LEARNED = {"threads", "ckpt", "row", "table", "test", "trainer", "callbacks", "logger"}
+NOT_LEARNED = {"threads", "ckpt", "row", "table", "leaderboard", "test", "trainer", "callbacks", "logger"}
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:

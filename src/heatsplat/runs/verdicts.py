@@ -36,6 +36,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
         costs = prices(
             maker(verdicts), leaving, scene, config["max_steps"], device_of(config["trainer"]["accelerator"])
         )
+        verdicts = assembly.affordable(verdicts, costs, config["effects"]["least_db_per_ms"])
     found = assembly.verdicts_as_dicts(verdicts, costs)
     for line in assembly.verdict_table(found):
         log.info("%s", line)

@@ -21,7 +21,15 @@ PLACES = {"data", "data.root", "data.scene", "data.scenes"}
 NAMES = {"method", "row", "ablation", "experiment"}
 HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
-NOT_WHAT_WAS_LEARNED = {"trainer", "launcher", "callbacks", "logger", "hydra", "table"}  # these groups with all below
+NOT_WHAT_WAS_LEARNED = {
+    "trainer",
+    "launcher",
+    "callbacks",
+    "logger",
+    "hydra",
+    "table",
+    "leaderboard",
+}  # these groups with all below
 
 
 @dataclass

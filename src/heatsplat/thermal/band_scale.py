@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.physics.planck import Band
-from heatsplat.physics.units import kelvin
+from heatsplat.physics.units import celsius, kelvin
 
 DEGREE = 12  # of the two polynomials; over ranges of up to 600 K neither errs by more than 2e-8
+COLDEST_K = 150.0  # no margin reaches below: colder bodies send nothing that a camera sees
 
 
 class BandScale(nn.Module):
@@ -20,15 +21,17 @@ class BandScale(nn.Module):
     Radiance is what adds up where a surface emits and mirrors. Its fourth root is all but a straight line over the
     temperature, so that one polynomial each way holds Planck's law and its inverse.
 
-    **Convention:** from the values of the surroundings or black, whichever is lower, to those of the surroundings or white.
+    **Convention:** from the values of the surroundings or black, whichever is lower, to those of the surroundings or white,
+    and ``margin`` beyond, but not below ``COLDEST_K``.
 
     Args:
         shortest_um, longest_um: ends of the band in micrometres.
+        margin: in image units.
     """
 
-    def __init__(self, shortest_um: float = 7.5, longest_um: float = 14.0) -> None:
+    def __init__(self, shortest_um: float = 7.5, longest_um: float = 14.0, margin: float = 0.0) -> None:
         super().__init__()
-        self.band = Band(shortest_um, longest_um)
+        self.band, self.margin = Band(shortest_um, longest_um), margin
         self.register_buffer("of_values", torch.zeros(DEGREE + 1, dtype=torch.float64))
         self.register_buffer("of_roots", torch.zeros(DEGREE + 1, dtype=torch.float64))
         self.register_buffer("values", torch.tensor([0.0, 1.0], dtype=torch.float64))
@@ -46,11 +49,13 @@ class BandScale(nn.Module):
                 "give the data set its thermal range, or choose thermal.law=grey"
             )
         ambient = 0.0 if scene.ambient_c is None else scene.thermal_range.to_unit(scene.ambient_c)
-        self.values.copy_(torch.tensor([min(0.0, ambient), max(1.0, ambient)]))
+        coldest = scene.thermal_range.to_unit(celsius(COLDEST_K))
+        low, high = min(0.0, ambient), max(1.0, ambient) + self.margin
+        self.values.copy_(torch.tensor([min(low, max(low - self.margin, coldest)), high]))
 
         def root(values: np.ndarray) -> np.ndarray:
-            celsius = scene.thermal_range.to_celsius(torch.from_numpy(values))
-            return (self.band.radiance(kelvin(celsius)) / white).pow(0.25).numpy()
+            at = kelvin(scene.thermal_range.to_celsius(torch.from_numpy(values)))
+            return (self.band.radiance(at) / white).pow(0.25).numpy()
 
         white = self.band.radiance(kelvin(torch.tensor(scene.thermal_range.max_c, dtype=torch.float64)))
         low, high = self.values.tolist()
@@ -60,6 +65,10 @@ class BandScale(nn.Module):
         of_roots = chebyshev.Chebyshev.fit(root(dense), dense, DEGREE, self.roots.tolist())
         for buffer, fitted in ((self.of_values, of_values), (self.of_roots, of_roots)):
             buffer.copy_(torch.from_numpy(chebyshev.cheb2poly(fitted.coef)))
+
+    def within(self, values: Tensor) -> Tensor:
+        """Image values moved into the range of the curves; what was moved still learns, so that it comes back."""
+        return values + (values.detach().clamp(*self.values.tolist()) - values.detach())
 
     def root_of(self, values: Tensor) -> Tensor:
         """r of image values, of any shape."""

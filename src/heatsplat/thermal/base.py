@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -224,6 +225,17 @@ class ThermalModel(Heat):
                     f"scene '{scene.name}' have none, {without[0]} first. Give each thermal image its {modality} image "
                     "(of the same name), or choose a method that explains thermal images alone."
                 )
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        """Names of parts without which it can be looked at."""
+        return ()
+
+    @contextmanager
+    def without(self, name: str) -> Iterator[None]:
+        """While it lasts, a part of ``removable`` is absent."""
+        raise KeyError(name)
+        yield
 
     @abstractmethod
     def features(self, splats: Splats, query: Query) -> Tensor:

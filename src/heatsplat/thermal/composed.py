@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from torch import Tensor, nn
@@ -51,6 +52,19 @@ class Composed(Wrapper):
         for part in self.parts.values():
             values = part(values, splats, query)
         return clipped(values, self.clip) if self.parts else values
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        return tuple(self.parts)
+
+    @contextmanager
+    def without(self, name: str) -> Iterator[None]:
+        whole = self.parts
+        self.parts = nn.ModuleDict({key: part for key, part in whole.items() if key != name})
+        try:
+            yield
+        finally:
+            self.parts = whole
 
     def effects(self) -> dict[str, dict[str, Any]]:
         """Those of state and parts; of a companion, that it has an opacity of its own."""

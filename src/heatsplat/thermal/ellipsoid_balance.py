@@ -48,16 +48,7 @@ class EllipsoidBalance:
 
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, with the way out, where the scene's weather lacks what the balance needs."""
-        if scene.weather.air_c is None:
-            raise SceneError(
-                f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
-                "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
-            )
-        if self.sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
-            raise SceneError(
-                f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={self.sky} needs; "
-                "thermal.sky=swinbank does without"
-            )
+        check_weather(scene, self.sky)
 
     @torch.no_grad()
     def areas(self, splats: Splats, ids: Tensor, metres_per_unit: float) -> dict[str, Tensor]:
@@ -83,11 +74,7 @@ class EllipsoidBalance:
         for direction, power in sunlight_at(weather, time_s):
             local = direction.to(areas["rotations"]) @ areas["rotations"]
             lit = lit + power * projected_area_ratio(areas["axes"], local, self.projected_area)
-        now = weather.at(time_s)
-        air_k, sky_k = kelvin(torch.tensor(now.air_c, dtype=torch.float64)), 0.0
-        if self.sky != "none":
-            moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
-            sky_k = float(sky_temperature_k(air_k, moist, self.sky))
+        air_k = kelvin(torch.tensor(weather.at(time_s).air_c, dtype=torch.float64))
         return heating_rate(
             temperature_k,
             absorbed_w_m3=body["absorptivity"] * lit,
@@ -97,7 +84,7 @@ class EllipsoidBalance:
             radiating_ratio=areas["radiating"],
             convecting_ratio=areas["convecting"],
             air_k=float(air_k),
-            sky_k=sky_k,
+            sky_k=sky_at(weather, time_s, self.sky),
         )
 
     def effects(self, weather: Weather | None) -> dict[str, dict[str, Any]]:
@@ -106,3 +93,26 @@ class EllipsoidBalance:
         if weather is not None:
             effects["solar"] = {"projected_area": self.projected_area, "irradiance": source_of_sunlight(weather)}
         return effects
+
+
+def check_weather(scene: SceneData, sky: str) -> None:
+    """Raises SceneError, with the way out, where the scene's weather lacks what a balance under this sky needs."""
+    if scene.weather.air_c is None:
+        raise SceneError(
+            f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
+            "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
+        )
+    if sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
+        raise SceneError(
+            f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={sky} needs; "
+            "thermal.sky=swinbank does without"
+        )
+
+
+def sky_at(weather: Weather, time_s: float, sky: str) -> float:
+    """Temperature in kelvin of what a body sees above it at a moment; 0 under no sky."""
+    if sky == "none":
+        return 0.0
+    now = weather.at(time_s)
+    moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
+    return float(sky_temperature_k(kelvin(torch.tensor(now.air_c, dtype=torch.float64)), moist, sky))

@@ -13,10 +13,12 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Core, Drivers, Surface, power_excess
+from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
+from heatsplat.physics.walls import u_value
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
+from heatsplat.thermal.base import KELVIN_RANGE, NORMALS, PerGaussian, Query, Seeds, ThermalModel, surface_normals
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
 
@@ -35,7 +37,9 @@ START_COUPLING = 0.5
 COUPLINGS = (math.log(0.02), math.log(50.0))
 START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
-COSTS = {"linear": 400, "corrected": 30_000}
+LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind")  # of bodies of one node
+MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
+COSTS = {"linear": 400, "corrected": 400}
 
 
 class EnergyBalance(ThermalModel):
@@ -47,10 +51,15 @@ class EnergyBalance(ThermalModel):
     call for are absent: without a sky there is no share of radiation, without wind in the record no share of wind, without
     the sun's direction no normal, without any irradiance no sunlight.
 
+    Bodies without an end (``semi_infinite``) are massive walls and ground that the record does not heat through: one number
+    in the place of the rate, a = (H/b)², tells their effusivity b. ``inner`` adds a constant heat from within, q/H for each
+    Gaussian, such as a heated room behind a wall: heat that is lost, and with ``indoor_c`` a U-value.
+
     Identifiable: α/C and h/C, and e/C by night, with the state at the start of the record where it is still remembered
     when images begin; the share of wind in h where the wind changes while surface and air differ. Not identifiable: the
     common factor of α, h, e and C; α from C/h of surfaces that the sun never meets; the rate of surfaces that settle between
-    any two samples of the weather.
+    any two samples of the weather. The heat from within is told from that of the sky by nights of different skies only, and
+    counts from the air: an air temperature that is 1 K off is 1 K of it.
 
     Bodies of two nodes have a core behind the surface, which follows it at a rate of its own: ground and walls that are warm
     after dusk. Both rates are looked up in the same tables; it costs twice as much.
@@ -60,21 +69,27 @@ class EnergyBalance(ThermalModel):
 
     Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW;
     "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two nodes "initial_core" in
-    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H.
+    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H; with heat from within
+    "inner_rise", q/H in image units. With solution "corrected" a constant, "marched_at" [N, Q], the parameters at which a
+    Gaussian was last marched.
 
     Args:
         solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
-            record; "corrected" solves the full balance and costs the samples that a surface remembers.
+            record; "corrected" solves the full balance along the record, for all training frames at once and anew where
+            parameters have moved (heatsplat.physics.marching).
         nodes: 1, or 2 for bodies with a core (with solution "linear").
         sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
             humidity and the last without), or None: nothing radiates.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
+        semi_infinite: bodies have no end (with one node and solution "linear").
+        inner: whether there is heat from within (with solution "linear").
+        indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
         emissivity: assumed for ``attributes``, in (0, 1].
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
-        lr_initial, lr_rate, lr_sun, lr_share, lr_wind: learning rates.
+        lr_initial, lr_rate, lr_sun, lr_share, lr_wind, lr_inner: learning rates.
         lr_end: factor on them at the last step, log-linear in between.
 
     Raises:
@@ -92,6 +107,9 @@ class EnergyBalance(ThermalModel):
         sky: str | None = "auto",
         wind: bool = True,
         sun: bool = True,
+        semi_infinite: bool = False,
+        inner: bool = False,
+        indoor_c: float | None = None,
         normals: str = "seen",
         emissivity: float = 0.95,
         clip: str = "straight_through",
@@ -100,6 +118,7 @@ class EnergyBalance(ThermalModel):
         lr_sun: float = 2e-2,
         lr_share: float = 1e-2,
         lr_wind: float = 1e-2,
+        lr_inner: float = 2.5e-3,
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
@@ -111,12 +130,18 @@ class EnergyBalance(ThermalModel):
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
-        if nodes == 2 and solution != "linear":
-            raise ValueError("nodes=2 is solved about a mean only: give solution=linear, or nodes=1")
+        for name, asked in (("nodes=2", nodes == 2), ("semi_infinite", semi_infinite), ("inner", inner)):
+            if asked and solution != "linear":
+                raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
+        if nodes == 2 and semi_infinite:
+            raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
+        if indoor_c is not None and not inner:
+            raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
+        self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
         self.climate: Climate | None = None
@@ -127,6 +152,9 @@ class EnergyBalance(ThermalModel):
         if wind:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
         self._weather: Weather | None = None
+        self._moments: Tensor | None = None  # of training frames
+        self._kept: Kept | None = None
+        self._course: tuple[dict[str, Tensor], Course] | None = None
         self.register_load_state_dict_post_hook(_live_on)
 
     # What the contract asks -----------------------------------------------------------------------------
@@ -140,6 +168,7 @@ class EnergyBalance(ThermalModel):
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self._wind and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
+        self._moments = torch.tensor(sorted(set(scene.train.times_s) - {None}), dtype=torch.float64)
         self.under(weather)
         for part in (scene.train, scene.val, scene.test):
             for frame in part.frames:
@@ -153,7 +182,8 @@ class EnergyBalance(ThermalModel):
             SceneError: the record lacks a series that the model was trained with.
         """
         drivers, self.simulated = self._drivers(weather)
-        self._weather, self.climate = weather, Climate(drivers)
+        self._weather, self.climate = weather, Climate(drivers, self.semi_infinite)
+        self._kept, self._course = Kept(self.climate, self._moments), None
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         grey = seeds.values.mean(1)
@@ -166,6 +196,8 @@ class EnergyBalance(ThermalModel):
             tensors["initial_core"] = tensor(grey.clone(), self.lr_initial)
             tensors["log_core_rate"] = tensor(torch.full_like(grey, -math.log(START_CORE_S)), self.lr_rate)
             tensors["log_coupling"] = tensor(torch.full_like(grey, math.log(START_COUPLING)), self.lr_rate)
+        if self.inner:
+            tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
@@ -174,6 +206,8 @@ class EnergyBalance(ThermalModel):
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
         if drivers.wind_anomaly is not None:
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
+        if self.solution == "corrected":
+            tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), len(tensors)), 0.0)  # at none that there is
         return tensors if drivers.up is None else tensors | surface_normals(seeds)
 
     def features(self, splats: Splats, query: Query) -> Tensor:
@@ -188,9 +222,13 @@ class EnergyBalance(ThermalModel):
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's; and with
-        the assumed emissivity absorptivity, convection at mean wind and heat capacity per area."""
+        the assumed emissivity absorptivity, convection at mean wind, heat capacity per area (of bodies without an end their
+        effusivity), and the heat that a wall loses with its U-value, which are estimates (``physics.walls``)."""
         surface = self._surface(splats, query)
-        values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
+        if self.semi_infinite:  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
+            values = {"settling_time_h": torch.exp(-surface.log_rate) / 3600.0}
+        else:
+            values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
         if surface.core is not None:
             values["core_time_constant_h"] = torch.exp(-surface.core.log_rate) / 3600.0
             values["core_coupling"] = surface.core.coupling
@@ -198,13 +236,23 @@ class EnergyBalance(ThermalModel):
             values["sun_k_per_kw_m2"] = surface.sun
         if surface.wind is not None:
             values["wind_share"] = surface.wind
+        if surface.inner is not None:
+            values["inner_rise_k"] = surface.inner
         if surface.share is not None:
             exchange = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
             values["radiation_share"] = surface.share
             values["convection_w_m2_k"] = exchange * (1 - surface.share)
-            values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
+            if self.semi_infinite:
+                values["effusivity_j_m2_k_s05"] = exchange * torch.exp(-0.5 * surface.log_rate)
+            else:
+                values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
             if self._sunlit:
                 values["absorptivity"] = exchange * surface.sun / 1000.0
+            if surface.inner is not None:
+                values["heat_loss_w_m2"] = exchange * surface.inner
+                if self.indoor_c is not None:
+                    mean_c = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
+                    values["u_value_w_m2_k"] = u_value(values["heat_loss_w_m2"], self.indoor_c, mean_c)
         return values
 
     def effects(self) -> dict[str, dict]:
@@ -212,7 +260,8 @@ class EnergyBalance(ThermalModel):
 
     @property
     def cost(self) -> int:
-        # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 150 steps of some 200.
+        # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 190 steps of some 100 for one
+        # Gaussian of fifty (over 1000 steps on outdoor), and a sum of five products for all.
         return COSTS[self.solution] * self.nodes
 
     # The balance ----------------------------------------------------------------------------------------
@@ -230,10 +279,24 @@ class EnergyBalance(ThermalModel):
                 f"there is no weather for second {query.time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s "
                 "after the first training frame. Give a record that covers every moment that is asked for."
             )
+        if self.solution == "corrected" and not torch.is_grad_enabled():
+            return self._course_of(splats).temperature(query.time_s, query.ids)
         surface = self._surface(splats, query)
         if self.solution == "linear":
             return self.climate.linear_temperature(surface, query.time_s)
-        return self.climate.stepped_temperature(surface, query.time_s)
+        if not self._kept.has(query.time_s, splats[MARCHED_AT]):
+            return self.climate.stepped_temperature(surface, query.time_s)
+        ids = torch.arange(len(splats), device=splats.means.device) if query.ids is None else query.ids
+        normals = splats[NORMALS].detach() if surface.normals is not None else None
+        return self._kept.temperature(surface, query.time_s, ids, normals, splats[MARCHED_AT].detach())
+
+    def _course_of(self, splats: Splats) -> Course:
+        """The course of all Gaussians as they are now: that of the last view, unless something has changed since."""
+        now = {name: splats[name].detach() for name in (*LEARNED, NORMALS) if name in splats}
+        if self._course is None or not all(torch.equal(now[name], was) for name, was in self._course[0].items()):
+            course = Course(self.climate, self._surface(splats, Query()))
+            self._course = {name: tensor.clone() for name, tensor in now.items()}, course
+        return self._course[1]
 
     def _surface(self, splats: Splats, query: Query) -> Surface:
         def bounded(name: str, low: float, high: float) -> Tensor:
@@ -255,6 +318,7 @@ class EnergyBalance(ThermalModel):
             wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
             normals=query.normals(splats) if drivers.up is not None else None,
             core=core() if self.nodes == 2 else None,
+            inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
         )
 
     def _first_sun(self, grey: Tensor) -> Tensor:
@@ -275,6 +339,10 @@ class EnergyBalance(ThermalModel):
         effects: dict[str, dict[str, Any]] = {"convection": {"air": "recorded"}}
         if self.nodes == 2:
             effects["relaxation"] = {"nodes": "surface and core"}
+        if self.semi_infinite:
+            effects["relaxation"] = {"bodies": "without an end"}
+        if self.inner:
+            effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
         parts: dict[str, Any] = {}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
         if self._sky is not None:

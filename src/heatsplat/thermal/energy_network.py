@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,18 +17,21 @@ from heatsplat.physics.ellipsoids import SMALLEST_AXIS_M
 from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
-from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
 from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
 from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
-from heatsplat.thermal.weather_drive import columns_at
+from heatsplat.thermal.surface_balance import SurfaceBalance
+from heatsplat.thermal.weather_drive import columns_at, remembered, value_at
 
 log = logging.getLogger(__name__)
 
 TIMES = ("record", "day", "none")
 FEATURES = ("learned", "given", "labels", "none")
-BODIES = ("inferred", "table")
+MATERIALS = ("inferred", "constant", "table")
+COLLOCATIONS = ("view", "record")
+BODIES = ("ellipsoid", "surface")
 TERMS = ("smooth", "physical", "ode", "pinn")
 BALANCED = ("ode", "pinn")  # the terms that need the balance of heat
 LATENT = "latent_heat"
@@ -39,7 +42,8 @@ LIMITS = {
     "convection": (0.0, 50.0),  # W/(m² K); wind over 15 m/s
     "capacity": (0.5e6, 6.0e6),  # J/(m³ K); water has 4.2e6
 }
-GOLDEN = 0.6180339887498949  # multiples of it, without their whole part, fill [0, 1) evenly however many are taken
+# Multiples of these, without their whole part, fill [0, 1) evenly however many are taken, and pairs of both the square.
+GOLDEN, PLASTIC = 0.6180339887498949, 0.7548776662466927
 TRAVELS = (
     "bounds_k",
     "clock.record",
@@ -67,8 +71,9 @@ class EnergyNetwork(ThermalModel):
     For ``first_steps`` every Gaussian emits one value, the same at every time, while geometry and opacity settle; from
     there on (with ``stages=frozen_geometry``) the network emits and they stand still. Further heads give emissivity,
     absorptivity, convection coefficient and volumetric heat capacity of every Gaussian at every time. Four penalties
-    (``heat_terms``) tie them together, for an interval that starts at the time of the view and ends 1 to 10 minutes
-    later (earlier, at the end of the weather record) and for at most ``sampled`` of the Gaussians in view. Interval and
+    (``heat_terms``) tie them together, for an interval that starts at the time of the view (or anywhere in the weather
+    record) and ends 1 to 10 minutes
+    later (earlier, at the end of the record) and for at most ``sampled`` of the Gaussians in view. Interval and
     sample are functions of the step. The head for latent heat is the paper's; as its balance has no such term, no loss
     reaches it.
 
@@ -87,11 +92,18 @@ class EnergyNetwork(ThermalModel):
             time to the weather.
         features: "learned" per Gaussian, "given" by the scene's points, "labels" (one number per class), or "none".
         feature_size: F of learned or given features.
-        attributes: "inferred" by the network, or those of the class "table" (Tab. 6).
+        attributes: "inferred" by the network at every moment (paper), "constant" by it throughout, or those of the class "table"
+            (Tab. 6).
         weights: of smooth, physical, ode and pinn; 0 leaves a term out.
         first_steps: steps of the first stage.
         ramp_steps: steps after them over which the penalties grow to their weight.
         interval_s: shortest and longest interval in seconds.
+        collocation: the penalties' intervals begin at the time of the "view" (paper), or anywhere in the weather "record", also
+            where no image is.
+        past_h: time constants in hours of means of the past weather that the network sees beside the present one (none in the
+            paper).
+        body: what the balance is of: "ellipsoid" (paper), or "surface", slabs that face as the surfaces do.
+        depth_m: thickness of such slabs.
         sampled: Gaussians in view that penalties are evaluated for, at most.
         projected_area: "exact" or "printed" (Eq. 8), the area that sunlight falls on.
         surface_area: "printed" (Eq. 6) or "consistent", the area that air cools.
@@ -124,6 +136,10 @@ class EnergyNetwork(ThermalModel):
         first_steps: int = 0,
         ramp_steps: int = 0,
         interval_s: tuple[float, float] = (60.0, 600.0),
+        collocation: str = "view",
+        past_h: Sequence[float] = (),
+        body: str = "ellipsoid",
+        depth_m: float = 0.05,
         sampled: int = 2048,
         projected_area: str = "exact",
         surface_area: str = "printed",
@@ -140,8 +156,13 @@ class EnergyNetwork(ThermalModel):
         super().__init__()
         check_option("time", time, TIMES)
         check_option("features", features, FEATURES)
-        check_option("attributes", attributes, BODIES)
+        check_option("attributes", attributes, MATERIALS)
+        check_option("collocation", collocation, COLLOCATIONS)
+        check_option("body", body, BODIES)
         self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
+        if body == "surface":
+            self.balance = SurfaceBalance(sky, depth_m)
+        self.collocation, self.past_h = collocation, tuple(past_h)
         if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
             raise ValueError(
                 "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
@@ -161,7 +182,7 @@ class EnergyNetwork(ThermalModel):
             raise ValueError("without place and features all Gaussians are alike: set position_frequencies or features")
 
         self.weights = {name: weight for name, weight in (weights or {}).items() if weight > 0}
-        self.inferred = attributes == "inferred"
+        self.inferred, self.constant = attributes != "table", attributes == "constant"
         if not self.inferred:
             self.weights.pop("physical", None)  # nothing is predicted that could be compared
         self.features_from, self.feature_size = features, sizes[features]
@@ -183,16 +204,18 @@ class EnergyNetwork(ThermalModel):
         if self.inferred:
             heads |= {"attributes": start, LATENT: torch.zeros(1)}
         timed = 2 * time_frequencies if time != "none" else 0
-        self.network = ResidualNetwork(own, timed + len(WEATHER_COLUMNS), width, blocks, heads)
+        columns = len(WEATHER_COLUMNS) * (1 + len(self.past_h))
+        self.network = ResidualNetwork(own, timed + columns, width, blocks, heads)
 
         self.register_buffer("emits", torch.tensor(True))  # the network, not the value of the first stage
         self.box, self.clock, self.range = Box(), Clock(), ImageRange()
         self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # T_min, and T_max - T_min
-        self.register_buffer("weather_mean", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
-        self.register_buffer("weather_scale", torch.zeros(len(WEATHER_COLUMNS), dtype=torch.float64))
+        self.register_buffer("weather_mean", torch.zeros(columns, dtype=torch.float64))
+        self.register_buffer("weather_scale", torch.zeros(columns, dtype=torch.float64))
         self.register_buffer("feature_mean", torch.zeros(self.feature_size))
         self.register_buffer("feature_scale", torch.ones(self.feature_size))
         self.weather: Weather | None = None
+        self._past: Tensor | None = None  # [T, k] of the record's samples
         self.metres_per_unit = 1.0
         self._step = 0
         self._seen: _Seen | None = None
@@ -232,11 +255,12 @@ class EnergyNetwork(ThermalModel):
 
     def prepare(self, scene: SceneData) -> None:
         self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
+        self._past = remembered(scene.weather, self.past_h)
         for constants in (self.box, self.clock, self.range):
             constants.prepare(scene)
         for frame in (*scene.test.frames, *scene.val.frames):
             scene.weather.at(frame.time_s)  # refuses now what would fail after training
-        columns = torch.stack([columns_at(scene.weather, time) for time in scene.train.times_s])
+        columns = torch.stack([self._weather_at(time) for time in scene.train.times_s])
         spread = columns.std(0, unbiased=False)
         there = ~columns[0].isnan()
         self.weather_mean.copy_(torch.where(there, columns.mean(0), 0.0))
@@ -268,6 +292,8 @@ class EnergyNetwork(ThermalModel):
             tensors["label"] = PerGaussian(self._points["label"][nearest], 0.0)
         if self.features_from == "given":
             tensors["feature"] = PerGaussian(self._points["feature"][nearest], 0.0)
+        if self._balanced and isinstance(self.balance, SurfaceBalance):
+            tensors |= surface_normals(seeds)
         self.network.draw(seeds.generator)
         if self.features_from == "learned":
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
@@ -307,27 +333,32 @@ class EnergyNetwork(ThermalModel):
         ids, base, now = seen.ids[rows], seen.base[rows], seen.units[rows]
         terms = {}
         if "physical" in weights:
-            body = self._body(splats, ids, seen.hidden[rows])
+            body = self._body(splats, ids, base, seen.hidden[rows])
             terms["physical"] = heat_terms.to_reference(body, reference(splats["label"].detach()[ids].long()))
-        interval = self._interval(seen.time_s)
+        start_s, hidden = seen.time_s, seen.hidden[rows]
+        ends = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
+        if self.collocation == "record" and set(weights) - {"physical"}:
+            start_s = ends[0] + (ends[1] - ends[0]) * math.fmod(self._step * PLASTIC, 1.0)
+            hidden = self.network(base, self._moment(start_s))
+            now = self._units(hidden)
+        interval = self._interval(start_s)
         if interval == 0 or not set(weights) - {"physical"}:
             return {name: weights[name] * term for name, term in terms.items()}
-        ends = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
-        last_s = min(max(seen.time_s + interval, ends[0]), ends[1])  # the sum may round to a hair outside
-        middle_s = 0.5 * (seen.time_s + last_s)
+        last_s = min(max(start_s + interval, ends[0]), ends[1])  # the sum may round to a hair outside
+        middle_s = 0.5 * (start_s + last_s)
         last = self.network(base, self._moment(last_s))
         later = self._units(last)
         if "smooth" in weights:
             terms["smooth"] = heat_terms.change(now, later)
         if self._balanced:
             areas = self.balance.areas(splats, ids, self.metres_per_unit)
-            first_rate = self._rate(now, self._body(splats, ids, seen.hidden[rows]), areas, seen.time_s)
+            first_rate = self._rate(now, self._body(splats, ids, base, hidden), areas, start_s)
             if "ode" in weights:
-                middle = self._body(splats, ids, self.network(base, self._moment(middle_s)))
+                middle = self._body(splats, ids, base, self.network(base, self._moment(middle_s)))
                 rate = self._rate(now + interval / 2 * first_rate, middle, areas, middle_s)
                 terms["ode"] = heat_terms.integration(now, later, rate, interval)
             if "pinn" in weights:
-                rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, last), areas, last_s))
+                rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, base, last), areas, last_s))
                 terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.interval_s[1])
         return {name: weights[name] * term for name, term in terms.items()}
 
@@ -339,8 +370,8 @@ class EnergyNetwork(ThermalModel):
         if not self._network_emits:
             return {}
         with torch.no_grad():
-            hidden = self.network(self._base(splats, query.ids), self._moment(query.time_s))
-            return self._body(splats, query.ids, hidden)
+            base = self._base(splats, query.ids)
+            return self._body(splats, query.ids, base, self.network(base, self._moment(query.time_s)))
 
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         """Attributes of the classes, each [N]; NaN where there is no class. Empty for models that use no labels."""
@@ -408,7 +439,7 @@ class EnergyNetwork(ThermalModel):
     def _moment(self, time_s: float) -> Tensor:
         """Encoded time and weather of a moment, as the network sees them."""
         mean, scale = self.weather_mean.cpu(), self.weather_scale.cpu()
-        weather = torch.where(scale > 0, (columns_at(self.weather, time_s).nan_to_num() - mean) * scale, 0.0)
+        weather = torch.where(scale > 0, (self._weather_at(time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
         if self.time != "none":
             # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
@@ -432,8 +463,15 @@ class EnergyNetwork(ThermalModel):
         coldest, span = self.bounds_k.tolist()
         return torch.logit(((lower + width * value - coldest) / span).clamp(0.05, 0.95))
 
-    def _body(self, splats: Splats, ids: Tensor | None, hidden: Tensor) -> dict[str, Tensor]:
+    def _weather_at(self, time_s: float) -> Tensor:
+        """Present and past weather at a moment, as the network sees it before it is scaled."""
+        present = columns_at(self.weather, time_s)
+        return torch.cat([present, value_at(self.weather, self._past, time_s)]) if self.past_h else present
+
+    def _body(self, splats: Splats, ids: Tensor | None, base: Tensor, hidden: Tensor) -> dict[str, Tensor]:
         """The four attributes, each [n], from hidden values [n, width] or from the table."""
+        if self.constant:
+            hidden = self.network(base, torch.zeros_like(self.network.shared.weight[0]))
         if self.inferred:
             values = self.lowest + (self.highest - self.lowest) * self.network.heads["attributes"](hidden).sigmoid()
         else:

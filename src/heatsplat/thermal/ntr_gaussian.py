@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch.nn.functional import layer_norm, softplus
 
 from heatsplat.contracts import SceneData
 from heatsplat.physics.units import STEFAN_BOLTZMANN
@@ -16,6 +16,7 @@ from heatsplat.thermal.layers import draw_uniform
 
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
 STORAGE = 1.0e5  # J/m²/K, unit of the heat capacity: 5 cm of ground
+ATTRIBUTE_NETWORKS = ("of_feature", "of_place", "of_state", "attribute_")  # what their parameters' names begin with
 FIRST_COOLING = 0.25  # of the scene's range by radiation in a window, at most, with the networks as they start
 
 
@@ -43,7 +44,9 @@ class NtrGaussian(ThermalModel):
         environment: weight of the mean (T_env - ambient)², image units.
         variation: weight of the total variation in time of T_env, wind and T_net.
         integral: weight of the mean squared integral, image units (paper: 0.002).
+        normalised: whether hidden values of the attribute networks are normalised in each Gaussian (LayerNorm; published code).
         lr, lr_end: learning rate of the networks and the factor on it at the end of the run.
+        lr_attributes: learning rate of the attribute networks.
         lr_feature, lr_first: learning rates of features and of the first stage's value.
     """
 
@@ -64,7 +67,9 @@ class NtrGaussian(ThermalModel):
         environment: float = 1.0,
         variation: float = 1.0,
         integral: float = 0.002,
+        normalised: bool = False,
         lr: float = 1.6e-3,
+        lr_attributes: float = 1.6e-3,
         lr_end: float = 0.1,
         lr_feature: float = 2.5e-3,
         lr_first: float = 2.5e-3,
@@ -96,6 +101,11 @@ class NtrGaussian(ThermalModel):
         self.of_feature, self.of_place = nn.Linear(feature_size, 3 * half), nn.Linear(places, half)
         self.of_state = nn.Linear(3 + times, 3 * half)
         self.attribute_heads = nn.Parameter(torch.zeros(3, half))
+        if normalised:
+            self.attribute_norm = nn.ParameterList(
+                [nn.Parameter(torch.ones(3, half)), nn.Parameter(torch.zeros(3, half))]
+            )
+        self.normalised, self.lr_attributes = normalised, lr_attributes
         self.clock, self.box, self.range = Clock(), Box(), ImageRange()
         self.register_buffer("ambient", torch.full((), 0.5))
         self.register_buffer("emits", torch.tensor(first_steps == 0))
@@ -140,6 +150,9 @@ class NtrGaussian(ThermalModel):
             if not self.emits:
                 return self.range.kelvin(splats["first_value"])
             return self.range.kelvin(self._units(splats, None, time_s))
+
+    def rate_of(self, name: str) -> tuple[float, float]:
+        return (self.lr_attributes, self.lr_end) if name.startswith(ATTRIBUTE_NETWORKS) else super().rate_of(name)
 
     def effects(self) -> dict[str, dict]:
         return {"relaxation": {"nodes": self.nodes, "window_s": self.window_s}, "radiation": {}, "convection": {}}
@@ -190,8 +203,11 @@ class NtrGaussian(ThermalModel):
         own = torch.cat(
             (own[:, : -self.of_place.out_features], own[:, -self.of_place.out_features :] + self.of_place(code)), 1
         )
-        hidden = (units[..., None] * weight[:, 0] + shared[None] + own[:, None]).relu()
-        raw = (hidden.unflatten(2, (3, -1)) * self.attribute_heads).sum(-1)
+        hidden = (units[..., None] * weight[:, 0] + shared[None] + own[:, None]).unflatten(2, (3, -1))
+        if self.normalised:
+            gain, bias = self.attribute_norm
+            hidden = gain * layer_norm(hidden, hidden.shape[-1:]) + bias
+        raw = (hidden.relu() * self.attribute_heads).sum(-1)
         emissivity, exchange = raw[..., 0].sigmoid(), EXCHANGE * softplus(raw[..., 1])
         storage = self._storage * (softplus(raw[..., 2]) + 0.05)  # 5 kJ/m²/K at least: a sheet of metal
         span = self.range.bounds.span_k

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import WEATHER_COLUMNS, Weather
+from heatsplat.physics.units import DAY_S
 
 
 def columns_at(weather: Weather, time_s: float) -> Tensor:
@@ -25,6 +27,22 @@ def columns_at(weather: Weather, time_s: float) -> Tensor:
     return torch.tensor([math.nan if value is None else value for value in values.values()], dtype=torch.float64)
 
 
+def remembered(weather: Weather, hours: Sequence[float]) -> Tensor:
+    """What the record's columns (``columns_at``) were before each sample, [T, 5 hours] float64: means that forget as e^{-t/τ},
+    for each τ in ``hours``. Before the record lies what its first day is on average."""
+    columns = torch.stack([columns_at(weather, time) for time in weather.times_s.tolist()])
+    before = columns[weather.times_s <= weather.times_s[0] + DAY_S].mean(0)
+    found = []
+    for tau_s in (3600.0 * hour for hour in hours):
+        state, series = before, [before]
+        for i, step in enumerate(weather.times_s.diff().tolist()):
+            keep = math.exp(-step / tau_s)
+            state = keep * state + (1.0 - keep) * 0.5 * (columns[i] + columns[i + 1])
+            series.append(state)
+        found.append(torch.stack(series))
+    return torch.cat(found, 1) if found else columns[:, :0]
+
+
 def sunlight_at(weather: Weather, time_s: float) -> list[tuple[Tensor, float]]:
     """Beams of sunlight at a moment: direction towards the source [3] in the world, and W/m² on a surface facing it.
 
@@ -34,14 +52,14 @@ def sunlight_at(weather: Weather, time_s: float) -> list[tuple[Tensor, float]]:
     """
     beams = []
     if weather.sun is not None and weather.direct_w_m2 is not None:
-        towards = _at(weather, weather.sun, time_s)
+        towards = value_at(weather, weather.sun, time_s)
         length = float(towards.norm())  # of the chord between two directions; zero only where they are opposite
         if length > 0:
-            beams.append((towards / length, float(_at(weather, weather.direct_w_m2, time_s))))
+            beams.append((towards / length, float(value_at(weather, weather.direct_w_m2, time_s))))
         if weather.diffuse_w_m2 is not None:
-            beams.append((weather.up, float(_at(weather, weather.diffuse_w_m2, time_s))))
+            beams.append((weather.up, float(value_at(weather, weather.diffuse_w_m2, time_s))))
     elif weather.irradiance_w_m2 is not None:
-        beams.append((weather.up, float(_at(weather, weather.irradiance_w_m2, time_s))))
+        beams.append((weather.up, float(value_at(weather, weather.irradiance_w_m2, time_s))))
     return [(direction, power) for direction, power in beams if power > 0]
 
 
@@ -54,7 +72,7 @@ def source_of_sunlight(weather: Weather) -> str:
     return "none: the record has no irradiance"
 
 
-def _at(weather: Weather, series: Tensor, time_s: float) -> Tensor:
+def value_at(weather: Weather, series: Tensor, time_s: float) -> Tensor:
     """A series at a moment within the record, linear between samples."""
     times = weather.times_s
     above = int(torch.searchsorted(times, time_s).clamp(1, len(times) - 1))

@@ -14,6 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.export.basis import steps_of
 from heatsplat.export.snapshot import TOLERANCE_C, TOLERANCE_UNIT, Layer, Snapshot
+from heatsplat.io.quantities import words_and_unit
 
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
 CAMERAS = 36  # training cameras that are in the page, with their images
@@ -22,16 +23,6 @@ UNKNOWN = 65535  # of a thumbnail's pixel that is masked
 LEVELS = 65534  # steps between the ends of a range in 16 bits
 ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
 LOG_RATIO = 100.0  # an attribute above 0 whose ends are further apart than this is stored as its logarithm
-SUFFIXES = {  # of names of attributes
-    "_k_per_kw_m2": "K m²/kW",
-    "_kj_m2_k": "kJ/(m² K)",
-    "_w_m2_k": "W/(m² K)",
-    "_w_m2": "W/m²",
-    "_h": "h",
-    "_s": "s",
-    "_k": "K",
-    "_c": "°C",
-}
 
 
 class Block:
@@ -138,11 +129,11 @@ def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:
         values, low, high = values.clamp_min(1e-30).log10(), math.log10(low), math.log10(high)
     span = high - low if high > low else 1.0
     share = ((values.double() - low) / span).nan_to_num(0.0).clamp(0, 1)
-    suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
+    label, unit = words_and_unit(name)
     return {
         "name": name,
-        "label": name.removesuffix(suffix).replace("_", " "),
-        "unit": SUFFIXES.get(suffix, ""),
+        "label": label,
+        "unit": unit,
         "low": low,
         "high": low + span,
         "log": logarithmic,
@@ -181,12 +172,18 @@ def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
     return told
 
 
-def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> Mapping[str, Any]:
-    """What the sensor adds to the clean image of a frame, in the scene's unit."""
-    images = module.predict_all(frame)
-    difference = (images[module.modality] - images["clean"]).mean(-1).cpu() * span
-    steps, step = steps_of(_small(difference, size).flatten())
-    return block.add(steps.view(size), "i2") | {"step": step}
+@torch.no_grad()
+def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> list[Mapping[str, Any]]:
+    """What each part of the sensor adds to the image of a frame, in their order, in the scene's unit."""
+    image = module.render(frame).features[..., : module.thermal.modality_channels[0]]
+    told = []
+    for name, part in module.sensor.parts.items():
+        after = part(image, frame)
+        difference = (after - image).mean(-1).cpu() * span
+        steps, step = steps_of(_small(difference, size).flatten())
+        told.append(block.add(steps.view(size), "i2") | {"step": step, "name": name.replace("_", " ")})
+        image = after
+    return told
 
 
 def _small(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
 
 if TYPE_CHECKING:
+    from heatsplat.studies.leaderboard.plan import Board
     from heatsplat.studies.published import Reproduction
 
 log = logging.getLogger("heatsplat")
@@ -99,6 +100,7 @@ class RowSweeper(BasicSweeper):
         self.paper = paper
         self.rows = rows
         self.reproduction: Reproduction | None = None
+        self.board: Board | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
@@ -110,6 +112,8 @@ class RowSweeper(BasicSweeper):
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
         if self.reproduction is not None:
             jobs = self._of_table(self.reproduction, jobs)
+        elif self.board is not None:
+            jobs = [run for given in jobs for run in self.board.jobs(given)]
         elif self.rows:
             jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
         return [jobs]
@@ -137,8 +141,11 @@ class RowSweeper(BasicSweeper):
         folder = Path(self.config.hydra.sweep.dir)
         if self.config.get("table") is not None and not self._plan(list(arguments)):
             return None
+        if self.config.get("leaderboard") is not None:
+            self._plan_board()
+        idle = (self.reproduction is not None and not self.reproduction.runs) or (self.board and not self.board.jobs())
         try:
-            return super().sweep(list(arguments)) if self.reproduction is None or self.reproduction.runs else None
+            return None if idle else super().sweep(list(arguments))
         except ConfigCompositionException as error:
             of, chosen = (self.paper or {}).get("of"), self.config.hydra.runtime.choices.method
             if of in (None, chosen):
@@ -153,7 +160,11 @@ class RowSweeper(BasicSweeper):
                 )
             raise
         finally:
-            written = write_sweep(folder, list(self.rows or ()), self._printed())
+            written = [] if self.board else write_sweep(folder, list(self.rows or ()), self._printed())
+            if self.board is not None:
+                from heatsplat.studies.leaderboard.report import write_leaderboard
+
+                written += write_leaderboard(folder, self.board)
             if self.reproduction is not None:
                 from heatsplat.studies.published import write_comparison
 
@@ -175,7 +186,10 @@ class RowSweeper(BasicSweeper):
     def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
         """Composes every job before any starts, unless the launcher does so by itself: a hundred take a minute."""
         if not isinstance(self.launcher, JobLauncher):
-            super().validate_batch_is_legal(batch)
+            # Of a leaderboard one job per method and track: scenes and seeds make no other configuration.
+            alike = ("data.scene=", "seed=", "callbacks.temperatures.image=")
+            told = {tuple(text for text in job if not text.startswith(alike)): job for job in batch}
+            super().validate_batch_is_legal(list(told.values()) if self.board else batch)
 
     def _plan(self, arguments: list[str]) -> bool:
         """Plans the runs of a published table and tells them, with what is missing; False where nothing is to be done.
@@ -204,6 +218,19 @@ class RowSweeper(BasicSweeper):
         if nothing:
             sys.exit(1)
         return not table["dry"]
+
+    def _plan_board(self) -> None:
+        """Plans the runs of the leaderboard and tells how many; exit code 1 where it asks for what there is not."""
+        from heatsplat.contracts import SceneError
+        from heatsplat.studies.leaderboard.plan import board_of
+
+        asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
+        try:
+            self.board = board_of(asked, self.hydra_context.config_loader.get_group_options("method"))
+        except SceneError as error:
+            log.error("%s", error)
+            sys.exit(1)
+        log.info("%s", self.board.summary())
 
     def _ablation(self, name: str | None) -> Mapping[str, Mapping[str, Any]]:
         """Rows of a ready-made ablation (conf/ablation); none without a name."""

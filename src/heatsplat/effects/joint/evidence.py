@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import candidates, earns, worthwhile
 
 WELL_OUTDONE = 1.0  # share of others' size below which an effect makes up for what they lack
@@ -16,21 +17,40 @@ def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
     if inspected.joint is None:
         return Evidence(None, inspected.obs.why or "no point can be followed through the images")
     fit, model = inspected.joint
+    certainty = inspected.certainty
     if name in model.names:
-        less = fit.without(model, name)
-        gain, size = fit.gain(model, less), fit.effect_size(model, less)
-        return Evidence(gain, f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost")
+        return judged(inspected, name, sentence, model, fit.without(model, name))
+    if name in certainty.doubts:
+        return Evidence(None, f"cannot be told: {certainty.doubts[name]}", told=False)
     tried = [one for other, one in candidates(fit, model) if other == name]
+    if few := certainty.few(name):
+        return Evidence(None, f"cannot be told: {few}", told=False)
     if not tried:
         why = fit.data.effects[name].term.unseen(fit.data)
         return Evidence(None, f"the training views do not allow to look for it: {why}")
     best = max(tried, key=lambda one: fit.gain(one, model))
     gain, size = fit.gain(best, model), fit.effect_size(best, model)
+    if gain > 1.0 and certainty.unseen_changes and not certainty.explained:
+        return Evidence(gain, f"{sentence} {beside(size)}: cannot be told, {certainty.unseen_changes}", told=False)
     if gain > 1.0 and not worthwhile(fit, best, model, name):
         return Evidence(0.0, f"{sentence} {beside(size)}, too little beside the noise or the changes of the scene")
     if earns(fit, best, model, name):
         return Evidence(0.0, f"{sentence} {beside(size)}, which the effects that are on explain as well")
-    return Evidence(gain, f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost")
+    found = f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost"
+    told = not certainty.undecided(best, name)
+    return Evidence(gain, found if told else f"{found}: cannot be told, more frames would tell", told=told)
+
+
+def judged(inspected: Inspection, name: str, sentence: str, more: Model, less: Model) -> Evidence:
+    """What an effect gains that was taken in, and whether that can be told from chance."""
+    fit, model = inspected.joint
+    gain, size = fit.gain(more, less), fit.effect_size(more, less)
+    worth = inspected.certainty.worth(name, more, less)
+    doubt = worth.doubt or inspected.certainty.doubts.get(name, "")
+    found = f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost, {worth.held_out.db:.1f} dB where left out"
+    return Evidence(
+        gain, f"{found}: cannot be told, {doubt}" if doubt else found, told=not doubt, gain_db=worth.held_out.db
+    )
 
 
 def selected_kind(inspected: Inspection, name: str) -> object | None:

@@ -10,6 +10,7 @@ a ``Path`` lets a share of a point's own part arrive.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 OWN_HURDLE, SHARED_HURDLE = 2.5, 1.3
 # An effect whose size is less than this share of the expected error is left out.
 SMALLEST = 0.1
+WELL_SEEN = 2.5  # observations of a point for each of its own numbers from which these can be told
 
 
 def never(data: Data) -> object | None:
@@ -46,6 +48,12 @@ class Term:
         rich: (Data) -> the kind in which it stands in the model by which good points are told from bad ones before
             anything is known; None where it does not.
         starts: (Data) -> models from which the selection starts, beside that of nothing.
+        frames: (Data) -> in how many frames points must be seen for the fit to tell it at all.
+        in_time: whether it makes the scene change.
+        single_images: whether its numbers belong to single images.
+        rivals: effects by name, one or several together, that look so much like it that it has to outdo them on held-out
+            observations to be told.
+        told_by: rules that it has to meet to be told, beside those by which it is taken in.
         sensor_first: whether one way of the selection tries it before the other effects.
         smallest: its size in expected errors below which it is left out.
         beside_changes: in a scene that changes, the share of its changes that its size must exceed.
@@ -57,6 +65,11 @@ class Term:
     unseen: Callable[[Data], str] = lambda data: "points are seen from one side only"
     rich: Callable[[Data], object | None] = never
     starts: Callable[[Data], Sequence[Model]] = lambda data: ()
+    frames: Callable[[Data], int] = lambda data: 0
+    in_time: bool = False
+    single_images: bool = False
+    rivals: Sequence[tuple[str, ...]] = ()
+    told_by: Sequence[Callable[[Fit, Model, Model], bool]] = ()
     sensor_first: bool = False
     smallest: float = SMALLEST
     beside_changes: float = 0.0
@@ -69,11 +82,9 @@ class Own(Term):
 
     Args:
         basis: (Fit, kind) -> what they multiply, [F, k] or [P, F, k].
-        in_time: whether it makes the scene change.
     """
 
     basis: Callable[[Fit, object], Tensor]
-    in_time: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +116,11 @@ class Path(Term):
     """
 
     passing: Callable[[Fit, object, Tensor, Tensor], Tensor]
+
+
+def well_seen(numbers: int) -> int:
+    """Frames in which a point must be seen for so many numbers of its own to be told."""
+    return math.ceil(WELL_SEEN * numbers)
 
 
 def centred(numbers: Tensor) -> Tensor:

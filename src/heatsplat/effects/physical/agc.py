@@ -12,13 +12,16 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
-from heatsplat.effects.physical.frame_offset import in_common
+from heatsplat.effects.physical.frame_offset import common_to_all, in_common
 
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent."""
     if outdone(inspected, "agc", {"frame_offset", "tone"}):
-        return Evidence(0.0, "what looks like gains of single images is a bent curve along which they shift")
+        found = "what looks like gains of single images is a bent curve along which they shift"
+        doubts = inspected.certainty.doubts
+        doubt = doubts.get("agc") or doubts.get("tone")
+        return Evidence(None, f"{found}, if it is: {doubt}", told=False) if doubt else Evidence(0.0, found)
     return gained(inspected, "agc", "gains of single images change values by")
 
 
@@ -46,6 +49,9 @@ EFFECT = Effect(
         gain=True,
         kinds=lambda fit: (1,),
         numbers=lambda data, kind: data.frames - 1,
+        single_images=True,
+        rivals=(("frame_offset", "tone"), ("attenuation",)),
+        told_by=(common_to_all,),
         rich=lambda data: 1,
         beside_changes=0.1,
         rules=(in_common,),

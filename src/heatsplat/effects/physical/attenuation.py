@@ -83,6 +83,7 @@ EFFECT = Effect(
         passing=passing,
         kinds=kinds,
         numbers=numbers,
+        rivals=(("relaxation", "harmonic_source"),),
         smallest=0.2,  # misplaced points go with distance a little
     ),
 )

@@ -28,14 +28,20 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(None, obs.why or "no point can be followed over time")
     fit, model = inspected.joint
     if fit.data.drivers is not None:
-        return Evidence(0.0, "levels follow the weather, so that nobody knows how fast they would fade by themselves")
+        why = "levels follow the weather, so that nobody knows how fast they would fade by themselves"
+        return Evidence(None, f"cannot be told: {why}", told=False)
     if "relaxation" not in model.names or "harmonic_source" in model.names:
-        why = "a source hides how contrasts fade" if "harmonic_source" in model.names else "nothing changes over time"
-        return Evidence(0.0, f"{why}, so that no flow between neighbours shows")
+        if "harmonic_source" in model.names:
+            return Evidence(None, "cannot be told: a source hides how contrasts fade", told=False)
+        doubt = inspected.certainty.doubts.get("relaxation") or inspected.certainty.few("relaxation")
+        if doubt and "relaxation" not in model.names:
+            return Evidence(None, f"cannot be told, as whether anything changes over time: {doubt}", told=False)
+        return Evidence(0.0, "nothing changes over time, so that no flow between neighbours shows")
     early, late, used = early_and_late(fit, model)
     points = obs.tracks.points[used]
     if len(points) < MIN_POINTS:
-        return Evidence(None, f"{len(points)} points are too few to have neighbours, {MIN_POINTS} are needed")
+        why = f"cannot be told: {len(points)} points are too few to have neighbours, {MIN_POINTS} are needed"
+        return Evidence(None, why, told=False)
     near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
     first, last = early[used], late[used]
     before, after = first[near].mean(1), last[near].mean(1)
@@ -43,7 +49,8 @@ def evidence(inspected: Inspection) -> Evidence:
     contrast, remains = first - before, last - after
     strong = contrast.abs() > 5.0 * obs.noise
     if int(strong.sum()) < MIN_STRONG or kept < LEFT:
-        return Evidence(0.0, "neighbours are too much alike, or all is cold in the end, to tell how contrasts fade")
+        why = "neighbours are too much alike, or all is cold in the end; a shorter record of finer patterns would tell"
+        return Evidence(None, f"cannot be told: {why}", told=False)
     still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
     rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
     return Evidence(

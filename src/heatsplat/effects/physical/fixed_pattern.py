@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
-from heatsplat.effects.joint.evidence import beside
+from heatsplat.effects.joint.evidence import beside, judged
 from heatsplat.effects.joint.image_grid import STILL, grid_columns
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import worthwhile
@@ -19,6 +20,7 @@ from heatsplat.effects.physical import relaxation, vignetting
 
 NODES, NODES_FEW = 7, 5  # along the sides of the grids on which a pattern is looked for
 MANY = 10_000  # observations from which the finer grid pays
+SURE = 8.0  # gain above which it is no error of what else is fitted
 WELL_SEEN = 2.5  # observations of a point for each of its own numbers before a driven scene is taken for granted
 
 
@@ -35,11 +37,13 @@ def evidence(inspected: Inspection) -> Evidence:
     fades = share < vignetting.MIN_FALLOFF and gain > vignetting.EFFECT.threshold
     less = none.plus("vignetting") if fades else none
     more = less.plus("fixed_pattern")
-    size = fit.effect_size(more, less)
-    return Evidence(
-        fit.gain(more, less) if worthwhile(fit, more, less, "fixed_pattern") else 0.0,
-        f"places in the image differ by {beside(size)}" + (" beside the falloff" if fades else ""),
-    )
+    found = "places in the image differ" + (" beside the falloff" if fades else "") + " by"
+    if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
+        evidence = judged(inspected, "fixed_pattern", found, more, less)
+        if evidence.told and evidence.statistic < SURE:
+            return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")
+        return evidence
+    return Evidence(0.0, f"{found} {beside(fit.effect_size(more, less))}")
 
 
 def nodes(data: Data) -> int:

@@ -23,7 +23,9 @@ def evidence(inspected: Inspection) -> Evidence:
     """Whether each image has an offset that all its points share. Where gains change, their shift takes it."""
     both = inspected.joint is not None and {"agc", "frame_offset"} <= inspected.joint[1].names
     if both and not outdone(inspected, "agc", {"frame_offset", "tone"}):
-        return Evidence(0.0, "gains change from image to image, and their shift takes what offsets there are")
+        found = "gains change from image to image, and their shift takes what offsets there are"
+        doubt = inspected.certainty.doubts.get("agc")
+        return Evidence(None, f"{found}, if they do: {doubt}", told=False) if doubt else Evidence(0.0, found)
     return gained(inspected, "frame_offset", "images differ from each other by an offset of")
 
 
@@ -39,12 +41,15 @@ def starts(data: Data) -> Sequence[Model]:
 
 
 def in_common(fit: Fit, more: Model, less: Model) -> bool:
+    """``common_to_all``; where nothing changes there is nothing to ask."""
+    return not fit.may_change(less) or common_to_all(fit, more, less)
+
+
+def common_to_all(fit: Fit, more: Model, less: Model) -> bool:
     """Whether what the points that change most say of every image holds for those that change least, and conversely.
 
-    A sensor changes all points alike; a lamp does not. Where nothing changes there is nothing to ask.
+    A sensor changes all points alike; a lamp does not.
     """
-    if not fit.may_change(less):
-        return True
     weights, values = fit.weights, fit.data.tracks.values
     used = weights > 0
     mean = (values * used).sum(1) / used.sum(1).clamp_min(1)
@@ -78,6 +83,8 @@ EFFECT = Effect(
         settled=centred,
         kinds=lambda fit: (1,),
         numbers=lambda data, kind: data.frames - 1,
+        single_images=True,
+        told_by=(common_to_all,),
         rich=lambda data: 1,
         starts=starts,
         sensor_first=True,

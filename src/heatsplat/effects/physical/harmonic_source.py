@@ -16,7 +16,7 @@ from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import RIDGE, own_part, own_weights
 from heatsplat.effects.joint.model import Model
-from heatsplat.effects.joint.terms import OWN_HURDLE, Own
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
 from heatsplat.effects.physical import relaxation
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
@@ -123,6 +123,9 @@ EFFECT = Effect(
         numbers=lambda data, count: count * data.frames,
         rich=rich,
         unseen=relaxation.unseen,
+        rivals=(("attenuation",),),
+        # Where the weather is recorded it stands for what drives a scene (``weather_record.INSTEAD``).
+        frames=lambda data: well_seen(2 + relaxation.count(data)) if data.span_s > 0 and data.drivers is None else 0,
         beside_changes=0.15,
         rules=(relaxation.beyond_drift,),
     ),

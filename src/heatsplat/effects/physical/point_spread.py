@@ -13,7 +13,7 @@ from heatsplat.effects.inspection import Inspection
 REACH = 4  # pixels on either side of an edge within which it has to be over
 SHARPEST = 0.1  # of the strong edges, the share that is judged: others are gradients of the scene and not its edges
 CLEAR = 20.0  # an edge is strong when it is this many times the noise high
-MIN_EDGES = 30
+MIN_EDGES, MANY_EDGES = 30, 300  # of fewer than many, all may be gradients of the scene
 # The width of a step that is no wider than the pixel that collects it, and one of which the reconstruction should know.
 PIXEL_PX, WIDE_PX = 0.45, 0.75
 
@@ -29,14 +29,17 @@ def evidence(inspected: Inspection) -> Evidence:
         widths += [_widths(image, obs.noise), _widths(image.mT, obs.noise)]
     widths = torch.cat(widths)
     if len(widths) < MIN_EDGES:
-        return Evidence(None, f"only {len(widths)} edges stand out of the noise, {MIN_EDGES} are needed")
+        why = f"cannot be told: only {len(widths)} edges stand out of the noise, {MIN_EDGES} are needed"
+        return Evidence(None, why, told=False)
     sigma = float(widths.quantile(0.5 * SHARPEST))
     spread = math.sqrt(max(sigma**2 - PIXEL_PX**2, 0.0))
-    return Evidence(
-        spread / WIDE_PX,
-        f"the sharpest tenth of {len(widths)} edges has a width (standard deviation) of {sigma:.2f} pixels, "
-        f"{spread:.2f} beyond that of the pixel",
+    found = (
+        f"the sharpest tenth of {len(widths)} edges has a width (standard deviation) of {sigma:.2f} pixels, {spread:.2f} beyond "
+        "that of the pixel"
     )
+    if len(widths) < MANY_EDGES and spread > 0.5 * WIDE_PX:
+        return Evidence(spread / WIDE_PX, f"{found}: cannot be told, {MANY_EDGES} edges would tell", told=False)
+    return Evidence(spread / WIDE_PX, found)
 
 
 def _widths(image: Tensor, noise: float) -> Tensor:

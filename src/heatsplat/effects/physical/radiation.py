@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.weathered import NO_BALANCE, SIGMAS, judged
 
-BENT = 1.0  # statistic above which T⁴ shows as what it is: the bend is three times the noise
 MEAN_K = 290.0
 
 
 def evidence(inspected: Inspection) -> Evidence:
-    """Whether T⁴ departs from a straight line over the span of temperatures by more than the noise.
+    """Whether balances of heat with the sky's long waves explain images better that they were not fitted to.
 
-    For a surface at T about a mean M: the excess over the line is (T - M)² · 3 / (2 M) to second order, in kelvin.
+    Air and sun alone leave no surface colder than the air has been. How far T⁴ departs from a straight line over the span of
+    temperatures only says how to solve the balance. For a surface at T about a mean M, the excess over the line is
+    (T - M)² · 3 / (2 M) to second order, in kelvin.
     """
     obs = inspected.obs
+    found = judged(inspected.weathered, "radiation", obs.why or NO_BALANCE)
     if obs.tracks is None:
-        return Evidence(None, obs.why)
-    kept = torch.where(obs.tracks.weights > 0, obs.tracks.values, torch.nan)
-    span_k = _span(kept) * obs.unit_k
-    bend_k = 1.5 * (0.5 * span_k) ** 2 / MEAN_K
-    statistic = bend_k / (3.0 * obs.noise * obs.unit_k)
-    return Evidence(
-        statistic,
-        f"surfaces go through {span_k:.1f} K, over which T⁴ departs from a line by the worth of {bend_k:.2f} K; three times "
-        f"the noise is {3 * obs.noise * obs.unit_k:.2f} K",
-        {"solution": "corrected" if statistic > BENT else "linear"},
-    )
+        return found
+    span_k = _span(torch.where(obs.tracks.weights > 0, obs.tracks.values, torch.nan)) * obs.unit_k
+    bent = 1.5 * (0.5 * span_k) ** 2 / MEAN_K > 3.0 * obs.noise * obs.unit_k
+    # A balance that is solved about its mean alone has bodies with a core.
+    nodes = 1 if bent or inspected.weathered is None else inspected.weathered.nodes
+    return replace(found, settings={"solution": "corrected" if bent else "linear", "nodes": nodes})
 
 
 def _span(values: Tensor) -> float:
@@ -44,12 +44,11 @@ EFFECT = Effect(
     name="radiation",
     stage="state",
     place=3,
-    summary="long waves to and from the sky, beyond their linear part",
+    summary="long waves to and from the sky, as the sky sends them",
     source="ThermoGS, Eq. 5",
     needs=frozenset({"time", "thermal_range", "weather"}),
-    null="over the span of temperatures T⁴ is a straight line to within the noise",
-    # From 7.8 with it; no recording has weather without it.
-    threshold=BENT,
+    null="temperatures follow air and sun, not the sky",
+    threshold=SIGMAS,
     adds="an emissivity for each Gaussian, one driver",
     evidence=evidence,
     part=Part("state", "energy_balance", off={"sky": None}),

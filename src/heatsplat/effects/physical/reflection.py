@@ -49,6 +49,7 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=lambda data, kind: 8,
         unseen=lambda data: "the points show no surface",
+        rivals=(("view_dependence",),),
         smallest=0.2,  # misplaced points go with direction a little
         beside_changes=0.04,
     ),

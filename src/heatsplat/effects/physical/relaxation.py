@@ -13,7 +13,7 @@ from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
-from heatsplat.effects.joint.terms import OWN_HURDLE, Own
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
 
 # Mixtures of these decays, as rates times the record's length, stand for any course that relaxes: the surface of a deep
 # body does not follow one exponential. Within 0.5 % of the excess for slabs of Biot number 0 to 3.
@@ -81,5 +81,13 @@ EFFECT = Effect(
     adds="a level and a rate for each Gaussian, an exponential at each time",
     evidence=evidence,
     part=Part("state", "newton_harmonic"),
-    term=Own(basis=decays, in_time=True, kinds=kinds, rich=rich, unseen=unseen, rules=(beyond_drift,)),
+    term=Own(
+        basis=decays,
+        in_time=True,
+        kinds=kinds,
+        rich=rich,
+        unseen=unseen,
+        frames=lambda data: well_seen(1 + count(data)) if data.span_s > 0 else 0,
+        rules=(beyond_drift,),
+    ),
 )

@@ -40,7 +40,9 @@ def evidence(inspected: Inspection) -> Evidence:
     sure = (thermal != 0) & (visible != 0)
     n, apart = int(sure.sum()), int((thermal[sure] != visible[sure]).sum())
     if n < MIN_VOTES:
-        return Evidence(0.0, f"{n} points lie behind others so that both modalities could tell them apart")
+        why = f"{n} points lie behind others so that both modalities could tell them apart"
+        told = apart == 0
+        return Evidence(0.0, why if told else f"cannot be told: {why}, {MIN_VOTES} are needed", told=told)
     usual = STRAY * n
     return Evidence(
         (apart - usual) / math.sqrt(usual + 1.0),

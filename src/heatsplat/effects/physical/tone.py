@@ -12,7 +12,9 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
+from heatsplat.effects.physical import frame_offset
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -21,6 +23,11 @@ def evidence(inspected: Inspection) -> Evidence:
     A curve that never changes over a scene that never changes only renames its levels: nothing shows it, and nothing is
     lost without it. It shows where an offset moves all levels along it.
     """
+    absent = inspected.joint is not None and "tone" not in inspected.joint[1].names
+    if absent and not frame_offset.evidence(inspected).told:
+        return Evidence(
+            None, "cannot be told: nobody can tell whether offsets move the levels along a curve", told=False
+        )
     return gained(inspected, "tone", "offsets act on dark and bright parts differently by")
 
 
@@ -52,6 +59,8 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=lambda data, kind: 2,
         unseen=lambda data: "no offset moves the levels along a curve",
+        # Along a curve every offset comes with a gain: gains alone would be found first.
+        starts=lambda data: (Model.of(frame_offset=1, tone=1),),
         sensor_first=True,
         beside_changes=0.01,
     ),

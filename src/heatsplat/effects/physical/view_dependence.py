@@ -5,7 +5,7 @@ from __future__ import annotations
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.evidence import gained, outdone
-from heatsplat.effects.joint.terms import OWN_HURDLE, Own, where_moving
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen, where_moving
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -30,5 +30,9 @@ EFFECT = Effect(
     adds="harmonics for each Gaussian",
     evidence=evidence,
     part=Part("path", "view_dependence"),
-    term=Own(basis=lambda fit, kind: fit.data.tracks.directions, kinds=where_moving),
+    term=Own(
+        basis=lambda fit, kind: fit.data.tracks.directions,
+        kinds=where_moving,
+        frames=lambda data: well_seen(4),
+    ),
 )

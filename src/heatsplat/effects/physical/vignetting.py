@@ -21,6 +21,7 @@ from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, where_moving
 
 MIN_FALLOFF = -0.04  # in the corners; blur at the border of an image passes for half of that
 FINE_NODES = 9  # where the pattern is a random field, which more nodes than it needs do no harm
+UNSURE = (0.5, 3.0)  # gains between which random patterns have their own falloffs, and true ones may stay
 STRENGTHS = 12  # iterations for the strength of that field
 
 
@@ -40,7 +41,14 @@ def evidence(inspected: Inspection) -> Evidence:
     )
     if share >= MIN_FALLOFF:
         return Evidence(0.0, f"{why}, which is no falloff")
-    return Evidence(gain if worthwhile(fit, radial, none, "vignetting") else 0.0, why)
+    if not worthwhile(fit, radial, none, "vignetting"):
+        return Evidence(0.0, why)
+    worth = inspected.certainty.worth("vignetting", radial, none)
+    doubt = worth.doubt or inspected.certainty.doubts.get("vignetting", "")
+    if UNSURE[0] < gain < UNSURE[1]:
+        doubt = "a pattern of the camera may have as much of a falloff; more frames would tell"
+    told = gain <= UNSURE[0] or not doubt
+    return Evidence(gain, why if told else f"{why}: cannot be told, {doubt}", told=told, gain_db=worth.held_out.db)
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

@@ -68,6 +68,12 @@ def colours_of(moment: Moment, colormap: str | None, range_c: Sequence[float] | 
     return colours[:, 0].astype(np.float32) / 255
 
 
+def opacities_of(moment: Moment, colormap: str | None) -> Tensor:
+    """Opacities [N] that belong to the colours of ``colours_of``."""
+    own = moment.seen.colour_opacities if colormap == "rgb" and moment.seen.colours is not None else None
+    return moment.seen.opacities if own is None else own
+
+
 def checked_range(range_c: Sequence[float]) -> tuple[float, float]:
     """Two increasing numbers. Raises SceneError where they are not."""
     if len(range_c) != 2 or not range_c[0] < range_c[1]:

@@ -11,7 +11,7 @@ import numpy as np
 from heatsplat.contracts import SceneError
 from heatsplat.export.formats.base import Format, colours_of, extra_columns, optional
 from heatsplat.export.moment import Moment
-from heatsplat.export.place import place_of
+from heatsplat.export.place import AUTO, place_of
 
 LONGEST_NAME = 32  # bytes of an extra dimension's name (LAS 1.4)
 STEPS = 2**30  # of a coordinate, stored as a whole number of 32 bits
@@ -25,7 +25,7 @@ class Las(Format):
         least_opacity: Gaussians below are no surface and are left out, in [0, 1].
         colormap: colours of the points, as in ``formats.ply``.
         range_c: °C at the ends of the map; None takes the scene's range.
-        gps: table of camera positions (``export.place``), or None.
+        gps: table of camera positions, "auto" or None (``export.place``).
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Las(Format):
         least_opacity: float = 0.3,
         colormap: str = "inferno",
         range_c: Sequence[float] | None = None,
-        gps: str | None = None,
+        gps: str | None = AUTO,
     ) -> None:
         self.suffix = ".laz" if compressed else ".las"
         self.least_opacity, self.colormap, self.range_c, self.gps = least_opacity, colormap, range_c, gps

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,14 +14,19 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
-from heatsplat.export.place import Place, place_of
+from heatsplat.export.place import AUTO, Place, place_of
+from heatsplat.export.seams import comparison, mosaic, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, surface_depth
-from heatsplat.shots import sightings
+from heatsplat.geometry.looks import surface_points
+from heatsplat.io.pictures import write_png
+from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
 
 AWAY = 1000.0  # half widths of the map from which it is seen: what stands h high is displaced by h / 1000 at its edge
 LARGEST = 8192  # pixels of a side
+DEVIATION = "standard deviation"  # band of it
 MARGIN = 0.02  # of the longer side, around the scene's points
 
 
@@ -34,9 +40,12 @@ class Map(Format):
         resolution: width of a pixel in metres (units of the scene where it has no scale); None takes that of the training
             images.
         bounds: [west, south, east, north] in the map's coordinates; None takes the box of 99 % of the scene's points.
-        gps: table of camera positions (``export.place``), or None: then the map has no CRS.
+        gps: table of camera positions, "auto" or None (``export.place``); without one the map has no CRS.
         above: [x, y, z] direction in the world from which the map is seen; None finds it (``export.place``).
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
+        uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``).
+        against: such a map of another run on the same scene: a picture beside the file (.png) compares this map with it and with
+            a mosaic of the recorded images, seams and all (``export.seams``). None draws none.
     """
 
     suffix = ".tif"
@@ -45,9 +54,11 @@ class Map(Format):
         self,
         resolution: float | None = None,
         bounds: Sequence[float] | None = None,
-        gps: str | None = None,
+        gps: str | None = AUTO,
         above: Sequence[float] | None = None,
         unseen: str = "nan",
+        uncertainty: bool = False,
+        against: str | None = None,
     ) -> None:
         if resolution is not None and not resolution > 0:
             raise SceneError(f"what.resolution must be above 0, got {resolution}")
@@ -55,9 +66,11 @@ class Map(Format):
             raise SceneError(f"what.bounds must be [west, south, east, north], got {list(bounds)}")
         if unseen not in ("nan", "keep"):
             raise SceneError(f"what.unseen must be nan or keep, got '{unseen}'")
-        if above is not None and (len(above) != 3 or not any(above) or gps is not None):
+        if above is not None and (len(above) != 3 or not any(above) or gps not in (None, AUTO)):
             raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
         self.resolution, self.bounds, self.gps, self.unseen = resolution, bounds, gps, unseen
+        self.uncertainty = uncertainty
+        self.against = None if against is None else Path(against).expanduser()
         self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
 
     def write(self, moment: Moment, path: Path) -> None:
@@ -66,8 +79,9 @@ class Map(Format):
         scene = moment.module.scene
         place = place_of(scene, self.gps, self.above)
         west, north, pixel, width, height = self._grid(scene, place)
+        other = None if self.against is None else _other(rasterio, self.against)
         camera = _from_above(scene, place, west, north, pixel, width, height)
-        bands = self._bands(moment, camera)
+        depth, bands = self._bands(moment, camera)
         log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
         with rasterio.open(
             path,
@@ -86,7 +100,22 @@ class Map(Format):
             for number, (name, band) in enumerate(bands.items(), start=1):
                 file.write(band.astype(np.float32), number)
                 file.set_band_description(number, name)
-            file.update_tags(layer=moment.layer.name, lengths=place.unit, time_s=str(moment.time_s))
+            file.update_tags(
+                layer=moment.layer.name, lengths=place.unit, time_s=str(moment.time_s), method=_method(moment)
+            )
+        if other is not None:
+            own = next(iter(bands.values()))
+            name, values = other
+            if values.shape != own.shape:
+                raise SceneError(
+                    f"what.against={self.against} has {values.shape[1]} x {values.shape[0]} pixels, this map {width} x {height}: "
+                    "write both with the same what.resolution and what.bounds"
+                )
+            recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
+            names = ("images", name, _method(moment) if name != _method(moment) else f"{name}, this run")
+            maps = dict(zip(names, (recorded, values, own), strict=True))
+            spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
+            write_png(path.with_suffix(".png"), comparison(maps, owner, moment.seen.unit, spread))
 
     def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
         """West and north edge, width of a pixel, columns and rows."""
@@ -111,7 +140,8 @@ class Map(Format):
             )
         return west, north, pixel, width, height
 
-    def _bands(self, moment: Moment, camera: Camera) -> dict[str, np.ndarray]:
+    def _bands(self, moment: Moment, camera: Camera) -> tuple[Tensor, dict[str, np.ndarray]]:
+        """Depth of the surface [H, W] in the map's camera, and the bands by name."""
         seen, module = moment.seen, moment.module
         told = extra_columns(moment)
         columns = torch.stack([moment.blended, *told.values()], dim=1)
@@ -122,14 +152,32 @@ class Map(Format):
             )  # fmt: skip
         alpha = output.alpha[0, ..., None]
         means = (output.features / alpha).where(alpha >= OPEN, torch.nan)
+        depth = surface_depth(output.depth, output.alpha[0])
         if self.unseen == "nan":
             scene = module.scene
-            depth = surface_depth(output.depth, output.alpha[0])
             known = covered(camera, depth, sightings(scene, lambda frame: _depth(module, frame)))
             means = means.where(known[..., None], torch.nan)
         unit = seen.unit.replace("°", "deg ")
-        bands = {f"{moment.quantity} [{unit}]" if unit else moment.quantity: moment.of_blended(means[..., 0]).numpy()}
-        return bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
+        unit = f" [{unit}]" if unit else ""
+        bands = {f"{moment.quantity}{unit}": moment.of_blended(means[..., 0]).numpy()}
+        if self.uncertainty:
+            frame = at_time(module.scene, Frame("map", first_free_id(module.scene), camera), moment.time_s)
+            deviation = Uncertainty(module).deviation(frame)
+            bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
+        return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
+
+
+def _method(moment: Moment) -> str:
+    return str(moment.module.config.get("name") or type(moment.module.thermal).__name__)
+
+
+def _other(rasterio: Any, path: Path) -> tuple[str, np.ndarray]:
+    """The method and the first band of a map. Raises SceneError where it cannot be read."""
+    try:
+        with rasterio.open(path) as file:
+            return file.tags().get("method", path.stem), file.read(1)
+    except rasterio.errors.RasterioIOError as error:
+        raise SceneError(f"what.against={path} cannot be read: {error}") from error
 
 
 def _from_above(

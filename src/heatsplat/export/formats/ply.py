@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from heatsplat.export.formats.base import Format, colours_of, extra_columns
+from heatsplat.export.formats.base import Format, colours_of, extra_columns, opacities_of
 from heatsplat.export.moment import Moment
 from heatsplat.io.ply import write_splats
 from heatsplat.physics.units import kelvin
@@ -29,7 +29,7 @@ class Ply(Format):
 
     def write(self, moment: Moment, path: Path) -> None:
         seen = moment.seen
-        opacities = seen.colour_opacities if self.colormap == "rgb" and seen.colours is not None else seen.opacities
+        opacities = opacities_of(moment, self.colormap)
         write_splats(
             path,
             seen.means,

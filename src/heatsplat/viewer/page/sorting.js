@@ -9,7 +9,7 @@ function sortingWorker() {
       keys = new Uint32Array(depths.buffer);
       return;
     }
-    const [fx, fy, fz, offset] = data.forward;
+    const start = performance.now(), [fx, fy, fz, offset] = data.forward;
     const { near, far } = data;
     const count = depths.length;
     let seen = 0, from = new Uint32Array(count), into = new Uint32Array(count);
@@ -26,7 +26,7 @@ function sortingWorker() {
       [from, into] = [into, from];
     }
     const order = from.slice(0, seen).reverse();
-    postMessage({ order, number: data.number }, [order.buffer]);
+    postMessage({ order, milliseconds: performance.now() - start }, [order.buffer]);
   };
 }
 
@@ -36,6 +36,7 @@ class Sorter {
     this.worker = new Worker(source);
     this.worker.onmessage = ({ data }) => {
       this.busy = false;
+      this.milliseconds = data.milliseconds;  // that the last order took
       done(data.order);
       if (this.waiting) this.sort(...this.waiting);
     };

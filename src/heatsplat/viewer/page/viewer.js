@@ -20,8 +20,9 @@ class Viewer {
       return [name, { colours, texture: this.drawing.texture(gl.RGB8, 256, 1, gl.RGB, gl.UNSIGNED_BYTE, colours, true) }];
     }));
     this.cameras = this.told.cameras.map((entry) => ({ ...entry, camera: Camera.of(entry), recorded: payload.array(entry.recorded),
-      size: entry.recorded.shape, added: entry.added ? payload.array(entry.added) : null, rgb: entry.rgb ? payload.array(entry.rgb) : null,
-      step: entry.added ? entry.added.step : 0 }));
+      size: entry.recorded.shape, rgb: entry.rgb ? payload.array(entry.rgb) : null,
+      added: entry.added ? entry.added.map((part) => ({ ...part, values: payload.array(part) })) : null }));
+    this.off = new Set();  // parts of the camera's model that are switched off
     this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, at: 0,
       time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
     this.probes = [];
@@ -90,6 +91,7 @@ class Viewer {
     if (this.splats.colours) option($("other"), "visible", "visible light");
     option($("other"), "recorded", "recorded image");
     if (this.cameras.some((one) => one.added)) option($("other"), "sensor", "the model's recording");
+    for (const { name } of this.cameras[0].added || []) $("parts").append(this.partSwitch(name));
     for (const name of Object.keys(this.maps)) if (name !== DIFFERENCES) option($("map"), name, name);
     $("timeBar").hidden = !this.told.span;
     if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
@@ -111,6 +113,22 @@ class Viewer {
     const dark = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
     document.documentElement.dataset.theme = dark;
     if (innerWidth <= 760) this.fold(true);
+  }
+
+  partSwitch(name) {
+    const label = document.createElement("label"), input = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
+    input.onchange = () => {
+      this.off[input.checked ? "delete" : "add"](name);
+      this.pictureKey = null;
+      this.request();
+    };
+    label.append(input, ` ${name}`);
+    return label;
+  }
+
+  // What the parts of the camera's model that are on add at a pixel of a training camera.
+  addedAt(one, j) {
+    return one.added.reduce((sum, part) => sum + (this.off.has(part.name) ? 0 : part.values[j] * part.step), 0);
   }
 
   thumbnail(one, i) {
@@ -342,7 +360,7 @@ class Viewer {
     const [low, high] = this.told.limits, [rows, columns] = one.size;
     const content = new Float32Array(2 * rows * columns);
     for (let j = 0; j < rows * columns; j++) {
-      const value = other === "sensor" ? one.added[j] * one.step : low + one.recorded[j] / 65534 * (high - low);
+      const value = other === "sensor" ? this.addedAt(one, j) : low + one.recorded[j] / 65534 * (high - low);
       content.set([value, other === "sensor" || one.recorded[j] !== 65535 ? 1 : 0], 2 * j);
     }
     this.pictured = { content, rows, columns };
@@ -447,6 +465,7 @@ class Viewer {
     for (const input of document.querySelectorAll("input[name=move]")) input.checked = (input.value === "walk") === state.walk;
     $("how").hidden = state.other === "nothing" || state.other === "visible" || this.layer === null;
     $("otherTimeRow").hidden = state.other !== "time";
+    $("parts").hidden = state.other !== "sensor";
     const swiping = state.other !== "nothing" && this.layer !== null && !this.differing;
     $("divider").hidden = !swiping;
     $("divider").style.left = `${100 * state.split}%`;

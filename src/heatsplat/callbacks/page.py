@@ -1,0 +1,81 @@
+"""report.html: a report in Markdown as one page, with its pictures in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import re
+from pathlib import Path
+
+from markdown_it import MarkdownIt
+from PIL import Image
+
+from heatsplat.io.results import write_atomically
+
+PAGE_FILE = "report.html"
+QUALITY = 85  # of WebP, of 100, for still pictures
+FOLDED = ("The run", "Data: what was found and assumed", "What the scores mean", "Versions")
+STYLE = """
+:root { color-scheme: light dark; --paper: #fbfaf7; --ink: #23272b; --faint: #6a7178; --line: #dcd8d0; --accent: #a8470a; }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #14171a; --ink: #e6e9ec; --faint: #98a2ab; --line: #30363c; --accent: #ffa05a; }
+}
+body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 1160px; background: var(--paper); color: var(--ink);
+  font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; overflow-wrap: anywhere; }
+h1 { font-size: 1.7rem; margin: 0 0 .3rem; }
+h2, summary { font-size: 1.15rem; font-weight: 650; margin: 2.2rem 0 .6rem;
+  border-top: 1px solid var(--line); padding-top: .8rem; }
+summary { cursor: pointer; }
+nav { color: var(--faint); font-size: .9rem; }
+a { color: var(--accent); }
+img { max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
+th, td { padding: .2rem .9rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { text-align: left; color: var(--faint); font-weight: 600; }
+@media print { details { display: block; } nav { display: none; } }
+"""
+
+
+def write_page(path: Path, text: str) -> None:
+    """Writes the page of a report beside it: pictures are taken from the same folder, links stay as they are."""
+    write_atomically(path, page(text, path.parent))
+
+
+def page(text: str, folder: Path) -> str:
+    """The page of a report in Markdown whose pictures lie in ``folder``; those that do not are left out."""
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
+    body = markdown.render(text)
+    body = re.sub(r'<img src="([^"]+)" alt="([^"]*)" />', lambda found: _embedded(folder / found[1], found[2]), body)
+    body = re.sub(r"<table>.*?</table>", lambda found: f'<div class="wide">{found[0]}</div>', body, flags=re.S)
+    head, *parts = re.split(r"<h2>(.*?)</h2>", body)
+    sections, titles = [], []
+    for number, (title, content) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
+        if html.unescape(title) in FOLDED:
+            sections.append(f"<details><summary>{title}</summary>{content}</details>")
+        else:
+            sections.append(f'<section id="s{number}"><h2>{title}</h2>{content}</section>')
+            titles.append(f'<a href="#s{number}">{title}</a>')
+    name = re.search(r"<h1>(.*?)</h1>", head)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<title>{name[1] if name else "heatsplat"}</title><link rel="icon" href="data:,"><style>{STYLE}</style></head>\n'
+        f"<body>{head}<nav>{' · '.join(titles)}</nav>\n{''.join(sections)}</body></html>\n"
+    )
+
+
+def _embedded(path: Path, alternative: str) -> str:
+    """A picture with its content in it; stills as WebP, moving ones as they are."""
+    if not path.exists():
+        return ""
+    content = path.read_bytes()
+    with Image.open(io.BytesIO(content)) as picture:
+        width, height = picture.size
+        if not getattr(picture, "is_animated", False):
+            stored = io.BytesIO()
+            picture.convert("RGB").save(stored, "WEBP", quality=QUALITY, method=2)
+            content = stored.getvalue()
+    data = base64.b64encode(content).decode("ascii")
+    return f'<img src="data:image/webp;base64,{data}" alt="{alternative}" width="{width}" height="{height}">'

@@ -1,0 +1,115 @@
+"""The hottest and coldest surfaces of a scene: a table, and a picture with their numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from heatsplat.callbacks.images import scene_bounds
+from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
+from heatsplat.geometry.extremes import Surface, extremes
+from heatsplat.geometry.looks import Look
+from heatsplat.geometry.projection import to_camera, to_pixels
+from heatsplat.io.pictures import Bar, Panel, colorize, compose, lettering, write_png
+from heatsplat.io.tables import write_csv
+from heatsplat.shots import SIGHTING_SIZE, at_time
+
+SURFACES_FILE = "surfaces.csv"
+SURFACES_PICTURE = "renders/surfaces.png"
+ENLARGED = 640  # pixels of the longer side of the picture's image, about
+MARK = 8  # pixels
+
+
+class ExtremeSurfaces(pl.Callback):
+    """Writes surfaces.csv and renders/surfaces.png at the end of the test, of scenes that have temperatures.
+
+    As the model renders them, without what the camera adds, in the middle of the record. Areas are those of what training
+    views see, in square metres where the scene's scale is known.
+
+    Args:
+        views: training views from which surfaces are looked for, spread evenly.
+        share: of the area that counts as hot, and as cold.
+        count: surfaces of each kind.
+    """
+
+    def __init__(self, views: int = 12, share: float = 0.03, count: int = 4) -> None:
+        self.views, self.share, self.count = views, share, count
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        scene = module.scene
+        if scene.thermal_range is None or module.modality != "thermal":
+            return
+        frames = [middle(scene, scene.train.frames[i]) for i in evenly_spread(len(scene.train), self.views)]
+        looks = [look(module, frame) for frame in frames]
+        hot, cold = extremes(looks, self.share, self.count)
+        metres = scene.metres_per_unit
+        unit, square = ("m", metres**2) if metres else ("units", 1.0)
+        rows = [
+            {
+                "kind": kind,
+                "number": number,
+                "mean_c": round(one.mean, 3),
+                "most_c": round(one.most, 3),
+                "area": float(f"{one.area * square:.3g}"),
+                "unit": f"{unit}²" if metres else "square units",
+                **{axis: round(value, 4) for axis, value in zip("xyz", one.centre.tolist(), strict=True)},
+                "time_s": frames[0].time_s,
+            }
+            for kind, found in (("hottest", hot), ("coldest", cold))
+            for number, one in enumerate(found, start=1)
+        ]
+        if rows:
+            write_csv(module.output_dir / SURFACES_FILE, rows)
+            write_png(module.output_dir / SURFACES_PICTURE, picture(looks, hot, cold, scene))
+
+
+def middle(scene: SceneData, frame: Frame) -> Frame:
+    """A frame in the middle of the record, or as it is in scenes without time, small enough for a look."""
+    if frame.time_s is not None:
+        start, span = scene.record
+        frame = at_time(scene, frame, start + span / 2)
+    return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
+
+
+@torch.no_grad()
+def look(module: pl.LightningModule, frame: Frame) -> Look:
+    """What the model shows in a frame, without what its camera adds, °C."""
+    output = module.render(frame, depth=True)
+    values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
+    return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
+
+
+def picture(looks: list[Look], hot: list[Surface], cold: list[Surface], scene: SceneData) -> np.ndarray:
+    """The view that shows most of the surfaces, with their numbers."""
+    marked = [(f"{kind}{i}", one.centre) for kind, found in (("H", hot), ("C", cold)) for i, one in enumerate(found, 1)]
+    shown = [[(name, place) for name, point in marked if (place := _place(one, point)) is not None] for one in looks]
+    best = max(range(len(looks)), key=lambda i: len(shown[i]))
+    low, high = scene_bounds(scene, "thermal")
+    values = looks[best].values
+    factor = max(1, round(ENLARGED / max(values.shape)))
+    image = np.repeat(np.repeat(colorize(values, low, high), factor, axis=0), factor, axis=1)
+    page = Image.fromarray(image)
+    draw = ImageDraw.Draw(page)
+    for name, (column, row) in shown[best]:
+        x, y = column * factor, row * factor
+        draw.ellipse((x - MARK, y - MARK, x + MARK, y + MARK), outline="white", width=2)
+        lettering(draw, (x + MARK + 2, y), name)
+    missing = [name for name, _ in marked if name not in dict(shown[best])]
+    title = "H hottest, C coldest" + (f"; not in this view: {', '.join(missing)}" if missing else "")
+    return compose([Panel(np.asarray(page), title, Bar(low, high, "°C"))])
+
+
+def _place(one: Look, point: Tensor) -> tuple[float, float] | None:
+    """Column and row of a point of a surface in a look that sees it."""
+    local = to_camera(point[None], one.camera.viewmat.double())
+    column, row = to_pixels(local, one.camera.K.double())[0].tolist()
+    if local[0, 2] <= 0 or not (0 <= column < one.camera.width and 0 <= row < one.camera.height):
+        return None
+    there = one.depth[int(row), int(column)].item()
+    return (column, row) if abs(local[0, 2].item() - there) <= 2 * DEPTH_TOLERANCE * there else None

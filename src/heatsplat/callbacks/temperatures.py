@@ -1,0 +1,29 @@
+"""The test views as a protocol wants them handed in: one float32 TIFF in °C each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+
+from heatsplat.io.tiff import write_temperature
+
+
+class TemperatureRenders(pl.Callback):
+    """Writes every test view's render, in °C, to ``folder``/<name of the view>.tiff; nothing without a thermal range.
+
+    Args:
+        folder: in the run's folder.
+        image: "thermal" for what the camera would record, "clean" for what one without flaws would, of methods that tell it.
+    """
+
+    def __init__(self, folder: str = "submission", image: str = "thermal") -> None:
+        self.folder, self.image = folder, image
+
+    def on_test_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
+        if module.scene.thermal_range is None or module.modality != "thermal":
+            return
+        image = outputs["companions"].get(self.image, outputs["prediction"])
+        path = module.output_dir / self.folder / f"{Path(outputs['view'].frame.name).stem}.tiff"
+        write_temperature(path, module.scene.thermal_range.to_celsius(image.cpu()))

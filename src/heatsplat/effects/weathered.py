@@ -1,0 +1,200 @@
+"""What sun, sky and wind each explain of a scene under recorded weather: balances of heat fitted with and without them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Weather
+from heatsplat.effects import weather_record
+from heatsplat.effects.base import Evidence
+from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of
+from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
+
+# Standard errors from which a gain on held-out observations is no chance, and below which it is; decibels that are none.
+SIGMAS, CHANCE = 3.0, 0.5
+MIN_DB, NOTHING_DB = 0.2, 0.05
+NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
+PARTS = ("solar", "radiation", "convection")
+DEPTH = "depth"  # bodies with a core beside their surface
+RATES_PER_S = [1.0 / (60.0 * minutes) for minutes in (5, 12, 30, 75, 180, 450, 1100)]
+DEEPER = 1.0 / 8.0  # rate of a body's core beside that of its surface
+# What wind adds to the exchange at its mean, as a share of that without wind: none, and McAdams' order of magnitude.
+WINDS = (0.0, 0.5, 1.5)
+EXCHANGE_W_M2_K = 10.0  # typical; light and long waves are counted in what they add to a temperature at this exchange
+# What a body's own numbers are expected to be: its start in kelvin, and shares. Without expectations few frames would give
+# numbers that are none.
+EXPECTED = {"start": 10.0, "deep air": 0.5, "beam": 0.7, "diffuse": 0.7, "deep light": 0.5, "sky": 0.7}
+MODEL_K = 0.3  # by which a body of two rates errs itself
+
+
+def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
+    """Whether a balance of heat with one of PARTS explains observations better that it was not fitted to.
+
+    Args:
+        why: there is nothing to fit.
+    """
+    if weathered is None:
+        return Evidence(None, why, told=False)
+    gain = weathered.gain(name)
+    found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
+    sure = gain.sigmas > SIGMAS and gain.db > MIN_DB
+    if sure or gain.sigmas < CHANCE or gain.db < NOTHING_DB:
+        return Evidence(gain.sigmas if sure else min(gain.sigmas, CHANCE), found, gain_db=gain.db)
+    needed = math.ceil(gain.images * (SIGMAS / gain.sigmas) ** 2)
+    return Evidence(
+        gain.sigmas,
+        f"{found}: cannot be told from {gain.images} frames, about {needed} would tell",
+        told=False,
+        gain_db=gain.db,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Weathered:
+    """P points in F frames under a weather record.
+
+    Args:
+        weather: the record.
+        times_s: [F] of the frames.
+        values: [P, F] temperatures in °C, without what the camera adds.
+        errors, weights: [P, F] that are to be expected in kelvin, and 0 where a point is not seen.
+        normals: [P, 3] of the surface, or None.
+    """
+
+    weather: Weather
+    times_s: Tensor
+    values: Tensor
+    errors: Tensor
+    weights: Tensor
+    normals: Tensor | None
+
+    @property
+    def nodes(self) -> int:
+        """Temperatures that a body has: 2, surface and core, where that explains observations better that were left out."""
+        gain = self.gain(DEPTH)
+        return 2 if gain.sigmas > SIGMAS and gain.db > MIN_DB else 1
+
+    def gain(self, name: str) -> HeldOut:
+        """What one of the parts gains beside the others."""
+        others = tuple(part for part in self.parts if part != name)
+        return compared(self._whole, self.squares(others), self.weights)
+
+    @cached_property
+    def _whole(self) -> Tensor:
+        return self.squares(self.parts)
+
+    @cached_property
+    def parts(self) -> tuple[str, ...]:
+        """Of PARTS, those that the record knows, and DEPTH."""
+        weather = self.weather
+        known = {
+            "solar": weather.irradiance_w_m2 is not None and float(weather.irradiance_w_m2.max()) > 0,
+            "radiation": True,
+            "convection": weather.wind_m_s is not None,
+        }
+        return (*(name for name in PARTS if known[name]), DEPTH)
+
+    def squares(self, parts: tuple[str, ...]) -> Tensor:
+        """Squared errors [P, F], in squares of the expected ones, at observations that the balance with these parts was not
+        fitted to; each point has the rate that fits the others best."""
+        points, frames = self.values.shape
+        fold = fold_of(points, frames)
+        found = torch.zeros_like(self.values)
+        for k in range(FOLDS):
+            kept = self.weights * (fold != k)
+            least, squares = torch.full((points, 1), torch.inf, dtype=found.dtype), torch.zeros_like(found)
+            for winds in WINDS if "convection" in parts else WINDS[:1]:
+                each_least, each_squares, total = torch.full_like(least, torch.inf), torch.zeros_like(found), 0.0
+                for number in range(len(RATES_PER_S)):
+                    left, cost = self._fitted(winds, number, parts, kept)
+                    fit = cost[:, None]
+                    each_squares = torch.where(fit < each_least, left, each_squares)
+                    each_least = torch.minimum(fit, each_least)
+                total = float(each_least.sum())
+                if total < float(least.sum()):
+                    least, squares = each_least, each_squares
+            found = torch.where(fold == k, squares, found)
+        return found
+
+    def _fitted(self, winds: float, number: int, parts: tuple[str, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared errors [P, F] of the likeliest numbers, and how unlikely they and the observations that count are [P].
+
+        No sky warms: what would need one to is fitted without.
+        """
+        base, basis = self._responses(winds, number, parts)
+        variance = self.errors**2 + MODEL_K**2
+        values, used = self.values - base, (weights > 0) / variance
+        inner = torch.einsum("pf,pfi,pfj->pij", used, basis, basis) + torch.eye(basis.shape[2], dtype=basis.dtype)
+        numbers = torch.linalg.solve(inner, torch.einsum("pf,pfi,pf->pi", used, basis, values))
+        squares = (values - (basis @ numbers[..., None])[..., 0]) ** 2 / variance
+        cost = (squares * (weights > 0)).sum(1) + (numbers**2).sum(1)
+        if "radiation" in parts:
+            others = tuple(part for part in parts if part != "radiation")
+            without, costs = self._fitted(winds, number, others, weights)
+            cools = numbers[:, -1] > 0
+            squares, cost = torch.where(cools[:, None], squares, without), torch.where(cools, cost, costs)
+        return squares.clamp(max=WORST), cost
+
+    def _responses(self, winds: float, number: int, parts: tuple[str, ...]) -> tuple[Tensor, Tensor]:
+        """What the air makes of a body of a rate [F], and what its own numbers multiply [P, F, k]."""
+        courses = self._courses[winds, number]
+        names = ["start"]
+        names += ["beam", "diffuse"] if "solar" in parts else []
+        names += ["deep air"] if DEPTH in parts else []
+        names += ["deep light"] if DEPTH in parts and "solar" in parts else []
+        names += ["sky"] if "radiation" in parts else []
+        basis = [(EXPECTED[name] * courses[name]).expand(len(self.values), -1) for name in names]
+        return courses["air"], torch.stack(basis, 2)
+
+    @cached_property
+    def _courses(self) -> dict[tuple[float, int], dict[str, Tensor]]:
+        """Answers to air, light and sky at the frames' times by wind and rate, each [F] or [P, F]."""
+        weather = self.weather
+        zero = torch.zeros_like(weather.times_s)
+        wind = zero + 1.0 if weather.wind_m_s is None else weather.wind_m_s / weather.wind_m_s.mean().clamp_min(0.1)
+        light = zero if weather.irradiance_w_m2 is None else weather.irradiance_w_m2
+        air_k = kelvin(weather.air_c)
+        law = "swinbank" if weather.humidity_percent is None else "brutsaert"
+        sky_k = sky_temperature_k(air_k, weather.humidity_percent, law)
+        net = STEFAN_BOLTZMANN * (sky_k**4 - air_k**4)
+        beam, diffuse = light[:, None], zero
+        if self.normals is not None and weather.direct_w_m2 is not None and weather.sun is not None:
+            beam = weather.direct_w_m2[:, None] * (weather.sun @ self.normals.T).clamp_min(0.0)
+            diffuse = zero if weather.diffuse_w_m2 is None else weather.diffuse_w_m2
+        power = torch.cat([net[:, None], diffuse[:, None], light[:, None], beam], 1) / EXCHANGE_W_M2_K
+        drivers = torch.cat([weather.air_c[:, None], power], 1)
+        courses = {}
+        for winds in WINDS:
+            exchange = (1.0 + winds * wind) / (1.0 + winds)
+            # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
+            gains = torch.cat([exchange[:, None], torch.ones_like(drivers[:, 1:])], 1)
+            for number, rate in enumerate(RATES_PER_S):
+                near, start = self._answers(drivers, gains, rate * exchange, rate)
+                deep, _ = self._answers(drivers, gains, DEEPER * rate * exchange, DEEPER * rate)
+                courses[winds, number] = {
+                    "air": near[:, 0], "sky": near[:, 1], "diffuse": near[:, 2], "beam": near[:, 4:].T, "start": start,
+                    "deep air": deep[:, 0] - near[:, 0], "deep light": deep[:, 3],
+                }  # fmt: skip
+        return courses
+
+    def _answers(self, drivers: Tensor, gains: Tensor, rates: Tensor, rate: float) -> tuple[Tensor, Tensor]:
+        """u' = rate · gain · driver - rates · u at the frames' times [F, d], from rest; and the decay [F] from 1."""
+        steps = self.weather.times_s.diff()
+        keep = torch.exp(-0.5 * (rates[1:] + rates[:-1]) * steps)
+        taken = 0.5 * rate * (gains[1:] * drivers[1:] + gains[:-1] * drivers[:-1])
+        over = (1.0 - keep) / (0.5 * (rates[1:] + rates[:-1]))
+        states, start = [gains[0] * drivers[0] * rate / rates[0]], [torch.ones((), dtype=rates.dtype)]
+        for i in range(len(steps)):
+            states.append(keep[i] * states[-1] + over[i] * taken[i])
+            start.append(keep[i] * start[-1])
+        weather, times = self.weather, self.times_s
+        return (
+            weather_record.at(weather, torch.stack(states), times),
+            weather_record.at(weather, torch.stack(start), times),
+        )

@@ -1,0 +1,195 @@
+"""The heat balance as it stands, with T⁴ and gusts of wind, marched along the record for many moments at once.
+
+``Climate`` in heatsplat.physics.energy_balance says what the symbols mean; the kernel is in heatsplat.kernels.heat_balance. A
+march passes the whole record whatever is asked of it, so that it is worth keeping. Who learns keeps temperatures and their
+derivatives at the moments of all training frames (``Kept``): as long as parameters stay near those that were marched,
+a temperature is a sum of few products. Who looks keeps the state at samples of the record (``Course``): the next frame goes
+on from the sample before it.
+
+**Error:** 0.2 mK against a stiff solver at the parameters that were marched, from sheet metal to wet ground under weather
+every ten minutes. Between marches it is of second order in the change of parameters, 1.7 mK (root mean square) at 2 % of all
+of them and 10 mK at 5 %; ``Kept`` marches anew what has moved by more than CHANGE.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from heatsplat.kernels import heat_balance as kernels
+
+if TYPE_CHECKING:
+    from heatsplat.physics.energy_balance import Climate, Surface
+
+CHANGE = 0.05  # of a parameter, in its unit below, at which a surface is marched anew
+UNITS = {"start": 40.0, "log_rate": 1.0, "share": 0.5, "sun": 40.0, "wind": 0.5}  # K, 1, 1, K m²/kW, 1
+KEPT_BYTES = 4 << 30  # of tables of all moments; what needs more is marched for every view
+COURSE_BYTES = 256 << 20  # of states at samples; what needs more keeps only some of the samples
+
+
+def learned(surface: Surface) -> Tensor:
+    """The parameters that the kernel knows derivatives by, [n, Q]; those of effects that are off have no column.
+
+    Raises:
+        ValueError: the bodies have two nodes or heat from within, which only ``Climate.linear_temperature`` knows.
+    """
+    if surface.core is not None or surface.inner is not None:
+        raise ValueError(
+            "bodies of two nodes or heated from within are solved about a mean only: use linear_temperature"
+        )
+    columns = [getattr(surface, name) for name in UNITS]
+    return torch.stack([column for column in columns if column is not None], dim=1)
+
+
+def constants(surface: Surface, climate: Climate) -> Tensor | None:
+    """What else it knows of surfaces, [n, 4]: normals, and their share of the sky; None where all lie level."""
+    if surface.normals is None:
+        return None
+    return torch.cat((surface.normals, climate.share_of_sky(surface.normals)[:, None]), dim=1).detach()
+
+
+def march(
+    climate: Climate,
+    surface: Surface,
+    moments: Tensor,
+    sensitive: bool = True,
+    first: int = 0,
+    into: tuple[Tensor, Tensor] | None = None,
+) -> Tensor:
+    """Temperatures x of n surfaces at moments [F] of the record, with their derivatives by ``learned`` behind: [F, n, 1 + Q].
+
+    Args:
+        moments: [F] float64, increasing.
+        sensitive: with derivatives; otherwise [F, n, 1].
+        first: sample of the record at which surfaces have their ``start``.
+        into: a table [F, N, ...] and the rows [n] of it that are filled in place of a new one.
+    """
+    given, rest = learned(surface).detach(), constants(surface, climate)
+    order = given[:, kernels.LOG_RATE].argsort()  # neighbours take as many substeps
+    parameters = given if rest is None else torch.cat((given, rest.to(given)), dim=1)
+    width = 1 + given.shape[1] if sensitive else 1
+    table, rows = into if into is not None else (given.new_empty(len(moments), len(given), width), None)
+    own = rows[order] if rows is not None else order
+    here = table if table.device.type == "cpu" else table.new_empty(len(moments), len(given), width, device="cpu")
+    numbered = own if here is table else torch.arange(len(own))
+    if len(own):
+        has = [value is not None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
+        kernels.march(
+            kernels.Balance(*has, sensitive),
+            first,
+            parameters[order].cpu().contiguous().numpy(),
+            numbered.cpu().numpy(),
+            climate.drivers.times_s.numpy(),
+            climate.rows.numpy(),
+            climate.drivers.reference_k,
+            moments.numpy(),
+            here.numpy(),
+        )
+    if here is not table:
+        table[:, own] = here.to(table.device)
+    return table
+
+
+def temperature(climate: Climate, surface: Surface, time_s: float) -> Tensor:
+    """Temperature x at a moment of the record, [n]; differentiable but by normals, which images decide."""
+    found = march(climate, surface, torch.tensor([time_s], dtype=torch.float64))[0]
+    return _first_order(found, learned(surface), learned(surface).detach())
+
+
+def _first_order(found: Tensor, now: Tensor, then: Tensor) -> Tensor:
+    """Temperatures [n] at parameters ``now`` from those marched at ``then``, both [n, Q], found [n, 1 + Q]."""
+    return found[:, 0] + (found[:, 1:] * (now - then)).sum(1)
+
+
+class Kept:
+    """Temperatures of all N surfaces at the moments that training asks for, with their derivatives.
+
+    A surface is marched when it is first asked for and whenever a parameter has moved since by more than CHANGE. At which
+    parameters is told by ``marched_at``, which belongs to the Gaussians: a run that goes on from a checkpoint marches at the same
+    parameters and finds the same bits, and what a split makes of one inherits them.
+    """
+
+    def __init__(self, climate: Climate, moments_s: Tensor) -> None:
+        self.climate, self.moments_s = climate, moments_s
+        self._places = {time: number for number, time in enumerate(moments_s.tolist())}
+        self._marched_at: Tensor | None = None
+        self._normals: Tensor | None = None
+        self._known: Tensor | None = None
+        self._table: Tensor | None = None
+
+    def has(self, time_s: float, marched_at: Tensor) -> bool:
+        """Whether a moment is one of those kept, and all of them fit in memory."""
+        count, columns = marched_at.shape
+        size = len(self.moments_s) * count * (1 + columns) * marched_at.element_size()
+        return time_s in self._places and size <= KEPT_BYTES
+
+    @torch.no_grad()
+    def _refresh(self, surface: Surface, now: Tensor, ids: Tensor, normals: Tensor | None, marched_at: Tensor) -> None:
+        """Marches those of ``ids`` that have moved, or that came or were turned since."""
+        same = self._marched_at is not None and torch.equal(self._marched_at, marched_at)
+        if not same or (normals is not None and not torch.equal(self._normals, normals)):
+            if self._table is None or self._table.shape[1] != len(marched_at):
+                self._table = now.new_empty(len(self.moments_s), len(marched_at), 1 + now.shape[1])
+            self._known = torch.zeros(len(marched_at), dtype=torch.bool, device=now.device)
+            self._marched_at = marched_at.detach().clone()
+            self._normals = None if normals is None else normals.detach().clone()
+        unit = now.new_tensor([UNITS[name] for name in UNITS if getattr(surface, name) is not None])
+        moved = ((now - self._marched_at[ids]).abs() > CHANGE * unit).any(1)
+        for place in (marched_at, self._marched_at):
+            place[ids[moved]] = now[moved]
+        stale = (moved | ~self._known[ids]).nonzero()[:, 0]
+        if len(stale):
+            rows = ids[stale]
+            names = [name for name in UNITS if getattr(surface, name) is not None]
+            columns = dict(zip(names, self._marched_at[rows].unbind(1), strict=True))
+            turned = None if surface.normals is None else surface.normals[stale]
+            march(self.climate, surface._replace(**columns, normals=turned), self.moments_s, into=(self._table, rows))
+            self._known[rows] = True
+
+    def temperature(
+        self, surface: Surface, time_s: float, ids: Tensor, normals: Tensor | None, marched_at: Tensor
+    ) -> Tensor:
+        """Temperature x [n] of the surfaces ``ids`` [n] of N at one of the moments; differentiable but by normals.
+
+        Args:
+            surface: of those ids.
+            normals: [N, 3] of all, or None.
+            marched_at: [N, Q] parameters at which each was marched last, which this keeps up to date.
+        """
+        now = learned(surface)
+        self._refresh(surface, now.detach(), ids, normals, marched_at)
+        found = self._table[self._places[time_s]].index_select(0, ids)
+        return _first_order(found, now, self._marched_at.index_select(0, ids))
+
+
+class Course:
+    """The course of N surfaces at fixed parameters, marched as far as it was asked for.
+
+    Args:
+        climate: the record.
+        surface: of all N, whose tensors nobody changes.
+    """
+
+    def __init__(self, climate: Climate, surface: Surface) -> None:
+        self.climate, self.surface = climate, surface
+        samples = len(climate.drivers.times_s) * surface.start.nbytes
+        self._every = math.ceil(samples / COURSE_BYTES)
+        self._states = [surface.start]
+
+    def temperature(self, time_s: float, ids: Tensor | None = None) -> Tensor:
+        """Temperature x at a moment of the record, of all or of the surfaces ``ids``."""
+        times = self.climate.drivers.times_s
+        sample = int(torch.searchsorted(times, time_s, right=True).clamp(1, len(times) - 1)) - 1
+        wanted, last = sample // self._every, len(self._states) - 1
+        if wanted > last:
+            begins = self.surface._replace(start=self._states[last])
+            moments = times[last * self._every :: self._every][1 : wanted - last + 1]
+            self._states += list(march(self.climate, begins, moments, False, last * self._every)[..., 0])
+        now = self.surface._replace(start=self._states[wanted])
+        if ids is not None:
+            now = now._make(None if value is None else value.index_select(0, ids) for value in now)
+        moment = torch.tensor([time_s], dtype=torch.float64)
+        return march(self.climate, now, moment, False, wanted * self._every)[0, :, 0]

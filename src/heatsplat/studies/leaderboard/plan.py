@@ -1,0 +1,126 @@
+"""Which runs fill the leaderboard: methods x scenes x tracks x seeds of a protocol, and which combinations it leaves out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from heatsplat.contracts import SceneError
+from heatsplat.studies.score import META, SCENES, scenes_in
+
+
+@dataclass(frozen=True)
+class Board:
+    """What is asked for.
+
+    Args:
+        protocol: conf/protocol.
+        root: folder of its scenes/ and truth/.
+        methods, scenes, tracks, seeds: names, in the order of the table.
+        clock: the cost that counts as seconds, of ``metrics.json``.
+        submissions: folders of renders of other code, scored beside.
+        document, page: where the table and the page go besides the folder of the sweep; None for nowhere.
+        train: False to write what is there and run nothing.
+        note: on the conditions of the runs, for the table and the page.
+    """
+
+    protocol: Mapping[str, Any]
+    root: Path
+    methods: Sequence[str]
+    scenes: Sequence[str]
+    tracks: Sequence[str]
+    seeds: Sequence[int]
+    clock: str = "train_seconds"
+    submissions: Sequence[Path] = ()
+    document: Path | None = None
+    page: Path | None = None
+    train: bool = True
+    note: str = ""
+
+    @property
+    def sizes(self) -> list[str]:
+        """Sizes of the scenes, as they were written."""
+        metas = (json.loads((self.root / SCENES / name / META).read_text(encoding="utf-8")) for name in self.scenes)
+        return list(dict.fromkeys(str(meta.get("size") or "as recorded") for meta in metas))
+
+    def left_out(self, method: str, scene: str) -> str | None:
+        """Why the protocol does not run a method on a scene; None where it does."""
+        only = (self.protocol.get("only") or {}).get(method)
+        return None if only is None or scene in only["scenes"] else only["why"]
+
+    def jobs(self, given: Sequence[str] = ()) -> list[list[str]]:
+        """Overrides of every run, those of the command line first; all methods and scenes with one seed before the next."""
+        if not self.train:
+            return []
+        own, of_scene = self.protocol.get("overrides") or {}, self.protocol["scenes"]
+        return [
+            [
+                f"method={method}",
+                "data=benchmark",
+                f"data.root={self.root}",
+                f"data.scene={scene}",
+                f"seed={seed}",
+                *self.protocol["tracks"][track],
+                *own.get(method, ()),
+                f"callbacks.temperatures.image={of_scene.get(scene, {}).get('hand_in', 'thermal')}",
+                f"leaderboard.track={track}",
+                f"row='{method}'",
+                *given,
+            ]
+            for seed in self.seeds
+            for track in self.tracks
+            for method in self.methods
+            for scene in self.scenes
+            if self.left_out(method, scene) is None
+        ]
+
+    def summary(self) -> str:
+        """A sentence on what will run."""
+        what = f"{len(self.methods)} methods x {len(self.scenes)} scenes x {len(self.tracks)} tracks x {len(self.seeds)} seeds"
+        return f"{what}: {len(self.jobs())} runs; scenes in {self.root}"
+
+
+def board_of(asked: Mapping[str, Any], known: Iterable[str]) -> Board:
+    """The board that a configuration asks for (conf/experiment/leaderboard.yaml).
+
+    Args:
+        asked: its section "leaderboard".
+        known: options of conf/method.
+
+    Raises:
+        SceneError: no folder of scenes, or names that there are not.
+    """
+    protocol = asked["protocol"]
+    if asked["root"] is None:
+        raise SceneError(
+            "give the folder of the protocol's scenes: leaderboard.root=FOLDER; python src/study.py study=scenes "
+            "study.target=FOLDER writes them (docs/protocol.md)"
+        )
+    root = Path(asked["root"]).expanduser().absolute()
+    there, known = scenes_in(root), sorted(known)
+    ordered = [name for name in protocol["scenes"] if name in there]
+    choices = {
+        "methods": known,
+        "scenes": [*ordered, *(name for name in there if name not in ordered)],
+        "tracks": list(protocol["tracks"]),
+    }
+    chosen = {
+        key: list(asked[key] or (protocol.get(key) if key == "methods" else None) or choices[key]) for key in choices
+    }
+    for key, names in chosen.items():
+        if unknown := [name for name in names if name not in choices[key]]:
+            raise SceneError(
+                f"leaderboard.{key}: there is no {', '.join(unknown)}; there are {', '.join(choices[key])}"
+            )
+
+    def path(text: str | None) -> Path | None:
+        return None if text is None else Path(text).expanduser()
+
+    return Board(
+        protocol, root, **chosen, seeds=list(asked["seeds"] or protocol["seeds"]), clock=asked["clock"],
+        submissions=[Path(text).expanduser() for text in asked["submissions"]],
+        document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
+    )  # fmt: skip

@@ -1,0 +1,219 @@
+"""What the runs of a leaderboard and the submissions of others came to, and their ranks, with ties."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import METRICS_FILE, write_atomically
+from heatsplat.metrics import DEFINITIONS
+from heatsplat.studies.finished import reason_of
+from heatsplat.studies.leaderboard.plan import Board
+from heatsplat.studies.recorded import OVERRIDES, overrides_of
+from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene, score_submission
+
+log = logging.getLogger("heatsplat")
+
+SCORE_FILE, SUBMISSION = "score.json", "submission"
+WIDTH = 2.0  # standard errors of a difference below which two methods are tied
+
+
+@dataclass
+class Entry:
+    """A method on a scene in a track: the runs of its seeds.
+
+    Args:
+        method, scene, track: what it is.
+        scores: a score for each seed that has results.
+        costs: seconds, memory_mb, gaussians and steps of each, where known.
+        folders: where each lies.
+        commands: what each was run with.
+        reason: why there are none.
+        rank: best and worst rank that the seeds allow, in its scene and track; None without results.
+    """
+
+    method: str
+    scene: str
+    track: str
+    scores: list[SceneScore] = field(default_factory=list)
+    costs: list[dict[str, float]] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    commands: list[list[str]] = field(default_factory=list)
+    reason: str = "not run yet"
+    rank: tuple[int, int] | None = None
+
+    def values(self, score: str, part: str | None = None) -> list[float]:
+        """A score of each seed; all views, or those of a part."""
+        found = (one.mean(score, part) for one in self.scores)
+        return [value for value in found if value is not None and math.isfinite(value)]
+
+    def mean(self, score: str, part: str | None = None) -> float | None:
+        """Mean over the seeds."""
+        values = self.values(score, part)
+        return statistics.fmean(values) if values else None
+
+    def cost(self, name: str) -> float | None:
+        """Mean of a cost over the seeds that tell it."""
+        values = [cost[name] for cost in self.costs if cost.get(name) is not None]
+        return statistics.fmean(values) if values else None
+
+
+def standings(folder: Path, board: Board) -> list[Entry]:
+    """All entries of a board, in the order of its scenes and methods, submissions last; ranked within scene and track."""
+    places = {(run.method, run.scene, run.track): run for run in _entries(board)}
+    for path in sorted(folder.glob(f"*/{OVERRIDES}")):
+        _add_run(places, path.parents[1], board)
+    for submission in board.submissions:
+        told, scored = score_submission(submission, board.root, board.protocol["scores"])
+        for scene, score in scored.items():
+            key = (told["method"], scene, told.get("track", board.tracks[0]))
+            entry = places.setdefault(key, Entry(*key))
+            entry.scores.append(score)
+            entry.costs.append(dict(score.cost))
+            entry.folders.append(submission)
+            entry.commands.append([str(told.get("code", "a submission"))])
+    entries = list(places.values())
+    first = board.protocol["scores"][0]
+    higher = DEFINITIONS[first].better == "higher"
+    usual = usual_spread([entry.values(first) for entry in entries])
+    for scene in dict.fromkeys(entry.scene for entry in entries):
+        for track in board.tracks:
+            ranked = [one for one in entries if (one.scene, one.track) == (scene, track) and one.values(first)]
+            for entry, rank in zip(ranked, ranks([one.values(first) for one in ranked], usual, higher), strict=True):
+                entry.rank = rank
+    return entries
+
+
+def _entries(board: Board) -> list[Entry]:
+    return [
+        Entry(method, scene, track, reason=board.left_out(method, scene) or "not run yet")
+        for track in board.tracks
+        for scene in board.scenes
+        for method in board.methods
+    ]
+
+
+def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: Board) -> None:
+    """Adds what is in the folder of a run to its entry; runs of what the board does not ask for are passed over."""
+    overrides = overrides_of(folder)
+    key = (overrides.get("method", ""), overrides.get("data.scene", ""), overrides.get("leaderboard.track", ""))
+    entry = places.get(key)
+    if entry is None or int(overrides.get("seed", 0)) not in board.seeds:
+        return
+    if not (folder / METRICS_FILE).exists():
+        entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
+        return
+    try:
+        score = scored_once(folder, entry.scene, board)
+    except SceneError as error:
+        entry.reason = str(error)
+        return
+    results = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
+    cost = results["cost"]
+    told = {
+        "seconds": cost.get(board.clock),
+        "memory_mb": cost.get("peak_memory_mb"),
+        "gaussians": cost.get("gaussians"),
+    }
+    entry.scores.append(score)
+    entry.costs.append({**told, "steps": results["run"].get("steps")})
+    entry.folders.append(folder)
+    entry.commands.append(
+        [f"{name}={value}" for name, value in overrides.items() if name not in ("row", "leaderboard.root")]
+    )
+
+
+def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
+    """The score of the renders of a run, which is written beside them and taken from there the next time."""
+    path, metrics = folder / SCORE_FILE, folder / METRICS_FILE
+    names = list(board.protocol["scores"])
+    if path.exists() and path.stat().st_mtime >= metrics.stat().st_mtime:
+        known = json.loads(path.read_text(encoding="utf-8"))
+        if known["scores"] == names:
+            return SceneScore(known["views"])
+    score = score_scene(folder / SUBMISSION, board.root / SCENES / scene, board.root / TRUTH / scene, names)
+    write_atomically(path, json.dumps({"scores": names, "views": score.views}))
+    return score
+
+
+# Ranks ---------------------------------------------------------------------------------------------------------------
+
+
+def usual_spread(values: Sequence[Sequence[float]]) -> float | None:
+    """Standard deviation over seeds as a share of the mean: root mean square over all that have several; None for none."""
+    shares = [
+        statistics.stdev(own) / statistics.fmean(own) for own in values if len(own) > 1 and statistics.fmean(own) > 0
+    ]
+    return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
+
+
+def spread_of(entries: Sequence[Entry], board: Board) -> str:
+    """A sentence on what is taken for the spread of what ran with one seed."""
+    values = [entry.values(board.protocol["scores"][0]) for entry in entries]
+    if not any(len(own) == 1 for own in values):
+        return ""
+    usual = usual_spread(values)
+    if usual is None:
+        return "All ran with one seed, which tells no spread: ranks are those of the bare numbers."
+    return f"What ran with one seed is taken to spread by {100 * usual:.1f} %, as the others do."
+
+
+def ranks(values: Sequence[Sequence[float]], usual: float | None, higher: bool = False) -> list[tuple[int, int]]:
+    """Best and worst rank of each: those that are not told apart from it by the seeds may stand before or behind it.
+
+    Two are told apart where their means differ by more than two standard errors of the difference. What ran with one seed is
+    taken to spread by ``usual`` of its mean, all by 0 where nothing is known of the spread.
+
+    Args:
+        values: a score of each seed, for each method.
+        usual: of ``usual_spread``.
+        higher: whether more is better.
+    """
+    means = [statistics.fmean(own) for own in values]
+    errors = [
+        (statistics.stdev(own) if len(own) > 1 else (usual or 0.0) * abs(mean)) / math.sqrt(len(own))
+        for own, mean in zip(values, means, strict=True)
+    ]
+    found = []
+    for i, mean in enumerate(means):
+        apart = [
+            (other - mean) * (-1 if higher else 1)
+            for j, other in enumerate(means)
+            if j != i and abs(other - mean) > WIDTH * math.hypot(errors[i], errors[j])
+        ]
+        better, worse = sum(gap < 0 for gap in apart), sum(gap > 0 for gap in apart)
+        found.append((1 + better, len(means) - worse))
+    return found
+
+
+def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, str], tuple[float, int]]:
+    """(method, track) -> geometric mean of its error as a multiple of the reference's, over the scenes that both ran on, and
+    their number; a method without such a scene is left out."""
+    score, reference = board.protocol["scores"][0], board.protocol["reference"]
+    logs: dict[tuple[str, str], list[float]] = {}
+    for scene, track in dict.fromkeys((entry.scene, entry.track) for entry in entries):
+        own = {e.method: e.mean(score) for e in entries if (e.scene, e.track) == (scene, track) and e.mean(score)}
+        for method, value in own.items():
+            if reference in own:
+                logs.setdefault((method, track), []).append(math.log(value / own[reference]))
+    return {key: (math.exp(statistics.fmean(found)), len(found)) for key, found in logs.items()}
+
+
+def summary(entries: Sequence[Entry], board: Board) -> dict[str, Any]:
+    """What the whole table cost and how much of it there is."""
+    seconds = [cost["seconds"] for entry in entries for cost in entry.costs if cost.get("seconds") is not None]
+    return {
+        "runs": sum(len(entry.scores) for entry in entries),
+        "filled": sum(bool(entry.scores) for entry in entries),
+        "entries": len(entries),
+        "hours": sum(seconds) / 3600.0,
+        "clock": board.clock,
+    }

@@ -1,0 +1,312 @@
+"""How far the temperature of a pixel is likely off, for any trained scene: from what training views saw of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Frame, SceneError, View, ViewSet
+from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.physics.noise import noise_of_views
+from heatsplat.shots import at_time, sightings
+from heatsplat.thermal.base import Query
+
+log = logging.getLogger("heatsplat")
+
+WITHIN = 0.6827  # share of a normal distribution within one standard deviation
+PIXELS = 40_000  # that calibrate: so many tell five numbers
+ROUNDS = 60  # of the optimiser that finds them
+LEAST = 1e-12  # image units²: of what is divided by, or whose logarithm is taken
+# Times the variance of the camera's noise is that with which a pixel tells a temperature: neighbouring pixels err together.
+STRETCHES = tuple(10.0**power for power in range(7))
+
+
+GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")  # tensors of Gaussians that heat is not told by
+MOST_NUMBERS = 64  # of each Gaussian, of which intervals are made: their matrices have its square
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What views say of each Gaussian, [N] float64 each.
+
+    Args:
+        weight: Σ_p w_ip α_p over their pixels, with blending weights w and opacity α = Σ_i w_i: the row sums of the normal
+            matrix WᵀW of temperatures, which bound that matrix from above and are exact for what neighbours have in common
+            (separable surrogates; Erdogan and Fessler, Phys. Med. Biol. 44, 1999).
+        misfit: mean of the squared residual over these pixels, in image units².
+    """
+
+    weight: Tensor
+    misfit: Tensor
+
+
+def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
+    """Σ_p w_ip α_p m_p [N, M] of maps m [H, W, M] over the pixels of a view that count; maps of 1 are weights."""
+    with torch.enable_grad():  # what pixels gather from Gaussians, the gradient gives back to them
+        values = torch.zeros(len(module.splats), maps.shape[-1], device=module.device, requires_grad=True)
+        seen = module.composited(view.frame, values)
+        maps = seen.alpha[0].detach()[..., None] * maps
+        counted = maps.isfinite() if view.mask is None else maps.isfinite() & view.mask[..., None]
+        (found,) = torch.autograd.grad((seen.features * maps.where(counted, 0.0)).sum(), values)
+    return found.cpu().double().clamp(min=0.0)
+
+
+@torch.no_grad()
+def evidence(module: Any, views: Iterable[View]) -> Evidence:
+    """What some views say of the Gaussians of a training module: two renderings and one backward pass for each."""
+    sums = torch.zeros(len(module.splats), 2, dtype=torch.float64)
+    for view in views:
+        view = view.to(module.device)
+        squares = (module.predict(view.frame) - view.image(module.modality)).square().mean(-1)
+        sums += _gathered(module, view, torch.stack([squares * 0.0 + 1.0, squares], dim=-1))
+    weight, misfit = sums.unbind(1)
+    return Evidence(weight, misfit / weight.clamp(min=LEAST))
+
+
+class Uncertainty:
+    """Standard deviations of the temperature that a trained scene shows.
+
+    A pixel is uncertain by the sum of some variances:
+
+    * the temperatures of its Gaussians, each known as well as ``Evidence.weight`` tells it for some noise of a pixel, on a
+      prior as wide as the scene's values: all that is known of those that no view saw. Gaussians of a pixel are taken to
+      err together, which is exact for one, and about √K times too much for K of them;
+    * a floor;
+    * the misfit that training left at them;
+    * position: the gradient of the image times one length in the world;
+    * where there are times, the moment: how much changes in half of the time between two training images.
+
+    That noise, and how much each of the others counts, is found on images that training did not see (``SceneData.val``:
+    what was recorded, not the truth), by maximum likelihood of Laplace's distribution, which forgives outliers. One factor
+    then makes the interval hold 68 % of their pixels beyond the noise of the camera. What no training view has seen has the
+    whole prior on top.
+
+    **Convention:** °C; image values where the scene has no thermal range. It is the error of what the surfaces send, without
+    the noise of an image that is taken of them.
+
+    Args:
+        module: a trained module with its scene.
+
+    Raises:
+        SceneError: the scene has no training view.
+    """
+
+    def __init__(self, module: Any) -> None:
+        scene = module.scene
+        if not len(scene.train):
+            raise SceneError(f"scene '{scene.name}' has no training views, which tell how certain it is")
+        self.module = module
+        self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
+        self.noise = noise_of_views(scene.train, module.modality)
+        self.prior = float(torch.cat([view.image(module.modality).flatten()[::7] for view in scene.train]).std())
+        self.evidence = evidence(module, scene.train)
+        self.held_out = scene.val if len(scene.val) else scene.train
+        if not len(scene.val):
+            log.warning(
+                "scene '%s' holds no images out: intervals are fitted to images that training saw, and are too narrow",
+                scene.name,
+            )
+        found = self._parts(self.held_out, STRETCHES)
+        losses = [_shares(_only(torch.cat(found), i), self.noise)[1] for i in range(len(STRETCHES))]
+        best = losses.index(min(losses))
+        self.stretch = STRETCHES[best]
+        self._held_out_parts = [_only(part, best) for part in found]
+        self.calibrate()
+
+    def calibrate(self, without: Collection[str] = ()) -> None:
+        """Finds how much each variance counts, ``without`` some of the held-out frames (names), to be judged by them."""
+        frames = self.held_out.frames
+        used = [part for frame, part in zip(frames, self._held_out_parts, strict=True) if frame.name not in without]
+        self.shares = _calibrated(used, self.noise)
+
+    def deviation(self, frame: Frame) -> Tensor:
+        """Standard deviation [H, W] of the temperature in each pixel of a frame."""
+        variance = self._variances(frame, (self.stretch,)) @ self.shares
+        unseen = ~covered(frame.camera, self._depth(frame), self._sightings)
+        return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
+
+    def of_gaussians(self) -> Tensor:
+        """Standard deviation [N] of the temperature of each Gaussian, as far as it is a matter of who saw it."""
+        return self._known(self.stretch).sqrt().mul(self.unit).float()
+
+    def of_attributes(self, frame: Frame) -> dict[str, Tensor]:
+        """Standard deviations [N] of what the thermal model tells of every Gaussian at the time of a frame, by name.
+
+        By the delta method: the numbers that a Gaussian has for its heat are as uncertain as the views that saw it leave them
+        (Gauss-Newton, a block for each Gaussian), with their spread over the scene as the prior. Each view tells a
+        temperature as well as noise and misfit allow; what all views have in common, such as a wrong emissivity or air
+        temperature, is not in it. Empty for models that tell nothing.
+
+        Raises:
+            SceneError: Gaussians have more numbers than such a block can hold, or not all the same.
+        """
+        module = self.module
+        told = module.attributes(frame)
+        if not told:
+            return {}
+        trained = [name for name in module.splats.names if name not in (*GEOMETRY, *module.constants)]
+        tensors = [module.splats[name] for name in trained]
+        numbers = sum(tensor[0].numel() for tensor in tensors)
+        if numbers > MOST_NUMBERS or any(len(tensor) != len(module.splats) for tensor in tensors):
+            raise SceneError(
+                f"{type(module.thermal).__name__} has {numbers} numbers for each Gaussian, or not the same for all: intervals "
+                f"of what it learned are made of {MOST_NUMBERS} at most, the same for all"
+            )
+
+        def slopes(values: Tensor) -> Tensor:
+            """Derivatives [N, K] of values [N] by the numbers of each."""
+            if not values.requires_grad:
+                return torch.zeros(len(values), numbers, dtype=torch.float64)
+            found = torch.autograd.grad(values.sum(), tensors, allow_unused=True)
+            rows = (torch.zeros_like(t) if g is None else g for t, g in zip(tensors, found, strict=True))
+            return torch.cat([row.flatten(1) for row in rows], dim=1).cpu().double()
+
+        spread = torch.cat([tensor.detach().flatten(1) for tensor in tensors], dim=1).cpu().double().var(0)
+        precision = torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(module.splats), -1)).clone()
+        for view in module.scene.train:
+            view = view.to(module.device)
+            one = torch.ones(view.camera.height, view.camera.width, 1, device=module.device)
+            weight = _gathered(module, view, one)[:, 0]
+            tells = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
+            with torch.enable_grad():
+                query = Query(None, view.camera, view.time_s, view.frame.frame_id)
+                by = slopes(module.thermal.features(module.splats, query)[:, 0])
+            precision += tells[:, None, None] * by[:, :, None] * by[:, None, :]
+        factor = torch.linalg.cholesky(precision)
+        found = {}
+        for name in told:
+            with torch.enable_grad():
+                now = Query(None, frame.camera, frame.time_s, frame.frame_id)
+                by = slopes(module.thermal.attributes(module.splats, now)[name])
+            found[name] = torch.linalg.solve_triangular(factor, by[..., None], upper=False).norm(dim=(1, 2)).float()
+        return found
+
+    @property
+    def usual(self) -> float:
+        """Median standard deviation of the pixels of held-out images."""
+        return self._quantile(0.5)
+
+    @property
+    def widest(self) -> float:
+        """The standard deviation that one pixel in a hundred of held-out images exceeds, for the ends of colours."""
+        return self._quantile(0.99)
+
+    def _quantile(self, share: float) -> float:
+        return float((torch.cat(self._held_out_parts)[:, 1:] @ self.shares).quantile(share).sqrt()) * self.unit
+
+    def coverage(self) -> float:
+        """Share of the pixels of held-out images that lie within one standard deviation, that of the noise included.
+
+        Each image is judged by the calibration on all others, where there are several.
+        """
+        parts, inside = self._held_out_parts, []
+        for i, part in enumerate(parts):
+            others = [other for j, other in enumerate(parts) if j != i] or parts
+            variance = part[:, 1:] @ _calibrated(others, self.noise) + self.noise**2
+            inside.append(part[:, 0] <= variance)
+        return float(torch.cat(inside).double().mean())
+
+    # What pixels are made of ----------------------------------------------------------------------------------------------
+
+    def _known(self, stretch: float) -> Tensor:
+        """Variance [N] of each Gaussian's temperature, image units²."""
+        return 1.0 / (self.evidence.weight / (stretch * self.noise**2) + 1.0 / self.prior**2)
+
+    @torch.no_grad()
+    def _variances(self, frame: Frame, stretches: Sequence[float]) -> Tensor:
+        """The variances [H, W, S + V] of each pixel in image units², float64, before they are calibrated.
+
+        First what Gaussians are not known, for each of S stretches of the noise.
+        """
+        module = self.module
+
+        def shown(at: Frame) -> Tensor:
+            return module.render(at).features[..., : module.thermal.modality_channels[0]].mean(-1).cpu().double()
+
+        each = torch.stack(
+            [*(self._known(stretch).sqrt() for stretch in stretches), self.evidence.misfit.sqrt()], dim=1
+        )
+        seen = module.composited(frame, each.float().to(module.device), depth=True)
+        alpha = seen.alpha[0].cpu().double()
+        *known, misfit = seen.features.cpu().double().square().unbind(-1)
+        image = shown(frame)
+        down, right = torch.gradient(image) if min(image.shape) > 1 else (image * 0, image * 0)
+        pixels_per_length = (frame.camera.K[0, 0] * alpha / seen.depth.cpu().double().clamp(min=LEAST)).where(
+            alpha > 0, 0
+        )
+        position = (down.square() + right.square()) * pixels_per_length.square()
+        parts = [*known, torch.full_like(misfit, self.noise**2), misfit, position]
+        if frame.time_s is not None and "time" in module.scene.metadata:
+            start, span = module.scene.record
+            apart = span / len(module.scene.train) * (0.5 if frame.time_s < start + 0.5 * span else -0.5)
+            parts.append((shown(at_time(module.scene, frame, frame.time_s + apart)) - image).square())
+        return torch.stack(parts, dim=-1)
+
+    def _parts(self, views: ViewSet, stretches: Sequence[float]) -> list[Tensor]:
+        """Of some pixels of each view the squared residual and the variances, [P, 1 + S + V]."""
+        every = max(1, sum(frame.camera.width * frame.camera.height for frame in views.frames) // PIXELS)
+        found = []
+        for view in views:
+            squares = (
+                (self.module.predict(view.frame).cpu() - view.image(self.module.modality)).square().mean(-1).double()
+            )
+            rows = torch.cat([squares[..., None], self._variances(view.frame, stretches)], dim=-1).flatten(0, 1)
+            counted = rows.isfinite().all(1) if view.mask is None else rows.isfinite().all(1) & view.mask.reshape(-1)
+            found.append(rows[counted][::every])
+        return found
+
+    @torch.no_grad()
+    def _depth(self, frame: Frame) -> Tensor:
+        output = self.module.render(frame, depth=True)
+        return surface_depth(output.depth, output.alpha[0]).cpu()
+
+    @cached_property
+    def _sightings(self) -> list[Sighting]:
+        return sightings(self.module.scene, self._depth)
+
+
+def _only(rows: Tensor, stretch: int) -> Tensor:
+    """Rows [P, 1 + S + V] with one of the S stretches, [P, 2 + V]."""
+    return torch.cat([rows[:, :1], rows[:, 1 + stretch : 2 + stretch], rows[:, 1 + len(STRETCHES) :]], dim=1)
+
+
+def _shares(rows: Tensor, noise: float) -> tuple[Tensor, float]:
+    """How much of each variance is in squared residuals, [1 + V], by maximum likelihood of Laplace's distribution; its loss.
+
+    Args:
+        rows: [P, 2 + V] squared residuals and variances; the first of these, which the prior bounds, counts as it is.
+        noise: standard deviation of what the residuals have beside them.
+    """
+    squares, known, others = rows[:, 0], rows[:, 1] + noise**2, rows[:, 2:]
+    start = squares.mean().clamp(min=LEAST) / others.shape[1]
+    logs = (start / others.mean(0).clamp(min=LEAST)).log().requires_grad_()
+    optimiser = torch.optim.LBFGS([logs], max_iter=ROUNDS, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        total = known + others @ logs.exp()
+        value = (0.5 * total.log() + (2 * squares / total).sqrt()).mean()
+        value.backward()
+        return value
+
+    with torch.enable_grad():
+        optimiser.step(loss)
+        reached = float(loss().detach())
+    return torch.cat([logs.new_ones(1), logs.detach().exp()]), reached
+
+
+def _calibrated(parts: Sequence[Tensor], noise: float) -> Tensor:
+    """Shares [1 + V] of the variances with which the interval holds as many pixels as it should.
+
+    A squared residual lies within q² v + noise² where (r² - noise²) / v is below q².
+    """
+    rows = torch.cat(list(parts))
+    shares, _ = _shares(rows, noise)
+    factor = ((rows[:, 0] - noise**2) / (rows[:, 1:] @ shares).clamp(min=LEAST)).quantile(WITHIN)
+    return shares * factor.clamp(min=0.0)

@@ -1,0 +1,49 @@
+"""Hot and cold rectangles on a wall and a box before it: found where they are, as large as they are."""
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera
+from heatsplat.geometry.extremes import extremes
+from heatsplat.geometry.looks import Look
+from heatsplat.geometry.projection import look_at
+
+
+def look(x: float, tilt: float = 0.0) -> Look:
+    """A camera before the wall z = 4, seen from the side: a hot patch of 1 x 0.5 on it, two cold ones."""
+    eye = torch.tensor([x, 0.3, 0.0], dtype=torch.float64)
+    viewmat = look_at(eye, torch.tensor([tilt, 0.0, 4.0], dtype=torch.float64), torch.tensor([0.0, -1.0, 0.0]).double())
+    K = torch.tensor([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(viewmat, K, 160, 120)
+    rows, columns = torch.meshgrid(torch.arange(120), torch.arange(160), indexing="ij")
+    rays = torch.stack([(columns + 0.5 - 80) / 150, (rows + 0.5 - 60) / 150, torch.ones(120, 160)], -1).double()
+    world = rays @ viewmat[:3, :3]
+    depth = (4.0 - eye[2]) / world[..., 2]  # along the ray of camera z = 1
+    points = eye + world * depth[..., None]
+    values = torch.full((120, 160), 20.0).double() + 0.01 * points[..., 0]
+
+    def inside(cx, cy, w, h):
+        return ((points[..., 0] - cx).abs() < w / 2) & ((points[..., 1] - cy).abs() < h / 2)
+
+    values[inside(-0.5, 0.2, 1.0, 0.5)] = 40.0
+    values[inside(0.8, 0.5, 0.6, 0.6)] = 5.0
+    values[inside(0.8, -0.7, 0.3, 0.3)] = 2.0
+    return Look(camera, depth, values)
+
+
+@pytest.mark.parametrize("shown", [[0.0], [-1.5, -0.5, 0.0, 0.7, 2.0]])
+def test_surfaces_are_found_where_they_are_and_as_large_as_they_are(shown):
+    looks = [look(x, 0.1 * x) for x in shown]
+    hot, cold = extremes(looks, share=0.03)
+    assert len(hot) == 1 and len(cold) == 2
+    assert (hot[0].mean, hot[0].most) == pytest.approx((40.0, 40.0))
+    assert hot[0].area == pytest.approx(0.5, rel=0.03)
+    assert hot[0].centre.tolist() == pytest.approx([-0.5, 0.2, 4.0], abs=0.03)
+    assert [one.mean for one in cold] == pytest.approx([2.0, 5.0])
+    assert cold[0].area == pytest.approx(0.09, rel=0.2)
+    assert cold[0].centre.tolist() == pytest.approx([0.8, -0.7, 4.0], abs=0.03)
+
+
+def test_nothing_is_seen_where_there_is_no_surface():
+    seen = look(0.0)
+    assert extremes([Look(seen.camera, torch.full_like(seen.depth, torch.inf), seen.values)]) == ([], [])

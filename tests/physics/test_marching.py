@@ -1,0 +1,127 @@
+"""Marches along the record that are kept: what lies between two of them, what comes and goes, and views in order."""
+
+import pytest
+import torch
+
+from heatsplat.physics import marching
+from heatsplat.physics.energy_balance import Climate, Surface
+from heatsplat.physics.marching import CHANGE, UNITS, Course, Kept, learned, march
+from tests.physics.weather_reference import drivers
+
+MOMENTS = torch.arange(1000.0, 80_000.0, 5300.0, dtype=torch.float64)
+COUNT = 200
+
+
+@pytest.fixture(scope="module")
+def climate() -> Climate:
+    return Climate(drivers(days=1.0))
+
+
+def surfaces(seed: int = 0) -> Surface:
+    """Sheet metal to wet ground, turned all ways, in float32 as training has them."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def between(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(COUNT, generator=generator)
+
+    turned = torch.randn(COUNT, 3, generator=generator)
+    return Surface(
+        start=between(-10, 15),
+        log_rate=between(-11.5, -6.0),
+        sun=between(10, 70),
+        share=between(0.1, 0.8),
+        wind=between(0.05, 0.9),
+        normals=torch.nn.functional.normalize(turned, dim=1),
+    )
+
+
+def moved(surface: Surface, share: float, seed: int = 1) -> Surface:
+    """The surfaces with every parameter off by a share of itself (of 1 in the logarithm), either way."""
+    generator = torch.Generator().manual_seed(seed)
+    signs = torch.randn(len(UNITS), COUNT, generator=generator).sign() * share
+    columns = {name: getattr(surface, name) * (1 + sign) for name, sign in zip(UNITS, signs, strict=True)}
+    return surface._replace(**columns | {"log_rate": surface.log_rate + signs[1]})
+
+
+def rows(surface: Surface, ids: torch.Tensor) -> Surface:
+    return Surface(*(None if value is None else value[ids] for value in surface))
+
+
+def test_what_is_found_of_one_depends_neither_on_the_others_nor_on_other_moments(climate):
+    surface, ids = surfaces(), torch.randperm(COUNT)[:37]
+    whole, alone = march(climate, surface, MOMENTS), march(climate, rows(surface, ids), MOMENTS[4:5])
+    assert torch.equal(whole[4:5, ids], alone)
+    torch.testing.assert_close(
+        march(climate, surface, MOMENTS, sensitive=False)[..., 0], whole[..., 0], atol=1e-5, rtol=0
+    )
+
+
+def test_between_two_marches_temperatures_are_right_to_first_order(climate):
+    surface, ids = surfaces(), torch.arange(COUNT)
+    kept, marched_at = Kept(climate, MOMENTS), torch.zeros(COUNT, len(UNITS))
+
+    def error(now: Surface) -> torch.Tensor:
+        found = [kept.temperature(now, t, ids, now.normals, marched_at) for t in MOMENTS.tolist()]
+        return torch.stack(found) - march(climate, now, MOMENTS, sensitive=False)[..., 0]
+
+    assert error(surface).abs().max() < 1e-4
+    assert torch.equal(marched_at, learned(surface))
+    near = moved(surface, 0.02)
+    assert 1e-4 < error(near).square().mean().sqrt() < 3e-3
+    assert torch.equal(marched_at, learned(surface))
+    far = moved(surface, 2 * CHANGE)  # in the logarithm of the rate, so that all are marched anew
+    assert error(far).abs().max() < 1e-4
+    assert torch.equal(marched_at, learned(far))
+    drifting = learned(surface)  # as far as it may be without a new march
+    units = drifting.new_tensor(list(UNITS.values()))
+    signs = torch.randn(drifting.shape, generator=torch.Generator().manual_seed(2)).sign()
+    drifting = drifting + 0.99 * CHANGE * units * signs
+    marched_at.copy_(learned(surface))
+    off = error(surface._replace(**dict(zip(UNITS, drifting.unbind(1), strict=True))))
+    assert torch.equal(marched_at, learned(surface))
+    assert off.square().mean().sqrt() < 0.03
+    assert off.abs().max() < 0.5
+
+
+def test_splits_and_a_checkpoint_find_the_bits_that_were_there(climate):
+    surface, ids = surfaces(), torch.arange(COUNT)
+    kept, marched_at = Kept(climate, MOMENTS), torch.zeros(COUNT, len(UNITS))
+    time = MOMENTS[3].item()
+    kept.temperature(surface, time, ids, surface.normals, marched_at)
+    now = moved(surface, 0.02)
+    here = kept.temperature(now, time, ids, now.normals, marched_at)
+
+    again = Kept(climate, MOMENTS).temperature(now, time, ids, now.normals, marched_at.clone())
+    assert torch.equal(again, here)
+    children = torch.cat((ids[::2], ids[:30]))  # half of them leave, and some are split
+    theirs = rows(now, children)
+    for holds in (kept, Kept(climate, MOMENTS)):
+        found = holds.temperature(theirs, time, torch.arange(130), theirs.normals, marched_at[children].clone())
+        assert torch.equal(found, here[children])
+    turned = now._replace(normals=now.normals.roll(1, 0))
+    found = kept.temperature(turned, time, ids, turned.normals, marched_at)
+    assert (found - here).abs().max() > 1
+
+
+def test_derivatives_reach_the_parameters_through_what_is_kept(climate):
+    surface, ids = surfaces(), torch.arange(COUNT)
+    columns = [value.clone().requires_grad_() for value in learned(surface).unbind(1)]
+    live = surface._replace(**dict(zip(UNITS, columns, strict=True)))
+    marched_at, time = torch.zeros(COUNT, len(UNITS)), MOMENTS[-1].item()
+    kept = Kept(climate, MOMENTS)
+    ours = torch.autograd.grad(kept.temperature(live, time, ids, surface.normals, marched_at).sum(), columns)
+    alone = torch.autograd.grad(climate.stepped_temperature(live, time).sum(), columns)
+    for one, other in zip(ours, alone, strict=True):
+        torch.testing.assert_close(one, other)
+    assert not kept.has(time + 1.0, marched_at)
+    assert not kept.has(time, marched_at.new_zeros(1, 1).expand(1 << 32, 5))  # as much does not fit
+
+
+@pytest.mark.parametrize("room", [marching.COURSE_BYTES, 20_000])
+def test_views_in_any_order_see_what_a_march_of_their_own_finds(climate, monkeypatch, room):
+    monkeypatch.setattr(marching, "COURSE_BYTES", room)
+    surface, ids = surfaces(), torch.arange(0, COUNT, 3)
+    course = Course(climate, surface)
+    for time in (0.0, 5000.0, 5000.0, 40_000.0, 9000.0, 86_400.0):
+        alone = climate.stepped_temperature(rows(surface, ids), time)
+        torch.testing.assert_close(course.temperature(time, ids), alone, atol=2e-4, rtol=0)

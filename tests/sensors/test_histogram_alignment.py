@@ -1,0 +1,46 @@
+"""Histograms that are brought to one and back: exact for a camera that drifts, reversible where an image is flat."""
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
+from heatsplat.sensors.histogram_alignment import HistogramAlignment
+
+CAMERA = Camera(torch.eye(4), torch.eye(3), 24, 16)
+SCENE_IMAGE = torch.rand(16, 24, 1, generator=torch.Generator().manual_seed(0)) ** 1.5
+
+
+def drifted(count=5, gain=0.1):
+    """A scene whose camera shows g v + o of the same surfaces, another g and o in every image."""
+    frames = [Frame(f"{i}.png", i, CAMERA, float(i)) for i in range(count)]
+    images = [(1 - gain * i) * SCENE_IMAGE + 0.05 * i for i in range(count)]
+    views = ViewSet(frames, lambda i: View(frames[i], images[i]))
+    held = [Frame("between.png", 99, CAMERA, 1.5)]
+    test = ViewSet(held, lambda i: View(held[i], (images[1] + images[2]) / 2))
+    return SceneData("flight", views, test, test, torch.zeros(4, 3)), images
+
+
+def test_what_one_image_shows_of_another_s_clean_picture_is_that_image():
+    scene, images = drifted()
+    part = HistogramAlignment(quantiles=17)
+    part.prepare(scene)
+    clean = torch.stack(images).mean(0)  # the same surfaces with the mean histogram
+    for frame, image in zip(scene.train.frames, images, strict=True):
+        assert torch.allclose(part(clean, frame), image, atol=1e-5)
+    between = scene.test[0]
+    assert torch.allclose(part(clean, between.frame), between.thermal, atol=1e-5)
+    assert list(part.parameters()) == [] and part.regulariser() is None
+
+
+def test_no_strength_is_no_change_and_flat_images_stay_reversible():
+    scene, images = drifted()
+    part = HistogramAlignment(strength=0.0)
+    part.prepare(scene)
+    assert torch.allclose(part(images[0], scene.train.frames[3]), images[0], atol=1e-6)
+    flat = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], torch.full((16, 24, 1), 0.1 * i)))
+    part = HistogramAlignment()
+    part.prepare(SceneData("wall", flat, flat, flat, torch.zeros(4, 3)))
+    shown = part(torch.linspace(0, 1, 50)[:, None, None], scene.train.frames[2])
+    assert (shown.diff(dim=0) > 0).all()
+    with pytest.raises(ValueError, match="strength"):
+        HistogramAlignment(strength=2.0)

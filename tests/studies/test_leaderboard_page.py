@@ -1,0 +1,38 @@
+"""The page of a leaderboard: one file whose data are whole, with pictures, and links only where they lead somewhere."""
+
+import base64
+import json
+import re
+
+import cv2
+import numpy as np
+from boards import board, protocol_folder, run_of
+
+from heatsplat.studies.leaderboard.page import page
+from heatsplat.studies.leaderboard.standings import standings
+
+
+def content(text: str) -> dict:
+    return json.loads(re.search(r"^const board = (.*);$", text, re.M)[1])
+
+
+def test_the_page_has_all_entries_pictures_and_links(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+    run_of(sweep, "etgs", "cooling", 0, -1.0)
+    asked = board(root)
+    entries = standings(sweep, asked)
+    text = page(entries, asked, sweep)
+    assert "http" not in text.replace("http://www.w3.org/2000/svg", "")  # self-contained
+    told = content(text)
+    (scene,) = told["scenes"]
+    assert scene["name"] == "cooling" and [shown["view"] for shown in scene["pictures"]] == ["times_00008"]
+    shown = scene["pictures"][0]
+    assert set(shown["renders"]) == set(shown["errors"]) == {"3dgs", "etgs"}
+    picture = np.frombuffer(base64.b64decode(shown["errors"]["3dgs"].partition(",")[2]), np.uint8)
+    blue, _, red = cv2.imdecode(picture, cv2.IMREAD_COLOR).mean((0, 1))
+    assert red > blue  # too warm
+    entry = next(one for one in told["entries"] if one["method"] == "3dgs")
+    assert entry["links"] == ["3dgs_cooling_steps_0/.hydra/config.yaml"] and len(entry["rank"]) == 2
+    assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("made for")
+    assert content(page(entries, asked, None))["entries"][0]["links"] == []

@@ -1,0 +1,63 @@
+"""The table of a leaderboard says what ran, what could not, and who is tied."""
+
+import csv
+from pathlib import Path
+
+import pytest
+from boards import board, protocol_folder, run_of
+from commands import succeeds
+
+from heatsplat.studies.leaderboard.report import write_leaderboard
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_table_has_ranks_reasons_and_costs(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling", "driven"), tmp_path / "sweep"
+    for seed, off in ((0, 1.0), (1, 1.2)):
+        run_of(sweep, "3dgs", "cooling", seed, off)
+        run_of(sweep, "etgs", "cooling", seed, off + 0.05)
+        run_of(sweep, "etgs", "driven", seed, None)
+    asked = board(root, document=str(tmp_path / "docs" / "board.md"), page=str(tmp_path / "docs" / "board.html"))
+    written = write_leaderboard(sweep, asked)
+    assert {path.name for path in written} == {
+        "leaderboard.md",
+        "leaderboard.html",
+        "leaderboard.csv",
+        "board.md",
+        "board.html",
+    }
+    text = (tmp_path / "docs" / "board.md").read_text()
+    assert (
+        "Scenes of size tiny; 4 runs, 0.01 h of processor time together; seeds 0, 1. On a busy machine." in text
+        and "steps taken: `2,000`" in text
+    )
+    assert "| `3dgs` | 1.00 | 1 | 10 | **1.100 (1–2)** | – |" in text
+    assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
+    assert "- `etgs` on driven: scene 'x' lacks weather" in text
+    assert (
+        "- `3dgs` on driven: not run yet" in text and "- `supirgs` on cooling, driven: made for coarse images" in text
+    )
+    rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
+    found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]
+    assert [round(float(text), 3) for text in found] == [1.0, 1.2]
+    assert {row["method"] for row in rows if row["reason"]} == {"3dgs", "etgs", "supirgs"} and len(rows) == 8
+
+
+@pytest.mark.slow
+def test_the_command_runs_methods_on_scenes_and_goes_on_where_it_stopped(tmp_path):
+    root, sweep = tmp_path / "root", tmp_path / "sweep"
+    succeeds(
+        [str(ROOT / "src/study.py"), "study=scenes", f"study.target={root}", "study.size=tiny", "study.scenes=[cooling]",
+         f"hydra.run.dir={tmp_path}/written"]
+    )  # fmt: skip
+    command = [
+        str(ROOT / "src/train.py"), "experiment=leaderboard", f"leaderboard.root={root}", "leaderboard.methods=[3dgs,supirgs]",
+        "leaderboard.tracks=[steps]", "max_steps=6", "threads=2", f"hydra.sweep.dir={sweep}",
+    ]  # fmt: skip
+    assert "1 tracks x 1 seeds: 1 runs" in succeeds([*command, "leaderboard.seeds=[0]"])
+    before = (sweep / "3dgs_cooling_steps_0" / "metrics.json").stat().st_mtime_ns
+    assert "3 runs" in succeeds(command)
+    assert (sweep / "3dgs_cooling_steps_0" / "metrics.json").stat().st_mtime_ns == before
+    assert (sweep / "leaderboard.md").read_text().count("| `3dgs` |") == 1
+    assert "give the folder of the protocol's scenes" in succeeds([command[0], "experiment=leaderboard"], code=1)

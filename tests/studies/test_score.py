@@ -1,0 +1,84 @@
+"""Renders of any code are scored by their temperatures, and what is wrong with a file is named with its remedy."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from boards import PROTOCOL, VIEWS, hand_in, protocol_folder, truth
+
+from heatsplat.contracts import SceneError
+from heatsplat.io.tiff import write_temperature
+from heatsplat.studies.score import run, score_submission
+
+SCORES = PROTOCOL["scores"]
+
+
+@pytest.fixture
+def root(tmp_path):
+    return protocol_folder(tmp_path / "root", "cooling")
+
+
+@pytest.fixture
+def submission(tmp_path):
+    folder = tmp_path / "ours"
+    hand_in(folder / "cooling", 0.5)
+    (folder / "metrics.json").write_text(json.dumps({"method": "ours", "scenes": {"cooling": {"seconds": 12}}}))
+    return folder
+
+
+def test_half_a_degree_is_half_a_degree(root, submission, tmp_path):
+    np.save(submission / "cooling" / "near_00003.npy", truth("near_00003").astype(np.float64) - 2.0)
+    (submission / "cooling" / "near_00003.tiff").unlink()
+    scored = run(tmp_path / "out", str(submission), str(root), PROTOCOL)["cooling"]
+    assert scored.parts == ["near", "times"] and scored.cost == {"seconds": 12}
+    assert scored.mean("mae_c", "near") == pytest.approx(2.0, abs=1e-5)
+    assert scored.mean("mae_c") == pytest.approx(1.0, abs=1e-5)
+    assert scored.mean("psnr", "times") == pytest.approx(-20 * np.log10(0.5 / 30.0), abs=1e-3)
+    text = (tmp_path / "out" / "score.md").read_text()
+    assert "| cooling | all | 3 | 1.000 |" in text and (tmp_path / "out" / "score.csv").read_text().count("\n") == 4
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: f.unlink(), r"lacks 1 of the 3 held-out views of cooling: near_00003. Render every view of .*transforms_test"),
+        (lambda f: write_temperature(f, truth(VIEWS[0])[:, :8]), r"near_00003.tiff is \[12, 8\], its view is \[12, 16\]"),
+        (lambda f: write_temperature(f, np.full((12, 16), np.nan)), "has 192 pixels that are NaN or infinite; every pixel"),
+        (lambda f: write_temperature(f, truth(VIEWS[0]) + 273.15), r"kelvin, no °C. Subtract 273.15"),
+        (lambda f: write_temperature(f, truth(VIEWS[0]) / 50), r"between 0.42 and 0.82: image values, .* 15 \+ value \* 30"),
+        (lambda f: f.write_bytes(b"no image"), "cannot be read .* write float32 temperatures in °C, one channel"),
+        (lambda f: (f.unlink(), np.save(f.with_suffix(".npy"), np.ones((12, 16), np.uint16))), "uint16; write float32"),
+        (lambda f: write_temperature(f, truth(VIEWS[0]) - 500), "below absolute zero"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_named_with_its_remedy(root, submission, spoil, message):
+    spoil(submission / "cooling" / "near_00003.tiff")
+    with pytest.raises(SceneError, match=message):
+        score_submission(submission, root, SCORES)
+
+
+def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path):
+    for told, message in (
+        ("{", "is no JSON"),
+        ('{"method": "ours"}', 'needs "method": a name, and "scenes"'),
+        ('{"method": "ours", "scenes": {"glass": {}}}', f"names glass; {re.escape(str(root))} has cooling"),
+        (
+            '{"method": "ours", "scenes": {"cooling": {"seconds": -1}}}',
+            "scenes.cooling.seconds is -1; a number of 0 or more",
+        ),
+    ):
+        (submission / "metrics.json").write_text(told)
+        with pytest.raises(SceneError, match=message):
+            score_submission(submission, root, SCORES)
+    (submission / "metrics.json").write_text('{"method": "ours", "scenes": {"cooling": null}}')
+    assert score_submission(submission, root, SCORES)[1]["cooling"].cost == {}
+    shutil.rmtree(root / "truth")
+    with pytest.raises(SceneError, match="study=scenes"):
+        run(tmp_path, str(submission), str(root), PROTOCOL)
+    (submission / "metrics.json").unlink()
+    with pytest.raises(SceneError, match="metrics.json is missing"):
+        score_submission(submission, root, SCORES)
+    with pytest.raises(SceneError, match="submission=FOLDER root=FOLDER"):
+        run(tmp_path, None, None, PROTOCOL)

@@ -1,0 +1,55 @@
+"""Ranks with ties: what the spread of seeds does not tell apart shares its ranks."""
+
+import json
+
+import pytest
+from boards import board, hand_in, protocol_folder, run_of
+
+from heatsplat.studies.leaderboard.standings import beside_reference, ranks, spread_of, standings, usual_spread
+
+
+def test_a_difference_within_the_spread_is_a_tie():
+    apart = [[1.0, 1.02, 0.98], [1.5, 1.49, 1.51], [1.01, 1.03, 0.99]]
+    assert ranks(apart, None) == [(1, 2), (3, 3), (1, 2)]
+    assert ranks(apart, None, higher=True) == [(2, 3), (1, 1), (2, 3)]
+    wide = [[0.9, 1.1], [1.1, 1.3], [1.3, 1.5]]  # errors of 0.1: two of them of a difference are 0.28
+    assert ranks(wide, None) == [(1, 2), (1, 3), (2, 3)]
+
+
+def test_one_seed_spreads_as_the_others_do():
+    usual = usual_spread([[1.0, 1.2], [2.0, 2.4], [5.0]])
+    assert usual == pytest.approx(0.02**0.5 / 1.1)
+    assert ranks([[1.0], [1.2], [2.0]], usual) == [(1, 2), (1, 2), (3, 3)]
+    assert ranks([[1.0], [1.2]], None) == [(1, 1), (2, 2)]
+    assert usual_spread([[1.0], [2.0]]) is None
+
+
+def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling", "driven"), tmp_path / "sweep"
+    for seed, off in ((0, 1.0), (1, 1.1)):
+        run_of(sweep, "3dgs", "cooling", seed, off, seconds=8.0)
+        run_of(sweep, "etgs", "cooling", seed, off / 2)
+    run_of(sweep, "etgs", "driven", 0, None)
+    run_of(sweep, "etgs", "glass", 0, 0.1)  # not asked for
+    hand_in(tmp_path / "theirs" / "cooling", -0.25)
+    told = {"method": "theirs", "track": "steps", "scenes": {"cooling": {"seconds": 99}}}
+    (tmp_path / "theirs" / "metrics.json").write_text(json.dumps(told))
+    asked = board(root, submissions=[str(tmp_path / "theirs")])
+    for _ in range(2):  # the second time from score.json
+        found = {(one.method, one.scene): one for one in standings(sweep, asked)}
+    assert found["3dgs", "cooling"].mean("mae_c") == pytest.approx(1.05, abs=1e-4)
+    assert found["3dgs", "cooling"].cost("seconds") == 8.0 and found["theirs", "cooling"].cost("seconds") == 99
+    assert [found[name, "cooling"].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
+    assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
+    assert (
+        spread_of(list(found.values()), asked)
+        == "What ran with one seed is taken to spread by 6.7 %, as the others do."
+    )
+    assert found["3dgs", "driven"].reason == "not run yet"
+    assert found["supirgs", "driven"].reason.startswith("made for coarse images")
+    beside = beside_reference(list(found.values()), asked)
+    assert beside["etgs", "steps"] == (pytest.approx(0.5, abs=1e-4), 1)
+    (sweep / "3dgs_cooling_steps_0" / "submission" / "near_00003.tiff").unlink()
+    (sweep / "3dgs_cooling_steps_0" / "score.json").unlink()
+    left = next(one for one in standings(sweep, asked) if (one.method, one.scene) == ("3dgs", "cooling"))
+    assert len(left.scores) == 1 and "lacks 1 of the 3" in left.reason
