@@ -25,7 +25,8 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import NORMALS, SKY_SEEN, SUN_SEEN, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.training.exposure import Exposure
 from heatsplat.training.init import Initialisation
 from heatsplat.training.normals import Normals
 from heatsplat.training.optimisation import Optimisation, penalties
@@ -62,6 +63,7 @@ class SplatTraining(pl.LightningModule):
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
         normals: where normals come from, of models that read them; None: as before training, throughout.
+        exposure: what hides sun and sky, of models that ask for that; None: nothing, throughout.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -89,6 +91,7 @@ class SplatTraining(pl.LightningModule):
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
         normals: Normals | None = None,
+        exposure: Exposure | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -106,6 +109,7 @@ class SplatTraining(pl.LightningModule):
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
         self.normals = normals or Normals()
+        self.exposure = exposure or Exposure()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -151,6 +155,9 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.prepare(scene, self.splats.means.detach())
         if NORMALS in self.splats:
             self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
+        if self._exposed:
+            self.exposure.prepare(scene, self.renderer, self.normals.discs, self._exposed)
+            self._expose()
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -366,6 +373,8 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         if NORMALS in self.splats and step + 1 in self.normals.refresh:
             self._face(self.splats[NORMALS].detach())
+        if self._exposed and step + 1 in self.exposure.refresh:
+            self._expose()
         if change is not None:
             for group in inner.param_groups:
                 if group["name"] in self._declared:
@@ -375,6 +384,17 @@ class SplatTraining(pl.LightningModule):
     def _face(self, normals: Tensor) -> None:
         """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
         self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
+
+    @property
+    def _exposed(self) -> list[str]:
+        """Tensors of the splats that tell what reaches them of sun and sky."""
+        return [name for name in (SUN_SEEN, SKY_SEEN) if name in self.splats]
+
+    @torch.no_grad()
+    def _expose(self) -> None:
+        """Looks anew what hides sun and sky from the splats, where a model asks for that."""
+        for name, shares in self.exposure.look(self.splats.means.detach()).items():
+            self.splats[name].copy_(shares)
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
