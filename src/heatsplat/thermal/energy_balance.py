@@ -155,12 +155,18 @@ class EnergyBalance(ThermalModel):
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
-        for name, asked in (("nodes=2", nodes == 2), ("semi_infinite", semi_infinite), ("inner", inner)):
+        by_convention = exchange != "learned"
+        for name, asked in (
+            ("nodes=2", nodes == 2),
+            ("semi_infinite", semi_infinite),
+            ("inner", inner),
+            (f"exchange={exchange}", by_convention),
+        ):
             if asked and solution != "linear":
                 raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
         if nodes == 2 and semi_infinite:
             raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
-        if exchange != "learned" and (sky is None or not wind):
+        if by_convention and (sky is None or not wind):
             raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
         if indoor_c is not None and not inner:
             raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
