@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -32,7 +33,8 @@ This page is generated: `python src/study.py study=evidence`.
 An effect is simulated where its evidence exceeds its threshold and images can tell it. Evidence is a statistic on the training
 images that stays below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint
 fit of all of them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion
-in the presence of the others. Where metadata is missing an effect is off, and the reason says so.
+in the presence of the others. Where metadata is missing an effect is off, and the reason says so. Effects whose threshold is
+"asked for" have no evidence yet: they are simulated where they are switched on.
 
 What was taken in has to show it where it was not fitted (`effects/joint/certainty.py`): on observations that were left out, a
 quarter at a time, it has to gain 0.3 dB, and 3.5 standard errors over the images; images whose departures are shuffled must not
@@ -235,7 +237,7 @@ def written(
     rows = [
         (
             effect.name, effect.stage, effect.summary, effect.source, ", ".join(sorted(effect.needs)) or "images",
-            effect.null, f"{effect.threshold:g}", effect.adds,
+            effect.null, f"{effect.threshold:g}" if math.isfinite(effect.threshold) else "asked for", effect.adds,
         )
         for effect in CATALOGUE
     ]  # fmt: skip

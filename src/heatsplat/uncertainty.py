@@ -165,9 +165,11 @@ class Uncertainty:
                 return torch.zeros(len(values), numbers, dtype=torch.float64)
             found = torch.autograd.grad(values.sum(), tensors, allow_unused=True)
             rows = (torch.zeros_like(t) if g is None else g for t, g in zip(tensors, found, strict=True))
-            return torch.cat([row.flatten(1) for row in rows], dim=1).cpu().double()
+            return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
-        spread = torch.cat([tensor.detach().flatten(1) for tensor in tensors], dim=1).cpu().double().var(0)
+        spread = (
+            torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1).cpu().double().var(0)
+        )
         precision = torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(module.splats), -1)).clone()
         for view in module.scene.train:
             view = view.to(module.device)

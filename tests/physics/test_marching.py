@@ -44,7 +44,7 @@ def moved(surface: Surface, share: float, seed: int = 1) -> Surface:
 
 
 def rows(surface: Surface, ids: torch.Tensor) -> Surface:
-    return Surface(*(None if value is None else value[ids] for value in surface))
+    return marching.rows_of(surface, ids)
 
 
 def test_what_is_found_of_one_depends_neither_on_the_others_nor_on_other_moments(climate):
@@ -61,7 +61,7 @@ def test_between_two_marches_temperatures_are_right_to_first_order(climate):
     kept, marched_at = Kept(climate, MOMENTS), torch.zeros(COUNT, len(UNITS))
 
     def error(now: Surface) -> torch.Tensor:
-        found = [kept.temperature(now, t, ids, now.normals, marched_at) for t in MOMENTS.tolist()]
+        found = [kept.temperature(now, t, ids, (now.normals,), marched_at) for t in MOMENTS.tolist()]
         return torch.stack(found) - march(climate, now, MOMENTS, sensitive=False)[..., 0]
 
     assert error(surface).abs().max() < 1e-4
@@ -87,19 +87,19 @@ def test_splits_and_a_checkpoint_find_the_bits_that_were_there(climate):
     surface, ids = surfaces(), torch.arange(COUNT)
     kept, marched_at = Kept(climate, MOMENTS), torch.zeros(COUNT, len(UNITS))
     time = MOMENTS[3].item()
-    kept.temperature(surface, time, ids, surface.normals, marched_at)
+    kept.temperature(surface, time, ids, (surface.normals,), marched_at)
     now = moved(surface, 0.02)
-    here = kept.temperature(now, time, ids, now.normals, marched_at)
+    here = kept.temperature(now, time, ids, (now.normals,), marched_at)
 
-    again = Kept(climate, MOMENTS).temperature(now, time, ids, now.normals, marched_at.clone())
+    again = Kept(climate, MOMENTS).temperature(now, time, ids, (now.normals,), marched_at.clone())
     assert torch.equal(again, here)
     children = torch.cat((ids[::2], ids[:30]))  # half of them leave, and some are split
     theirs = rows(now, children)
     for holds in (kept, Kept(climate, MOMENTS)):
-        found = holds.temperature(theirs, time, torch.arange(130), theirs.normals, marched_at[children].clone())
+        found = holds.temperature(theirs, time, torch.arange(130), (theirs.normals,), marched_at[children].clone())
         assert torch.equal(found, here[children])
     turned = now._replace(normals=now.normals.roll(1, 0))
-    found = kept.temperature(turned, time, ids, turned.normals, marched_at)
+    found = kept.temperature(turned, time, ids, (turned.normals,), marched_at)
     assert (found - here).abs().max() > 1
 
 
@@ -109,7 +109,7 @@ def test_derivatives_reach_the_parameters_through_what_is_kept(climate):
     live = surface._replace(**dict(zip(UNITS, columns, strict=True)))
     marched_at, time = torch.zeros(COUNT, len(UNITS)), MOMENTS[-1].item()
     kept = Kept(climate, MOMENTS)
-    ours = torch.autograd.grad(kept.temperature(live, time, ids, surface.normals, marched_at).sum(), columns)
+    ours = torch.autograd.grad(kept.temperature(live, time, ids, (surface.normals,), marched_at).sum(), columns)
     alone = torch.autograd.grad(climate.stepped_temperature(live, time).sum(), columns)
     for one, other in zip(ours, alone, strict=True):
         torch.testing.assert_close(one, other)

@@ -15,6 +15,7 @@ from heatsplat.physics.marching import UNITS
 from tests.physics.weather_reference import drivers, solved
 
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
+BODY = (*UNITS, "normals")  # the parameters of a surface without a core
 TIME_CONSTANTS_S = (120.0, 600.0, 3600.0, 43200.0)  # thin sheet metal to wet ground
 
 
@@ -70,9 +71,7 @@ def test_both_agree_where_nothing_is_nonlinear():
 @pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
-    names = (
-        Surface._fields[:-2] if solution == "linear_temperature" else tuple(UNITS)
-    )  # but for a core and heat from within
+    names = BODY if solution == "linear_temperature" else tuple(UNITS)
     leaves = [getattr(surface, name).clone().requires_grad_() for name in names]
     at = 40_000.0  # the start is still remembered by some
     live = surface._replace(**dict(zip(names, leaves, strict=True)))
@@ -113,7 +112,7 @@ def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_
     zeros = {key: torch.zeros_like(getattr(whole, key)) + tensor(*([x] if x == 0 else x)) for key, x in zeroed.items()}
     found = []
     for surface in (whole._replace(**gone), whole._replace(**zeros)):
-        leaves = [None if x is None else x.clone().requires_grad_() for x in surface]
+        leaves = [None if x is None else x.clone().requires_grad_() for x in surface[: len(BODY)]]
         x = climate.stepped_temperature(Surface(*leaves), 40_000.0)
         x.sum().backward()
         found.append((x.detach(), leaves))
@@ -167,14 +166,14 @@ def test_cost_does_not_depend_on_the_length_of_the_record():
 
 def test_extreme_bodies_stay_finite_in_float32():
     climate = Climate(drivers())
-    surface = Surface(*(x.float() for x in bodies(wind=True)[:-2]))._replace(
+    surface = Surface(*(x.float() for x in bodies(wind=True)[: len(BODY)]))._replace(
         log_rate=torch.tensor([math.log(1e-7), math.log(0.1), math.log(0.1), math.log(1e-7)]),
         share=torch.tensor([0.98, 0.02, 0.98, 0.02]),
         sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
         wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
     )
     for solution in (climate.linear_temperature, climate.stepped_temperature):
-        leaves = [x.clone().requires_grad_() for x in surface[:-2]]
+        leaves = [x.clone().requires_grad_() for x in surface[: len(BODY)]]
         x = solution(Surface(*leaves), 130_000.0)
         assert x.isfinite().all()
         assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves[:-1]))

@@ -103,6 +103,41 @@ def test_the_sun_heats_what_faces_it_and_only_by_day():
     assert dark[level].mean() < dark[east].mean()  # what lies level sees more of the cold sky
 
 
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_what_stands_around_takes_sun_and_sky_and_the_ground_gives_some_back(solution):
+    """All in the shade is a day without beams; all of the sky hidden, or ground that reflects, is another diffuse light."""
+    options = {"solution": solution, "sky": None}
+
+    def at_noon(model, splats, **seen):
+        with torch.no_grad():
+            for name, value in ({"raw_sun": 0.0} | seen).items():  # which starts from the light of its own weather
+                splats[name].fill_(value)
+            return model.temperature(splats, 12 * HOUR)
+
+    def plainly(**changes):
+        return at_noon(*ready(scene(weather(**changes)), **options))
+
+    record, none = weather(), torch.zeros(73, dtype=torch.float64)
+    shaded = ready(shadows=True, **options)
+    assert shaded[1]["sun_seen"].shape[1] > 24
+    open_air = plainly()
+    torch.testing.assert_close(at_noon(*shaded), open_air)
+    dark = at_noon(*shaded, sun_seen=0.0)
+    torch.testing.assert_close(dark, plainly(direct_w_m2=none), atol=2e-3, rtol=0)
+    assert (dark < open_air - 1).all()
+    assert ((at_noon(*shaded, sun_seen=0.5) - 0.5 * (dark + open_air)).abs() < 0.02 * (open_air - dark)).all()
+    hidden = ready(sky_view=True, **options)
+    torch.testing.assert_close(at_noon(*hidden), open_air)
+    torch.testing.assert_close(at_noon(*hidden, sky_seen=0.0), plainly(diffuse_w_m2=none), atol=2e-3, rtol=0)
+    level = record.direct_w_m2 * record.sun[:, 2].clamp(min=0) + record.diffuse_w_m2
+    bright = at_noon(*ready(albedo=0.3, **options))
+    torch.testing.assert_close(bright[:3], open_air[:3])  # what lies level sees no ground
+    more = plainly(diffuse_w_m2=record.diffuse_w_m2 + 0.3 * level)  # what stands sees as much of it as of the sky
+    torch.testing.assert_close(bright[3:], more[3:], atol=2e-3, rtol=0)
+    with pytest.raises(SceneError, match="need the direction of the sun"):
+        ready(scene(weather(sun=None)), shadows=True)
+
+
 def test_effects_that_are_off_or_unknown_are_absent():
     model, splats = ready(sky=None, wind=False, sun=False)
     assert set(splats.names) & {"raw_share", "raw_sun", "raw_wind"} == set()
@@ -217,7 +252,11 @@ def test_a_night_only_record_works_without_sun():
         ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
         ({"inner": True, "solution": "corrected"}, "inner is solved about a mean only: give solution=linear"),
         ({"nodes": 2, "semi_infinite": True}, "no end or two nodes, not both"),
+        ({"exchange": "table"}, "exchange must be one of learned, iso_6946"),
+        ({"exchange": "iso_6946", "sky": None}, "exchange=iso_6946 is that with sky and wind"),
         ({"indoor_c": 20.0}, "indoor_c tells nothing without heat from within: give inner=true"),
+        ({"albedo": 1.0}, r"albedo must lie in \(0, 1\), or be null"),
+        ({"shadows": True, "sun": False}, "give sun=true, normals=seen"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )
@@ -269,3 +308,14 @@ def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
     torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())
     assert (told["u_value_w_m2_k"] > 0.5).all() and not {"time_constant_h", "areal_heat_capacity_kj_m2_k"} & set(told)
     assert "u_value_w_m2_k" not in plain.attributes(without, Query(time_s=0.0))
+
+
+def test_an_exchange_by_convention_is_not_learned():
+    model, splats = ready(exchange="iso_6946", emissivity=0.9)
+    assert not {"raw_share", "raw_wind"} & set(splats.names)
+    told = model.attributes(splats, Query(time_s=0.0))
+    wind = model.mean_wind.item()
+    torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 4 + 4 * wind), rtol=1e-5, atol=0)
+    torch.testing.assert_close(told["wind_share"], torch.full((6,), 4 * wind / (4 + 4 * wind)), rtol=1e-5, atol=0)
+    with pytest.raises(SceneError, match="exchange=iso_6946 needs wind_m_s"):
+        ready(scene(weather(wind_m_s=None)), exchange="iso_6946")

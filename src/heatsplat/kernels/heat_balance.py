@@ -24,7 +24,7 @@ STEP = 0.35  # of y that one substep covers, if they suffice
 FORGOTTEN = 1e-20  # share of the start that counts as none
 
 # Rows of the drivers of ``march``; those of effects that are off are not read.
-AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z = range(8)
+AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z, GROUND = range(9)
 START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 
 
@@ -38,6 +38,8 @@ class Balance:
         sunny: with absorptance g.
         windy: with sensitivity v to wind.
         oriented: with normals; without them surfaces lie level.
+        shaded: with the share of the beam that reaches them.
+        grounded: with light that the ground reflects.
         sensitive: derivatives come with values.
     """
 
@@ -45,6 +47,8 @@ class Balance:
     sunny: bool
     windy: bool
     oriented: bool
+    shaded: bool
+    grounded: bool
     sensitive: bool
 
     @property
@@ -70,6 +74,7 @@ class Balance:
 
 radiates, sunny = constant("radiates"), constant("sunny")
 windy, oriented, sensitive = constant("windy"), constant("oriented"), constant("sensitive")
+shaded, grounded = constant("shaded"), constant("grounded")
 share_column, sun_column = constant("share_column"), constant("sun_column")
 wind_column, normal_column = constant("wind_column"), constant("normal_column")
 
@@ -89,20 +94,27 @@ def weights(y):
 
 
 @inline
-def _recent_sunlight_block(block, normals, log_rates, steps, beams, last, responses, slopes, vectors):
+def _recent_sunlight_block(block, normals, log_rates, steps, beams, seen, slots, last, responses, slopes, vectors):
     """``recent_sunlight`` of BLOCK Gaussians."""
     count, intervals = log_rates.shape[0], steps.shape[0]
     for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
         nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
         rate = math.exp(float(log_rates[i]))
         y, response, slope, vx, vy, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        shaded = seen.shape[1] > 0
         bx, by, bz = beams[0, 0], beams[0, 1], beams[0, 2]
+        if shaded:
+            share = float(seen[i, slots[0]])
+            bx, by, bz = share * bx, share * by, share * bz
         u = nx * bx + ny * by + nz * bz
         if u <= 0.0:
             u, bx, by, bz = 0.0, 0.0, 0.0, 0.0
         seconds, decay, before, after, phi = -1.0, 1.0, 0.0, 0.0, 1.0
         for k in range(intervals):
             cx, cy, cz = beams[k + 1, 0], beams[k + 1, 1], beams[k + 1, 2]
+            if shaded:
+                share = float(seen[i, slots[k + 1]])
+                cx, cy, cz = share * cx, share * cy, share * cz
             v = nx * cx + ny * cy + nz * cz
             if v <= 0.0:
                 v, cx, cy, cz = 0.0, 0.0, 0.0, 0.0
@@ -131,7 +143,7 @@ def _recent_sunlight_block(block, normals, log_rates, steps, beams, last, respon
 
 
 @kernel
-def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, vectors):
+def recent_sunlight(normals, log_rates, steps, beams, seen, slots, last, responses, slopes, vectors):
     """Settled responses to max(n · beam, 0), which is linear between samples, from rest at the first sample.
 
     Args:
@@ -139,6 +151,8 @@ def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, v
         log_rates: [n].
         steps: [K] float64 seconds between samples.
         beams: [K + 1, 3] float64 direction times strength at the samples.
+        seen: [n, D] share of the beam that reaches them from D directions, or [n, 0]: all of it.
+        slots: [K + 1] int64 direction of each sample.
         last: share of the last step that has passed; u goes that far towards its last sample.
         responses: [n] filled with Y.
         slopes: [n] filled with dY / d log a.
@@ -147,7 +161,7 @@ def recent_sunlight(normals, log_rates, steps, beams, last, responses, slopes, v
     parallel_for(
         _recent_sunlight_block,
         (log_rates.shape[0] + BLOCK - 1) // BLOCK,
-        (normals, log_rates, steps, beams, last, responses, slopes, vectors),
+        (normals, log_rates, steps, beams, seen, slots, last, responses, slopes, vectors),
     )
 
 
@@ -177,7 +191,7 @@ def weights_of_lanes(y):
 
 
 @inline
-def _march_group(group, balance, first, parameters, rows, times, drivers, reference, moments, found):
+def _march_group(group, balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
     """``march`` of LANES Gaussians."""
     count = rows.shape[0]
     body = np.empty((parameters.shape[1], LANES), parameters.dtype)
@@ -185,6 +199,12 @@ def _march_group(group, balance, first, parameters, rows, times, drivers, refere
         i = min(group * LANES + j, count - 1)
         for column in range(parameters.shape[1]):
             body[column, j] = parameters[i, column]
+    lit = np.empty((seen.shape[1], LANES), parameters.dtype)
+    if shaded(balance):
+        for j in range(LANES):
+            i = min(group * LANES + j, count - 1)
+            for slot in range(seen.shape[1]):
+                lit[slot, j] = seen[i, slot]
     told = np.empty((found.shape[2], LANES), parameters.dtype)
     x = load_vector(body, START)
     nothing = x * 0.0
@@ -230,11 +250,16 @@ def _march_group(group, balance, first, parameters, rows, times, drivers, refere
             sky_d = ending * sky_d
         if sunny(balance):
             sun_1, sun_d = f * drivers[LIGHT, k], f * drivers[LIGHT, k + 1]
+            if grounded(balance):
+                sun_1 = sun_1 + (1.0 - f) * drivers[GROUND, k]
+                sun_d = sun_d + (1.0 - f) * drivers[GROUND, k + 1]
             if oriented(balance):
-                beam = nx * drivers[BEAM_X, k] + ny * drivers[BEAM_Y, k] + nz * drivers[BEAM_Z, k]
-                sun_1 = sun_1 + maximum(beam, 0.0)
-                beam = nx * drivers[BEAM_X, k + 1] + ny * drivers[BEAM_Y, k + 1] + nz * drivers[BEAM_Z, k + 1]
-                sun_d = sun_d + maximum(beam, 0.0)
+                beam = maximum(nx * drivers[BEAM_X, k] + ny * drivers[BEAM_Y, k] + nz * drivers[BEAM_Z, k], 0.0)
+                beam_2 = nx * drivers[BEAM_X, k + 1] + ny * drivers[BEAM_Y, k + 1] + nz * drivers[BEAM_Z, k + 1]
+                beam_2 = maximum(beam_2, 0.0)
+                if shaded(balance):
+                    beam, beam_2 = beam * load_vector(lit, slots[k]), beam_2 * load_vector(lit, slots[k + 1])
+                sun_1, sun_d = sun_1 + beam, sun_d + beam_2
             sun_d = ending * (sun_d - sun_1)
         substeps = minimum(1.0 + floor(r * fastest * (seconds / STEP)), SUBSTEPS)
         share = 1.0 / substeps
@@ -325,13 +350,13 @@ def _march_group(group, balance, first, parameters, rows, times, drivers, refere
 
 
 @kernel
-def march(balance, first, parameters, rows, times, drivers, reference, moments, found):
+def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
     """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
-    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v wind_anomaly), G = light f +
-    max(n · beam, 0) and s = f sky + (1 - f) around. Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and
-    Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. Lanes are Gaussians; what is
-    found of one depends neither on the others nor on the other moments.
+    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v wind_anomaly), G = f light +
+    (1 - f) ground + V max(n · beam, 0) and s = f sky + (1 - f) around. Exponential Rosenbrock steps of third order
+    (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. Lanes
+    are Gaussians; what is found of one depends neither on the others nor on the other moments.
 
     Args:
         balance: the effects that there are; without an effect its terms are left out, and with f = 1 where surfaces lie
@@ -339,9 +364,11 @@ def march(balance, first, parameters, rows, times, drivers, reference, moments, 
         first: sample from which they start.
         parameters: [n, P] x at that sample in kelvin above the reference, log r, then those of ``balance``; float32 or
             float64, in which all is computed. Neighbours of like rates are quickest.
+        seen: [n, D] V, share of the beam that reaches them from D directions; [n, 0] where all of it does.
+        slots: [T] int64 direction of the beam at each sample.
         rows: [n] int64 rows of ``found`` that they fill.
         times: [T] float64 samples.
-        drivers: [8, T] float64.
+        drivers: [9, T] float64.
         reference: R in kelvin.
         moments: [F] float64, increasing, within the samples from ``first`` on.
         found: [F, N, 1] filled with x; or, of a balance that is sensitive, [F, N, 1 + Q] with its derivatives by the
@@ -350,5 +377,5 @@ def march(balance, first, parameters, rows, times, drivers, reference, moments, 
     parallel_for(
         _march_group,
         (rows.shape[0] + LANES - 1) // LANES,
-        (balance, first, parameters, rows, times, drivers, reference, moments, found),
+        (balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found),
     )

@@ -45,6 +45,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.physics import marching
+from heatsplat.physics.exposure import nearest_direction
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,
@@ -53,7 +54,7 @@ from heatsplat.physics.responses import (
     interpolate,
     semi_infinite_weights,
 )
-from heatsplat.physics.sunlight import SunlightTable
+from heatsplat.physics.sunlight import Seen, SunlightTable
 
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
@@ -105,6 +106,18 @@ def _two_rates(core: Core, log_rate: Tensor, stiffness: Tensor | float) -> _TwoR
     return _TwoRates((log_fast, log_slow), own * (1 - coupled) / fast, own, coupled / root)
 
 
+class Exposure(NamedTuple):
+    """What the scene leaves n surfaces of sun and sky.
+
+    Args:
+        sun: [n, D] share of the beam from the directions of ``Drivers.ways``, or None: nothing casts shadows.
+        sky: [n] share of the sky's light, of what surfaces turned like these get without obstacles, or None: all of it.
+    """
+
+    sun: Tensor | None = None
+    sky: Tensor | None = None
+
+
 class Surface(NamedTuple):
     """What decides the temperature of n surfaces, each [n]; see the module for the symbols.
 
@@ -117,6 +130,7 @@ class Surface(NamedTuple):
         normals: [n, 3] unit vectors, or None for surfaces that lie level.
         core: what lies behind, or None for bodies of one node.
         inner: f in kelvin, or None where nothing is heated from within.
+        exposure: what hides sun and sky from surfaces with normals.
     """
 
     start: Tensor
@@ -127,6 +141,7 @@ class Surface(NamedTuple):
     normals: Tensor | None = None
     core: Core | None = None
     inner: Tensor | None = None
+    exposure: Exposure = Exposure()
 
 
 @dataclass(frozen=True)
@@ -143,6 +158,8 @@ class Drivers:
         beams: [T, 3] direction towards the sun times its strength, or None.
         wind_anomaly: wind / mean wind - 1, or None.
         up: [3], or None where all surfaces lie level.
+        ground: light that comes back from level ground, or None where it is black.
+        ways: [D, 3] directions of the sun for which shadows are known, or None.
     """
 
     times_s: Tensor
@@ -154,6 +171,8 @@ class Drivers:
     beams: Tensor | None = None
     wind_anomaly: Tensor | None = None
     up: Tensor | None = None
+    ground: Tensor | None = None
+    ways: Tensor | None = None
 
 
 def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
@@ -174,6 +193,7 @@ class Climate:
         self.drivers, self.semi_infinite = drivers, semi_infinite
         zero = torch.zeros_like(drivers.air)
         columns = {"air": drivers.air, "light": drivers.light, "sky": drivers.sky, "around": drivers.around}
+        columns |= {"ground": drivers.ground}
         self.wind_anomaly_mean = 0.0
         if drivers.wind_anomaly is not None:
             self.wind_anomaly_mean = float(driver_means(drivers.times_s, drivers.wind_anomaly))
@@ -188,11 +208,23 @@ class Climate:
         rows = [columns.get(name, zero) for name in ("air", "sky", "around", "light")]
         rows += [zero if drivers.wind_anomaly is None else drivers.wind_anomaly]
         rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
+        rows.append(zero if drivers.ground is None else drivers.ground)
         self.rows = torch.stack(rows).contiguous()
+        self.slots = torch.zeros(len(zero), dtype=torch.int64)
+        if drivers.ways is not None:
+            self.slots = nearest_direction(drivers.beams, drivers.ways)
 
-    def share_of_sky(self, normals: Tensor | None) -> Tensor | float:
-        """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2."""
-        return 1.0 if normals is None else 0.5 * (1 + normals @ self.drivers.up.to(normals))
+    def share_of_sky(self, surface: Surface) -> Tensor | float:
+        """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2 of what is open."""
+        if surface.normals is None:
+            return 1.0
+        share = 0.5 * (1 + surface.normals @ self.drivers.up.to(surface.normals))
+        return share if surface.exposure.sky is None else share * surface.exposure.sky
+
+    def _seen(self, surface: Surface) -> Seen | None:
+        """What surfaces see of the sun, None for all of it."""
+        sun = surface.exposure.sun
+        return None if sun is None else Seen(sun, self.drivers.ways, self.slots)
 
     def forcing(self, surface: Surface, values: Tensor, beam: Tensor | float, mean: Tensor | float) -> Tensor:
         """What a surface would settle at, times a / r without radiation's constant: drivers with their weights, [n].
@@ -203,11 +235,12 @@ class Climate:
             mean: temperature at which wind acts, [n].
         """
         take = {name: values[..., j] for name, j in self.columns.items()}
-        sky = self.share_of_sky(surface.normals)
+        sky = self.share_of_sky(surface)
         convection = self._convection(surface)
         total = take["air"] if convection is None else convection * take["air"]
         if surface.sun is not None:
-            total = surface.sun * (beam + sky * take["light"] if "light" in take else beam) + total
+            lit = beam + sky * take["light"] if "light" in take else beam
+            total = surface.sun * (lit + (1 - sky) * take["ground"] if "ground" in take else lit) + total
         if surface.wind is not None:
             gusty = surface.wind if surface.share is None else (1 - surface.share) * surface.wind
             total = total + gusty * (take["gusts_air"] - mean * take["gusts"])
@@ -230,6 +263,9 @@ class Climate:
         Newton's method on a function that rises with x; its last step carries the derivatives (implicit function).
         """
         beam = 0.0 if self.beam is None else self.beam.mean(surface.normals).to(surface.log_rate)
+        seen = self._seen(surface)
+        if seen is not None:
+            beam = beam * seen.mean(surface.normals)
         means = self.means.to(surface.log_rate)
         if surface.share is None:
             forced, convection = self.forcing(surface, means, beam, 0.0), self._convection(surface)
@@ -265,7 +301,7 @@ class Climate:
         def response(log_rate: Tensor) -> tuple[Tensor, Tensor]:
             """What a body of this one rate follows, before it is divided by its stiffness, and what it keeps of its start."""
             settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
-            beam = 0.0 if self.beam is None else self._beam(time_s, surface.normals, log_rate).to(log_rate)
+            beam = 0.0 if self.beam is None else self._beam(time_s, surface, log_rate).to(log_rate)
             if self.semi_infinite:
                 kept = torch.special.erfcx(torch.exp(0.5 * log_rate) * elapsed**0.5)
             else:
@@ -286,15 +322,17 @@ class Climate:
             left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
         return left + (forced if stiffness is None else forced / stiffness)
 
-    def _beam(self, time_s: float, normals: Tensor, log_rate: Tensor) -> Tensor:
+    def _beam(self, time_s: float, surface: Surface, log_rate: Tensor) -> Tensor:
         """Response [n] to the sun's beam; that of a semi-infinite body from so few rates that 0.3 % of it are missed."""
+        normals, seen = surface.normals, self._seen(surface)
         if not self.semi_infinite:
-            return self.beam.response(time_s, normals, log_rate)
+            return self.beam.response(time_s, normals, log_rate, seen)
         distances = torch.linspace(-_FARTHEST, _FARTHEST, _BEAM_RATES, dtype=torch.float64)
         weights = semi_infinite_weights(distances, 2 * _FARTHEST / (_BEAM_RATES - 1)).tolist()
         rates = (log_rate + distance for distance in distances.tolist())
         return sum(
-            weight * self.beam.response(time_s, normals, rate) for weight, rate in zip(weights, rates, strict=True)
+            weight * self.beam.response(time_s, normals, rate, seen)
+            for weight, rate in zip(weights, rates, strict=True)
         )
 
     def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:

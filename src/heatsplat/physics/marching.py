@@ -14,6 +14,7 @@ of them and 10 mK at 5 %; ``Kept`` marches anew what has moved by more than CHAN
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -48,7 +49,7 @@ def constants(surface: Surface, climate: Climate) -> Tensor | None:
     """What else it knows of surfaces, [n, 4]: normals, and their share of the sky; None where all lie level."""
     if surface.normals is None:
         return None
-    return torch.cat((surface.normals, climate.share_of_sky(surface.normals)[:, None]), dim=1).detach()
+    return torch.cat((surface.normals, climate.share_of_sky(surface)[:, None]), dim=1).detach()
 
 
 def march(
@@ -77,10 +78,14 @@ def march(
     numbered = own if here is table else torch.arange(len(own))
     if len(own):
         has = [value is not None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
+        has += [surface.exposure.sun is not None, climate.drivers.ground is not None]
+        seen = given.new_empty(len(given), 0) if surface.exposure.sun is None else surface.exposure.sun.to(given)
         kernels.march(
             kernels.Balance(*has, sensitive),
             first,
             parameters[order].cpu().contiguous().numpy(),
+            seen[order].detach().cpu().contiguous().numpy(),
+            climate.slots.numpy(),
             numbered.cpu().numpy(),
             climate.drivers.times_s.numpy(),
             climate.rows.numpy(),
@@ -104,6 +109,21 @@ def _first_order(found: Tensor, now: Tensor, then: Tensor) -> Tensor:
     return found[:, 0] + (found[:, 1:] * (now - then)).sum(1)
 
 
+def rows_of(surface: Surface, ids: Tensor) -> Surface:
+    """Some of n surfaces of one node."""
+    own = {name: value[ids] for name, value in surface._asdict().items() if isinstance(value, Tensor)}
+    exposure = surface.exposure._make(None if value is None else value[ids] for value in surface.exposure)
+    return surface._replace(**own, exposure=exposure)
+
+
+def unchanged(before: Sequence[tuple[Tensor, int]], now: Sequence[Tensor]) -> bool:
+    """Whether these are the tensors of ``before``, each with the version that it had, and nobody wrote to them since."""
+    return len(before) == len(now) and all(
+        tensor.data_ptr() == was.data_ptr() and tensor.shape == was.shape and tensor._version == version
+        for (was, version), tensor in zip(before, now, strict=True)
+    )
+
+
 class Kept:
     """Temperatures of all N surfaces at the moments that training asks for, with their derivatives.
 
@@ -116,7 +136,7 @@ class Kept:
         self.climate, self.moments_s = climate, moments_s
         self._places = {time: number for number, time in enumerate(moments_s.tolist())}
         self._marched_at: Tensor | None = None
-        self._normals: Tensor | None = None
+        self._given: list[tuple[Tensor, int]] = []
         self._known: Tensor | None = None
         self._table: Tensor | None = None
 
@@ -127,15 +147,15 @@ class Kept:
         return time_s in self._places and size <= KEPT_BYTES
 
     @torch.no_grad()
-    def _refresh(self, surface: Surface, now: Tensor, ids: Tensor, normals: Tensor | None, marched_at: Tensor) -> None:
-        """Marches those of ``ids`` that have moved, or that came or were turned since."""
+    def _refresh(self, surface: Surface, now: Tensor, ids: Tensor, given: Sequence[Tensor], marched_at: Tensor) -> None:
+        """Marches those of ``ids`` that have moved, or that came, were turned or shaded since."""
         same = self._marched_at is not None and torch.equal(self._marched_at, marched_at)
-        if not same or (normals is not None and not torch.equal(self._normals, normals)):
+        if not same or not unchanged(self._given, given):
             if self._table is None or self._table.shape[1] != len(marched_at):
                 self._table = now.new_empty(len(self.moments_s), len(marched_at), 1 + now.shape[1])
             self._known = torch.zeros(len(marched_at), dtype=torch.bool, device=now.device)
             self._marched_at = marched_at.detach().clone()
-            self._normals = None if normals is None else normals.detach().clone()
+            self._given = [(tensor, tensor._version) for tensor in given]
         unit = now.new_tensor([UNITS[name] for name in UNITS if getattr(surface, name) is not None])
         moved = ((now - self._marched_at[ids]).abs() > CHANGE * unit).any(1)
         for place in (marched_at, self._marched_at):
@@ -145,22 +165,22 @@ class Kept:
             rows = ids[stale]
             names = [name for name in UNITS if getattr(surface, name) is not None]
             columns = dict(zip(names, self._marched_at[rows].unbind(1), strict=True))
-            turned = None if surface.normals is None else surface.normals[stale]
-            march(self.climate, surface._replace(**columns, normals=turned), self.moments_s, into=(self._table, rows))
+            there = rows_of(surface, stale)._replace(**columns)
+            march(self.climate, there, self.moments_s, into=(self._table, rows))
             self._known[rows] = True
 
     def temperature(
-        self, surface: Surface, time_s: float, ids: Tensor, normals: Tensor | None, marched_at: Tensor
+        self, surface: Surface, time_s: float, ids: Tensor, given: Sequence[Tensor], marched_at: Tensor
     ) -> Tensor:
         """Temperature x [n] of the surfaces ``ids`` [n] of N at one of the moments; differentiable but by normals.
 
         Args:
             surface: of those ids.
-            normals: [N, 3] of all, or None.
+            given: what else decides of all N and is not learned, such as normals and shadows.
             marched_at: [N, Q] parameters at which each was marched last, which this keeps up to date.
         """
         now = learned(surface)
-        self._refresh(surface, now.detach(), ids, normals, marched_at)
+        self._refresh(surface, now.detach(), ids, given, marched_at)
         found = self._table[self._places[time_s]].index_select(0, ids)
         return _first_order(found, now, self._marched_at.index_select(0, ids))
 
@@ -190,6 +210,6 @@ class Course:
             self._states += list(march(self.climate, begins, moments, False, last * self._every)[..., 0])
         now = self.surface._replace(start=self._states[wanted])
         if ids is not None:
-            now = now._make(None if value is None else value.index_select(0, ids) for value in now)
+            now = rows_of(now, ids)
         moment = torch.tensor([time_s], dtype=torch.float64)
         return march(self.climate, now, moment, False, wanted * self._every)[0, :, 0]

@@ -14,6 +14,7 @@ thousand cases, and 10 mK at worst: heavy surfaces that the sun grazes for hours
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +28,25 @@ YOUNGEST_S = 12 * 3600.0  # age of the table that is used, at least (6 hours dou
 HEIGHTS, AZIMUTHS = 91, 181  # of the grid of normals: 2 degrees (3 double the error); 3 MB for each table
 FASTEST = 5e-4  # 1/s, the largest rate of the tables: twelve hours later 4e-10 is left of them
 RATES = 49
+
+
+class Seen(NamedTuple):
+    """What n surfaces see of the sun.
+
+    Args:
+        shares: [n, D] in [0, 1] of the beam from D directions.
+        directions: [D, 3].
+        slots: [T] int64 direction at each sample of the record.
+    """
+
+    shares: Tensor
+    directions: Tensor
+    slots: Tensor
+
+    def mean(self, normals: Tensor) -> Tensor:
+        """Share [n] of the beam over all directions, by how it strikes."""
+        weights = (normals @ self.directions.T.to(normals)).clamp(min=0.0)
+        return ((weights * self.shares).sum(1) / weights.sum(1).clamp(min=1e-6)).to(normals)
 
 
 class SunlightTable:
@@ -73,17 +93,27 @@ class SunlightTable:
         corners, weights = _corners(normals)
         return (self._means.to(weights)[corners, 0] * weights).sum(1)
 
-    def response(self, time_s: float, normals: Tensor, log_rates: Tensor) -> Tensor:
-        """Settled responses [n] at a moment of the record; differentiable by normals [n, 3] and log rates [n]."""
+    def response(self, time_s: float, normals: Tensor, log_rates: Tensor, seen: Seen | None = None) -> Tensor:
+        """Settled responses [n] at a moment of the record; differentiable by normals [n, 3] and log rates [n].
+
+        Of what is ``seen`` of the sun, the hours before those that are summed know the mean alone.
+        """
         oldest = time_s - YOUNGEST_S
         anchor = max([0] + [a for a, k in enumerate(self._anchors) if float(self.times_s[k]) <= oldest])
         first = self._anchors[anchor]
         last, seconds = interval_of(self.times_s, time_s)
         share = seconds / float(self.steps[last])
-        recent = _Recent.apply(normals, log_rates, self.steps[first : last + 1], self.beams[first : last + 2], share)
+        within = slice(first, last + 2)
+        shares, slots = (normals.new_empty(len(normals), 0), torch.zeros(1, dtype=torch.int64))
+        if seen is not None:
+            shares, slots = seen.shares, seen.slots[within]
+        steps = self.steps[first : last + 1]
+        recent = _Recent.apply(normals, log_rates, steps, self.beams[within], shares, slots, share)
         if anchor == 0:
             return recent
         kept = torch.exp(-log_rates.exp() * (time_s - float(self.times_s[first])))
+        if seen is not None:
+            kept = kept * seen.mean(normals)
         return recent + kept * self._earlier(self._tables[anchor - 1], normals, log_rates)
 
     def _earlier(self, table: Tensor, normals: Tensor, log_rates: Tensor) -> Tensor:
@@ -124,7 +154,9 @@ class _Recent(torch.autograd.Function):
     """Responses since a sample, from rest there; the kernel runs on the CPU and gives derivatives along with values."""
 
     @staticmethod
-    def forward(ctx, normals: Tensor, log_rates: Tensor, steps: Tensor, beams: Tensor, share: float) -> Tensor:
+    def forward(
+        ctx, normals: Tensor, log_rates: Tensor, steps: Tensor, beams: Tensor, seen: Tensor, slots: Tensor, share: float
+    ) -> Tensor:
         on_cpu = normals.detach().cpu().contiguous(), log_rates.detach().cpu().contiguous()
         responses, slopes = (torch.empty(len(log_rates), dtype=log_rates.dtype) for _ in range(2))
         vectors = torch.empty(len(log_rates), 3, dtype=normals.dtype)
@@ -133,6 +165,8 @@ class _Recent(torch.autograd.Function):
             on_cpu[1].numpy(),
             steps.numpy(),
             beams.numpy(),
+            seen.detach().cpu().contiguous().numpy(),
+            slots.numpy(),
             share,
             *(x.numpy() for x in (responses, slopes, vectors)),
         )
@@ -144,4 +178,4 @@ class _Recent(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, gradient: Tensor):
         slopes, vectors = ctx.saved_tensors
-        return gradient[:, None] * vectors, gradient * slopes, None, None, None
+        return gradient[:, None] * vectors, gradient * slopes, None, None, None, None, None

@@ -12,19 +12,31 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.physics import sky
-from heatsplat.physics.energy_balance import Climate, Core, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, Surface, power_excess
+from heatsplat.physics.exposure import sun_directions
 from heatsplat.physics.marching import Course, Kept
-from heatsplat.physics.responses import driver_means
+from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.walls import u_value
+from heatsplat.physics.walls import CONVECTION, u_value
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import KELVIN_RANGE, NORMALS, PerGaussian, Query, Seeds, ThermalModel, surface_normals
+from heatsplat.thermal.base import (
+    KELVIN_RANGE,
+    NORMALS,
+    SKY_SEEN,
+    SUN_SEEN,
+    PerGaussian,
+    Query,
+    Seeds,
+    ThermalModel,
+    surface_normals,
+)
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
 
 log = logging.getLogger(__name__)
 
 SOLUTIONS = ("linear", "corrected")
+EXCHANGES = ("learned", "iso_6946")
 SURFACES = ("seen", "level")
 SKIES = ("auto", *sky.LAWS)
 SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
@@ -37,6 +49,7 @@ START_COUPLING = 0.5
 COUPLINGS = (math.log(0.02), math.log(50.0))
 START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
+GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind")  # of bodies of one node
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
 COSTS = {"linear": 400, "corrected": 400}
@@ -49,7 +62,8 @@ class EnergyBalance(ThermalModel):
     same temperatures. Learned are the ratios themselves, in units in which an optimiser's steps are of order one; absolute
     attributes follow with ``emissivity`` given, and are maps for people, not measurements. Effects that the scene does not
     call for are absent: without a sky there is no share of radiation, without wind in the record no share of wind, without
-    the sun's direction no normal, without any irradiance no sunlight.
+    the sun's direction no normal, without any irradiance no sunlight. What the scene's own geometry does to them (shadows,
+    sky that is hidden, light from the ground) is there where it is asked for.
 
     Bodies without an end (``semi_infinite``) are massive walls and ground that the record does not heat through: one number
     in the place of the rate, a = (H/b)², tells their effusivity b. ``inner`` adds a constant heat from within, q/H for each
@@ -84,9 +98,15 @@ class EnergyBalance(ThermalModel):
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
         inner: whether there is heat from within (with solution "linear").
+        exchange: "learned" has each Gaussian find radiation's and wind's share of its exchange; "iso_6946" takes them from the
+            emissivity and the convention of building physics, 4 W/(m² K) and 4 more for each m/s of wind, which leaves
+            images to tell heat from within.
         indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
+        shadows: whether what stands in the way of the sun casts shadows (``Query.exposure``).
+        sky_view: whether it hides sky as well.
+        albedo: of the ground, for sunlight that comes back from what is not sky; None: nothing comes back.
         emissivity: assumed for ``attributes``, in (0, 1].
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
         lr_initial, lr_rate, lr_sun, lr_share, lr_wind, lr_inner: learning rates.
@@ -109,8 +129,12 @@ class EnergyBalance(ThermalModel):
         sun: bool = True,
         semi_infinite: bool = False,
         inner: bool = False,
+        exchange: str = "learned",
         indoor_c: float | None = None,
         normals: str = "seen",
+        shadows: bool = False,
+        sky_view: bool = False,
+        albedo: float | None = None,
         emissivity: float = 0.95,
         clip: str = "straight_through",
         lr_initial: float = 2.5e-3,
@@ -126,6 +150,7 @@ class EnergyBalance(ThermalModel):
             ("solution", solution, SOLUTIONS),
             ("normals", normals, SURFACES),
             ("clip", clip, CLIPS),
+            ("exchange", exchange, EXCHANGES),
             ("sky", sky, (*SKIES, None)),
         ):
             check_option(name, value, known)
@@ -135,12 +160,22 @@ class EnergyBalance(ThermalModel):
                 raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
         if nodes == 2 and semi_infinite:
             raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
+        if exchange != "learned" and (sky is None or not wind):
+            raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
         if indoor_c is not None and not inner:
             raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
+        if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
+            raise ValueError(
+                "shadows, sky_view and albedo are of sunlight on surfaces as they lie: give sun=true, normals=seen"
+            )
+        if albedo is not None and not 0 < albedo < 1:
+            raise ValueError(f"albedo must lie in (0, 1), or be null for none, got {albedo}")
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
+        self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
+        self.exchange = exchange
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
@@ -201,6 +236,8 @@ class EnergyBalance(ThermalModel):
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
+        if self.exchange != "learned":
+            return tensors if drivers.up is None else tensors | surface_normals(seeds)
         if drivers.sky is not None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
@@ -208,7 +245,13 @@ class EnergyBalance(ThermalModel):
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         if self.solution == "corrected":
             tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), len(tensors)), 0.0)  # at none that there is
-        return tensors if drivers.up is None else tensors | surface_normals(seeds)
+        if drivers.up is None:
+            return tensors
+        if self.shadows:
+            tensors[SUN_SEEN] = PerGaussian(grey.new_ones(len(grey), len(drivers.ways)), 0.0)
+        if self.sky_view:
+            tensors[SKY_SEEN] = PerGaussian(torch.ones_like(grey), 0.0)
+        return tensors | surface_normals(seeds)
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         if query.time_s is None:
@@ -221,9 +264,10 @@ class EnergyBalance(ThermalModel):
         return self._temperature(splats, Query(time_s=time_s)) + self.reference_k.item()
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's; and with
-        the assumed emissivity absorptivity, convection at mean wind, heat capacity per area (of bodies without an end their
-        effusivity), and the heat that a wall loses with its U-value, which are estimates (``physics.walls``)."""
+        """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of
+        the sky is open and of the sun's beam arrives; and with the assumed emissivity absorptivity, convection at mean wind,
+        heat capacity per area (of bodies without an end their effusivity), and the heat that a wall loses with its U-value,
+        which are estimates (``physics.walls``)."""
         surface = self._surface(splats, query)
         if self.semi_infinite:  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
             values = {"settling_time_h": torch.exp(-surface.log_rate) / 3600.0}
@@ -238,6 +282,11 @@ class EnergyBalance(ThermalModel):
             values["wind_share"] = surface.wind
         if surface.inner is not None:
             values["inner_rise_k"] = surface.inner
+        if surface.exposure.sky is not None:
+            values["sky_open"] = surface.exposure.sky
+        if surface.exposure.sun is not None and query.time_s is not None:
+            sample, _ = interval_of(self.climate.drivers.times_s, query.time_s)
+            values["sunlit"] = surface.exposure.sun[:, self.climate.slots[sample]]
         if surface.share is not None:
             exchange = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
             values["radiation_share"] = surface.share
@@ -287,12 +336,12 @@ class EnergyBalance(ThermalModel):
         if not self._kept.has(query.time_s, splats[MARCHED_AT]):
             return self.climate.stepped_temperature(surface, query.time_s)
         ids = torch.arange(len(splats), device=splats.means.device) if query.ids is None else query.ids
-        normals = splats[NORMALS].detach() if surface.normals is not None else None
-        return self._kept.temperature(surface, query.time_s, ids, normals, splats[MARCHED_AT].detach())
+        given = [splats[name].detach() for name in GIVEN if name in splats]
+        return self._kept.temperature(surface, query.time_s, ids, given, splats[MARCHED_AT].detach())
 
     def _course_of(self, splats: Splats) -> Course:
         """The course of all Gaussians as they are now: that of the last view, unless something has changed since."""
-        now = {name: splats[name].detach() for name in (*LEARNED, NORMALS) if name in splats}
+        now = {name: splats[name].detach() for name in (*LEARNED, *GIVEN) if name in splats}
         if self._course is None or not all(torch.equal(now[name], was) for name, was in self._course[0].items()):
             course = Course(self.climate, self._surface(splats, Query()))
             self._course = {name: tensor.clone() for name, tensor in now.items()}, course
@@ -310,16 +359,30 @@ class EnergyBalance(ThermalModel):
             return Core(state("initial_core"), query.rows(splats["log_core_rate"]).clamp(*LOG_RATES), coupling)
 
         drivers = self.climate.drivers
+        log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
+        if self.exchange == "learned":
+            share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
+            wind = bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None
+        else:
+            share, wind = (torch.full_like(log_rate, value) for value in self._convention())
         return Surface(
             start=state("initial_state"),
-            log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
+            log_rate=log_rate,
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
-            share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
-            wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
+            share=share,
+            wind=wind,
             normals=query.normals(splats) if drivers.up is not None else None,
+            exposure=Exposure(*(query.rows(splats[n].detach()) if n in splats else None for n in (SUN_SEEN, SKY_SEEN))),
             core=core() if self.nodes == 2 else None,
             inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
         )
+
+    def _convention(self) -> tuple[float, float]:
+        """Radiation's share of the exchange at mean wind, and the wind's of convection."""
+        windy = CONVECTION[1] * self.mean_wind.item()
+        convection = CONVECTION[0] + windy
+        radiation = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
+        return radiation / (radiation + convection), windy / convection
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -345,6 +408,13 @@ class EnergyBalance(ThermalModel):
             effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
         parts: dict[str, Any] = {}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
+        if up is not None:
+            self._surroundings(weather, up, parts, effects)
+        elif self.shadows or self.sky_view or self.albedo is not None:
+            raise SceneError(
+                "shadows, sky_view and albedo need the direction of the sun with its direct and diffuse light, which the "
+                "weather lacks; add them, or leave these effects out"
+            )
         if self._sky is not None:
             humid = weather.humidity_percent is not None
             law = ("brutsaert" if humid else "swinbank") if self._sky == "auto" else self._sky
@@ -363,10 +433,24 @@ class EnergyBalance(ThermalModel):
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
             parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
             effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
+        elif self.exchange != "learned":
+            raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
         return drivers, effects
+
+    def _surroundings(self, weather: Weather, up: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> None:
+        """Adds what comes of the scene's own geometry to the drivers, and tells the effects of it."""
+        if self.shadows:
+            parts["ways"] = sun_directions(weather.sun, up)
+            effects["shadows"] = {"directions": len(parts["ways"])}
+        if self.sky_view:
+            effects["sky_view"] = {"sky": "as far as it is open"}
+        if self.albedo is not None:
+            level = weather.direct_w_m2 * (weather.sun @ up).clamp(min=0.0) + weather.diffuse_w_m2
+            parts["ground"] = self.albedo * level / 1000.0
+            effects["albedo"] = {"ground": self.albedo}
 
     def _light(self, weather: Weather, effects: dict[str, dict]) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
         """Up (None where surfaces lie level), light of all but the beams, and beams; tells the effects of it."""

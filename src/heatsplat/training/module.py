@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,8 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import NORMALS, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import NORMALS, SKY_SEEN, SUN_SEEN, Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.training.exposure import Exposure
 from heatsplat.training.init import Initialisation
 from heatsplat.training.normals import Normals
 from heatsplat.training.optimisation import Optimisation, penalties
@@ -60,6 +63,7 @@ class SplatTraining(pl.LightningModule):
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
         normals: where normals come from, of models that read them; None: as before training, throughout.
+        exposure: what hides sun and sky, of models that ask for that; None: nothing, throughout.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -87,6 +91,7 @@ class SplatTraining(pl.LightningModule):
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
         normals: Normals | None = None,
+        exposure: Exposure | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -104,6 +109,7 @@ class SplatTraining(pl.LightningModule):
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
         self.normals = normals or Normals()
+        self.exposure = exposure or Exposure()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -149,6 +155,9 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.prepare(scene, self.splats.means.detach())
         if NORMALS in self.splats:
             self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
+        if self._exposed:
+            self.exposure.prepare(scene, self.renderer, self.normals.discs, self._exposed)
+            self._expose()
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -212,6 +221,8 @@ class SplatTraining(pl.LightningModule):
         for name, gradient in self._waiting.items():
             self.get_parameter(name).grad = gradient.to(self.device)
         self._waiting = {}
+        if self.trainer.gradient_clip_val:  # Lightning clips what is in grad
+            self.trainer.optimizers[0].takes_unwritten = False
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -255,8 +266,9 @@ class SplatTraining(pl.LightningModule):
             told = self.thermal.features(self.splats, query) if values is None else values.index_select(0, ids)
             return self.composite.encode(told, channels)
 
+        raw = moved is None and not self.smoothing.changes
         output = self.renderer(
-            *self._shapes(moved),
+            *(self._raw_shapes() if raw else self._shapes(moved)),
             emitted,
             frame.camera,
             self.background,
@@ -266,8 +278,15 @@ class SplatTraining(pl.LightningModule):
             maps=maps,
             ratio=ratio,
             signs=signs,
+            raw=raw,
         )
-        return replace(output, features=self.composite.decode(output.features, channels))
+        image = self.composite.decode(output.features, channels)
+        return output if image is output.features else replace(output, features=image)
+
+    def _raw_shapes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, logarithms of scales and logits of opacities of all Gaussians."""
+        splats = self.splats
+        return splats.means, splats.quats, splats["log_scales"], splats["opacity_logits"].T
 
     def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are."""
@@ -280,14 +299,14 @@ class SplatTraining(pl.LightningModule):
         ratio = self.resolution.ratio(progress)
         camera = rendered(view.camera, self.supersample / ratio)
         view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
-        frame = replace(view.frame, camera=camera)
+        frame = view.frame if camera is view.camera else replace(view.frame, camera=camera)
         self.thermal.on_step(here)
         signs = self.overlap.signs_at(here, len(self.splats), self.seed)
         maps = self.density.maps_at(here)
         output = self.render(
             frame, depth=self.sensor.needs_depth, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs
         )
-        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
             prediction,
@@ -304,13 +323,18 @@ class SplatTraining(pl.LightningModule):
         if signs is not None:
             terms["entropy"] = self.overlap.entropy(output, here)
         self._rendered = (output, camera)
-        loss = sum(terms.values())
+        loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
             target = resampled(inputs.target, camera.height, camera.width, "area")
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
+
+    def _images(self, output: RenderOutput) -> Sequence[Tensor]:
+        """The image of each modality, the model's own first."""
+        channels = self.thermal.modality_channels
+        return [output.features] if len(channels) == 1 else output.features.split(channels, dim=-1)
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
@@ -349,8 +373,10 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         if NORMALS in self.splats and step + 1 in self.normals.refresh:
             self._face(self.splats[NORMALS].detach())
+        if self._exposed and step + 1 in self.exposure.refresh:
+            self._expose()
         if change is not None:
-            for group in optimizer.param_groups:
+            for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
 
@@ -358,6 +384,17 @@ class SplatTraining(pl.LightningModule):
     def _face(self, normals: Tensor) -> None:
         """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
         self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
+
+    @property
+    def _exposed(self) -> list[str]:
+        """Tensors of the splats that tell what reaches them of sun and sky."""
+        return [name for name in (SUN_SEEN, SKY_SEEN) if name in self.splats]
+
+    @torch.no_grad()
+    def _expose(self) -> None:
+        """Looks anew what hides sun and sky from the splats, where a model asks for that."""
+        for name, shares in self.exposure.look(self.splats.means.detach()).items():
+            self.splats[name].copy_(shares)
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
@@ -377,7 +414,7 @@ class SplatTraining(pl.LightningModule):
         Last comes "clean", what a camera without the flaws of the sensor chain would record.
         """
         output = self.render(frame, depth=self.sensor.needs_depth)
-        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        image, *companions = self._images(output)
         images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}

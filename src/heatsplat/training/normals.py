@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.spatial import cKDTree
@@ -22,6 +22,19 @@ OPACITY, FLATNESS = 0.95, 0.1  # of discs, and their thickness by their radius
 WIDEST = 2.0  # radius of a disc, in medians: what stands alone is no large surface
 
 
+@dataclass(frozen=True)
+class Discs:
+    """What is known of a scene's surfaces before training: opaque discs in the planes of its points.
+
+    Args:
+        shapes: means [P, 3], rotations [P, 4], semi-axes [P, 3] and opacities [1, P], as a renderer takes them.
+        normals: [P, 3] unit vectors to the side from which training views see them.
+    """
+
+    shapes: tuple[Tensor, Tensor, Tensor, Tensor]
+    normals: Tensor
+
+
 class Normals:
     """Unit normals of the surfaces that Gaussians show, [N, 3], pointing to the side from which they are seen.
 
@@ -32,7 +45,7 @@ class Normals:
     training has left it.
 
     Between two looks normals stand still, and new Gaussians inherit them. They are a tensor of the splats, so that a
-    checkpoint has those that it was written with.
+    checkpoint has those that it was written with. ``discs`` are there once ``prepare`` has looked.
 
     Args:
         refresh: steps before which it is looked again; the first look is before training.
@@ -53,6 +66,7 @@ class Normals:
         self.views, self.side, self.neighbours = views, side, neighbours
         self._frames: list[tuple[Frame, float]] = []
         self._maps: list[Tensor] = []
+        self.discs: Discs | None = None
 
     @torch.no_grad()
     def prepare(self, scene: SceneData, renderer: Renderer, means: Tensor) -> Tensor:
@@ -81,6 +95,7 @@ class Normals:
             seen = _gathered(show, frame, ratio, everywhere, points)
             towards += seen * torch.nn.functional.normalize(frame.camera.center.to(points) - points, dim=1)
         normals = on_the_side_of(axes[..., 2].float(), towards)
+        self.discs = Discs(discs, normals)
         self._maps = []
         for frame, ratio in self._frames:
             seen = show(frame, normals, ratio=ratio)

@@ -1,0 +1,20 @@
+"""The sky mirrored in what does not emit."""
+
+from __future__ import annotations
+
+from heatsplat.effects.base import Effect, Part
+from heatsplat.effects.weather_record import NEVER, only_if_asked
+
+EFFECT = Effect(
+    name="mirrored_sky",
+    stage="emission",
+    place=2,
+    summary="the sky mirrored in what does not emit",
+    source="Kirchhoff's law under a sky of one optical depth (Elsasser 1942)",
+    needs=frozenset({"time", "thermal_range", "weather"}),
+    null="what a surface does not emit does not show",
+    threshold=NEVER,
+    adds="a reflectance for each Gaussian, the sky in one direction",
+    evidence=only_if_asked,
+    part=Part("path", "mirrored_sky"),
+)

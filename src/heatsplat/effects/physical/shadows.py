@@ -1,0 +1,22 @@
+"""Shadows that are cast within a scene."""
+
+from __future__ import annotations
+
+from heatsplat.effects.base import Effect, Part
+from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
+
+EFFECT = Effect(
+    name="shadows",
+    stage="state",
+    place=6,
+    summary="what stands in the way of the sun casts shadows",
+    source="Williams (1978), with the splatted depth of the scene",
+    needs=frozenset({"time", "thermal_range", "weather"}),
+    null="what hides the sun does not show",
+    threshold=NEVER,
+    adds="a share for each Gaussian and direction of the sun",
+    evidence=only_if_asked,
+    part=Part("state", "energy_balance", off={"shadows": False}),
+    stands_on="solar",
+    missing=directed,
+)

@@ -1,0 +1,22 @@
+"""Sky that is hidden by what stands around."""
+
+from __future__ import annotations
+
+from heatsplat.effects.base import Effect, Part
+from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
+
+EFFECT = Effect(
+    name="sky_view",
+    stage="state",
+    place=7,
+    summary="what stands around hides a part of the sky",
+    source="sky view factor (Oke 1987), from the splatted depth of the scene",
+    needs=frozenset({"time", "thermal_range", "weather"}),
+    null="what hides the sky does not show",
+    threshold=NEVER,
+    adds="a share for each Gaussian",
+    evidence=only_if_asked,
+    part=Part("state", "energy_balance", off={"sky_view": False}),
+    stands_on="solar",
+    missing=directed,
+)
