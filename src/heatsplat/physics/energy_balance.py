@@ -45,7 +45,6 @@ import torch
 from torch import Tensor
 
 from heatsplat.physics import marching
-from heatsplat.physics.exposure import nearest_direction
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,
@@ -212,7 +211,7 @@ class Climate:
         self.rows = torch.stack(rows).contiguous()
         self.slots = torch.zeros(len(zero), dtype=torch.int64)
         if drivers.ways is not None:
-            self.slots = nearest_direction(drivers.beams, drivers.ways)
+            self.slots = (drivers.beams @ drivers.ways.T).argmax(1)
 
     def share_of_sky(self, surface: Surface) -> Tensor | float:
         """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2 of what is open."""
@@ -310,8 +309,9 @@ class Climate:
             return forced if constant is None else forced + constant * (1 - kept), kept
 
         if surface.core is None:
-            power = 2 if self.semi_infinite else 1  # of H in its rate
-            log_rate = surface.log_rate if stiffness is None else surface.log_rate + power * stiffness.log()
+            log_rate = surface.log_rate if stiffness is None else surface.log_rate + stiffness.log()
+            if self.semi_infinite and stiffness is not None:
+                log_rate = log_rate + stiffness.log()  # H counts twice in its rate
             forced, kept = response(log_rate)
             left = surface.start * kept
         else:
