@@ -78,7 +78,7 @@ def test_conduction_wraps_the_state():
 @pytest.mark.parametrize("name", ON_THE_WAY)
 def test_a_part_stands_in_the_configuration_exactly_when_its_effect_is_on(name):
     everything = assembled(*assembly.NAMES)["thermal"]["parts"]
-    assert list(everything) == ["view_dependence", "reflection", "attenuation"]
+    assert list(everything) == ["view_dependence", "reflection", "mirrored_sky", "attenuation"]
     assert list(assembled(name)["thermal"]["parts"]) == [name]
 
 
@@ -164,7 +164,8 @@ def test_every_selection_of_one_effect_can_be_built():
 
 
 def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
-    thermal = build(assembled(*set(assembly.NAMES) - {"solar", "radiation", "convection"})["thermal"])
+    outdoors = {"solar", "radiation", "convection", "shadows", "sky_view", "albedo"}
+    thermal = build(assembled(*set(assembly.NAMES) - outdoors)["thermal"])
     assert set(thermal.effects()) <= set(assembly.NAMES)
     assert {"relaxation", "conduction", *ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
 

@@ -75,7 +75,6 @@ ELSEWHERE = {
     "thermal/test_time_mlp": "thermal/layers",
     "training/test_auto_verdicts": "runs/prices runs/verdicts",
     "training/test_composite_runs": "sensors/band_composite sensors/composite sensors/total_composite",
-    "training/test_exposure": "physics/exposure",
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }

@@ -9,7 +9,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, Weather
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.shapes import trace
-from heatsplat.physics.exposure import nearest_direction, open_share, sky_directions, sun_directions
+from heatsplat.geometry.exposure import sun_directions
 from heatsplat.renderers.settings import Renderer
 from heatsplat.training.exposure import Exposure
 from heatsplat.training.normals import Normals
@@ -80,29 +80,6 @@ def test_the_floor_of_a_street_sees_the_sky_that_geometry_leaves_it(width, heigh
     assert truth - 0.06 < seen[middle].mean().item() < truth + 0.02
 
 
-def test_half_the_hemisphere_is_left_beside_a_wall_without_end():
-    directions = sky_directions(4096, UP)
-    beside = (directions[:, 0] > 0).double()[None]  # the wall takes all directions of one side
-    level = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    assert open_share(level, directions, beside).item() == pytest.approx(0.5, abs=2e-3)
-    assert open_share(level, directions, torch.ones(1, 4096)).item() == pytest.approx(1.0)
-    weights = directions[:, 2]  # an even sky on level ground: the mean cosine is a half
-    assert weights.mean().item() == pytest.approx(0.5, abs=1e-3)
-
-
-def test_directions_of_the_sun_stand_for_all_of_its_way():
-    angle = torch.linspace(-2.0, 8.0, 500, dtype=torch.float64)
-    sun = torch.stack((angle.cos(), 0.6 * angle.sin(), 0.8 * angle.sin()), dim=1)
-    ways = sun_directions(sun, UP)
-    risen = sun[sun[:, 2] > 0]
-    apart = (ways[nearest_direction(risen, ways)] * risen).sum(1).clamp(max=1).acos()
-    assert apart.max() <= math.radians(1.2501)
-    assert 70 < len(ways) < 160  # once for all days
-    assert len(sun_directions(-UP.expand(3, 3), UP)) == 0
-    with pytest.raises(ValueError, match="exposure.directions and side must be at least 1"):
-        Exposure(side=0)
-
-
 def test_the_yard_is_lit_as_rays_say():
     """Of a yard's points, against its boxes by ray tracing: shadows that are found outweigh those that are not there."""
     scene, world = Synthetic(scene="outdoor", size="demo").scene, OutdoorScene(OUTDOOR["outdoor"])
@@ -121,3 +98,5 @@ def test_the_yard_is_lit_as_rays_say():
     error, without = (((shares - truth).abs() * weights).sum() for shares in (found["sun_seen"][:, some], 1.0))
     assert found["sun_seen"].shape == (len(scene.points), len(directions))
     assert error < 0.6 * without
+    with pytest.raises(ValueError, match="exposure.directions and side must be at least 1"):
+        Exposure(side=0)

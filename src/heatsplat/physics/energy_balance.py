@@ -45,7 +45,6 @@ import torch
 from torch import Tensor
 
 from heatsplat.physics import marching
-from heatsplat.physics.exposure import nearest_direction
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,
@@ -212,7 +211,7 @@ class Climate:
         self.rows = torch.stack(rows).contiguous()
         self.slots = torch.zeros(len(zero), dtype=torch.int64)
         if drivers.ways is not None:
-            self.slots = nearest_direction(drivers.beams, drivers.ways)
+            self.slots = (drivers.beams @ drivers.ways.T).argmax(1)
 
     def share_of_sky(self, surface: Surface) -> Tensor | float:
         """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2 of what is open."""

@@ -16,7 +16,7 @@ from heatsplat.splats import Splats
 
 NORMALS = "normals"  # the tensor that ``surface_normals`` declares
 # Tensors that training fills where a model declares them, and new Gaussians inherit: shares [N, D] of the sun from the D
-# directions of ``physics.exposure.sun_directions``, and [N] of the sky (heatsplat.training.exposure).
+# directions of ``geometry.exposure.sun_directions``, and [N] of the sky (heatsplat.training.exposure).
 SUN_SEEN, SKY_SEEN = "sun_seen", "sky_seen"
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
 

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
+from heatsplat.geometry.exposure import sun_directions
 from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, Surface, power_excess
-from heatsplat.physics.exposure import sun_directions
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
@@ -52,7 +52,7 @@ LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 secon
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind")  # of bodies of one node
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
-COSTS = {"linear": 400, "corrected": 400}
+COSTS = {"linear": 400, "corrected": 3000}
 
 
 class EnergyBalance(ThermalModel):
@@ -315,8 +315,8 @@ class EnergyBalance(ThermalModel):
 
     @property
     def cost(self) -> int:
-        # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 190 steps of some 100 for one
-        # Gaussian of fifty (over 1000 steps on outdoor), and a sum of five products for all.
+        # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 190 steps of some 100 for each
+        # Gaussian that is marched anew, one of six (300 steps on outdoor), and a sum of five products for all.
         return COSTS[self.solution] * self.nodes
 
     # The balance ----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData
 from heatsplat.geometry.coverage import surface_depth
-from heatsplat.physics.exposure import open_share, sky_directions, sun_directions
+from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
 from heatsplat.renderers.settings import Renderer
 from heatsplat.thermal.base import SKY_SEEN, SUN_SEEN
 from heatsplat.training.normals import Discs

@@ -22,11 +22,6 @@ def sun_directions(sun: Tensor, up: Tensor) -> Tensor:
     return torch.stack(found) if found else sun.new_zeros(0, 3)
 
 
-def nearest_direction(sun: Tensor, directions: Tensor) -> Tensor:
-    """Which of directions [D, 3] is nearest to each of [T, 3], [T] int64; 0 where there are none."""
-    return (sun @ directions.T).argmax(1) if len(directions) else torch.zeros(len(sun), dtype=torch.int64)
-
-
 def sky_directions(count: int, up: Tensor) -> Tensor:
     """Directions [count, 3] float64 above the horizon that stand for equal parts of the hemisphere (a spiral)."""
     number = torch.arange(count, dtype=torch.float64)

@@ -1,0 +1,31 @@
+"""Directions of sun and sky, and what is left of an even sky where some of them are hidden."""
+
+import math
+
+import pytest
+import torch
+
+from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def test_half_the_hemisphere_is_left_beside_a_wall_without_end():
+    directions = sky_directions(4096, UP)
+    beside = (directions[:, 0] > 0).double()[None]  # the wall takes all directions of one side
+    level = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    assert open_share(level, directions, beside).item() == pytest.approx(0.5, abs=2e-3)
+    assert open_share(level, directions, torch.ones(1, 4096)).item() == pytest.approx(1.0)
+    weights = directions[:, 2]  # an even sky on level ground: the mean cosine is a half
+    assert weights.mean().item() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_directions_of_the_sun_stand_for_all_of_its_way():
+    angle = torch.linspace(-2.0, 8.0, 500, dtype=torch.float64)
+    sun = torch.stack((angle.cos(), 0.6 * angle.sin(), 0.8 * angle.sin()), dim=1)
+    ways = sun_directions(sun, UP)
+    risen = sun[sun[:, 2] > 0]
+    apart = (risen @ ways.T).amax(1).clamp(max=1).acos()
+    assert apart.max() <= math.radians(1.2501)
+    assert 70 < len(ways) < 160  # once for all days
+    assert len(sun_directions(-UP.expand(3, 3), UP)) == 0
