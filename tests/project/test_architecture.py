@@ -53,6 +53,7 @@ ALLOWED = {
         "density",
         "io",
         "kernels",
+        "physics",
     },  # fmt: skip
     "shots": {"contracts", "geometry", "io"},
     "uncertainty": {"contracts", "geometry", "physics", "shots", "thermal"},
