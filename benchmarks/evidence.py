@@ -40,7 +40,8 @@ What was taken in has to show it where it was not fitted (`effects/joint/certain
 quarter at a time, it has to gain 0.3 dB, and 3.5 standard errors over the images; images whose departures are shuffled must not
 gain as much; and what an image has in common must be common to all of its points. Sun, sky and wind are judged by balances of
 heat fitted with and without them (`effects/weathered.py`). What fails, what would take its place, and what the record has too
-few frames for **cannot be told**: it is off, and its reason says what would be needed. A run's table has the decibels beside
+few frames for **cannot be told**, and its reason says what would be needed. It is then simulated only where the joint
+fit took it in, as the best explanation of the images that there is. A run's table has the decibels beside
 the milliseconds that they cost; `effects.least_db_per_ms` asks for a least ratio of the two.
 
 `method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing.
@@ -127,7 +128,7 @@ class Outcome:
     @property
     def taken(self) -> frozenset[str]:
         """Names of the effects that were told to be there and are not."""
-        return self.found - self.present
+        return self.found - self.present - self.untold
 
     @property
     def wrong(self) -> int:

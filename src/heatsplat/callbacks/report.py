@@ -309,7 +309,8 @@ def effects_table(effects: Mapping[str, Any]) -> list[str]:
             "–" if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
             for key in ("statistic", "threshold", "parameters", "ms_per_step")
         )
-        on = "**yes**" if effect["on"] else "no" if effect["told"] else "cannot be told"
+        sure = "**yes**" if effect["on"] else "no"
+        on = sure if effect["told"] else "yes, but cannot be told" if effect["on"] else "cannot be told"
         gain, cost = effect["gain_db"], effect["ms_per_step"]
         gains = ("–" if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else "–")
         rows.append((name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds))

@@ -284,7 +284,7 @@ def verdict_table(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
         priced = "ms_per_step" in verdict
         numbers = f"{verdict['per_gaussian']:+d} N {verdict['shared']:+d}" if priced else ""
         milliseconds = f"{verdict['ms_per_step']:+.2f}" if priced else ""
-        on = "on" if verdict["on"] else "off" if verdict["told"] else "?"
+        on = ("on" if verdict["told"] else "on?") if verdict["on"] else "off" if verdict["told"] else "?"
         gain = "" if verdict["gain_db"] is None else f"{verdict['gain_db']:+.1f}"
         rows.append((name, on, statistic, gain, milliseconds, numbers, verdict["reason"]))
     widths = [max(len(row[i]) for row in rows) for i in range(6)]

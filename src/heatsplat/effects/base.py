@@ -115,7 +115,8 @@ class Verdict:
         statistic, threshold: of its evidence; None where it was forced or nothing could be measured.
         reason: in a sentence.
         settings: what it starts from, handed to the configuration.
-        told: False where the data do not say whether it is there; it is then off.
+        told: False where the data do not say whether it is there; it is then simulated only as the best explanation of the
+            images that there is.
         gain_db: on observations that it was not fitted to (``Evidence``).
     """
 

@@ -60,7 +60,8 @@ def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
     if choice == "on":
         return Verdict(effect.name, True, None, None, f"effects.{effect.name}=on", evidence.settings)
     known = evidence.statistic is not None and math.isfinite(evidence.statistic)
-    on = known and evidence.told and evidence.statistic > effect.threshold
+    # What was taken in without being certain is still the best explanation of the images that there is.
+    on = known and evidence.statistic > effect.threshold and (evidence.told or evidence.gain_db is not None)
     statistic = float(evidence.statistic) if known else None
     return Verdict(
         effect.name,
