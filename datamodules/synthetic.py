@@ -89,7 +89,8 @@ class Synthetic(SceneDataModule):
                 f"data.days={days}: outdoor_true lasts 2 to {MOST_DAYS} days, other scenes are as long as they are"
             )
         if weather is not None and scene not in YARDS:
-            raise SceneError(f"data.weather={weather}: scene '{scene}' has no weather, or its own; leave it null")
+            why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"
+            raise SceneError(f"data.weather={weather}: scene '{scene}' {why}; leave it null")
         if weather is not None and weather not in SKIES:
             raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
         if size not in SIZES:

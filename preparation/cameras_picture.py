@@ -41,7 +41,8 @@ def draw_cameras(path: Path, viewmats: Sequence[np.ndarray], points: np.ndarray,
     for panel, (across, up, title) in zip(
         figure.subplots(1, 2), ((0, 1, "from above"), (0, 2, "from the side")), strict=True
     ):
-        panel.scatter(cloud[kept, across], cloud[kept, up], s=1.5, color="0.6", linewidths=0)
+        size = float(np.clip(3000.0 / len(points), 1.5, 10.0))
+        panel.scatter(cloud[kept, across], cloud[kept, up], s=size, color="0.6", linewidths=0)
         panel.plot(where[:, across], where[:, up], color="0.3", linewidth=0.6, alpha=0.6)
         panel.quiver(
             where[:, across], where[:, up], length * sights[:, across], length * sights[:, up],

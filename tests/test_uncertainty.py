@@ -84,3 +84,27 @@ def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path):
     )
     turned = replace(module.scene.train.frames[0], camera=replace(module.scene.train.frames[0].camera, viewmat=behind))
     assert told.deviation(turned).median() > max(5 * seen, 0.9 * told.prior * told.unit)
+
+
+def test_what_is_learned_is_as_certain_as_what_it_does_to_images():
+    """Of one level for each of two Gaussians, seen by least squares with noise; what is told is twice the level."""
+
+    class Levels(dict):
+        names = ("level",)
+
+        def __len__(self) -> int:
+            return 2
+
+    module, views = opaque(2), 5
+    module.splats, module.constants = Levels(level=torch.tensor([0.2, 0.4], requires_grad=True)), frozenset()
+    module.thermal = SimpleNamespace(
+        features=lambda splats, query: splats["level"][:, None],
+        attributes=lambda splats, query: {"double": 2 * splats["level"]},
+    )
+    module.attributes = lambda frame: module.thermal.attributes(module.splats, None)
+    seen = View(FRAME, thermal=torch.full((CAMERA.height, CAMERA.width, 1), 0.25))
+    module.scene = SimpleNamespace(train=[seen] * views)
+    told = object.__new__(Uncertainty)
+    told.module, told.stretch, told.noise, told.evidence = module, 1.0, 0.1, evidence(module, [seen] * views)
+    exact = 2 / (told.evidence.weight / 0.1**2 + 1 / (4 * 0.02)).sqrt()  # their variance over the scene is 0.02
+    torch.testing.assert_close(told.of_attributes(FRAME)["double"], exact.float())

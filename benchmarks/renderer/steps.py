@@ -42,8 +42,8 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
     "loss": [(ssim, "forward"), (ssim, "backward")],
     "backward": [(compositing, "composite_backward")],
     "gradients": [(projection, "project_backward")],
-    "thermal": [(relaxation, name) for name in ("fill_table", "forward", "clear_others", "backward")],
-    "optimiser": [(adam, "square_columns"), (adam, "step")],
+    "thermal": [(relaxation, name) for name in ("fill_table", "forward", "backward", "write_gains")],
+    "optimiser": [(adam, "square_columns"), (adam, "step"), (relaxation, "step_gains")],
 }
 # What the module does in a step, its kernels included; the rest of a step is Lightning's.
 MODULE = ("training_step", "backward", "on_after_backward")

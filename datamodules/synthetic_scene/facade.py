@@ -1,4 +1,4 @@
-"""A heated house from the front over two winter nights: an insulated wall, and what is wrong with it.
+"""A heated house from the front in two calm winter nights after dull days: an insulated wall, and what is wrong with it.
 
 Metres; x is east, y north, z up; the front faces south. Every body is solved through all its layers, with a room of 20 °C behind
 walls (``layered_heat``; nothing of ``heatsplat.physics`` is used but constants). No dew falls, and what is not sky is as warm as
@@ -39,8 +39,9 @@ from heatsplat.training.rng import generator_for
 
 START_UTC_S = 1705334400.0  # 2024-01-15, 16:00 UTC
 DURATION_S = 40 * 3600.0  # two nights and the day between them
+NIGHT_S = (3 * 3600.0, 15 * 3600.0)  # in which images are taken, from the start and a day later
 _BEFORE_S = 6 * DAY_S  # of weather that walls have gone through
-WINTER = Sky(warm_c=2.0, swing_k=3.0, dew_point_c=-3.0)
+WINTER = Sky(warm_c=2.0, swing_k=3.0, dew_point_c=-3.0, cloud=2.0, wind_factor=0.3)
 INDOOR_C = 20.0
 INSIDE_W_M2_K = 1 / 0.13  # between a wall and the air of its room (ISO 6946, table 7)
 OUTSIDE_M2_K_W = 0.04
@@ -165,10 +166,12 @@ class FacadeScene(OutdoorScene):
         }
 
     def route(self, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-        """Times [F], even but for jitter, and world-to-camera matrices [F, 4, 4] of a camera that goes to and fro before it."""
+        """Times [F] in both nights, and world-to-camera matrices [F, 4, 4] of a camera that goes to and fro before it."""
         draws = torch.rand(frames, 4, generator=generator_for(seed, 0, "facade"), dtype=torch.float64)
         number = torch.arange(frames, dtype=torch.float64)
-        times = np.round(((number + 0.2 + 0.6 * draws[:, 0]) / frames * self.preset.duration_s).numpy(), 3)
+        place = 2.0 * (number + 0.2 + 0.6 * draws[:, 0]) / frames
+        nights = place.floor()
+        times = np.round((nights * DAY_S + NIGHT_S[0] + (place - nights) * (NIGHT_S[1] - NIGHT_S[0])).numpy(), 3)
         along = 5.0 * torch.sin(2.39996 * number + draws[:, 1])
         center = torch.stack([along, -8.5 - 1.5 * draws[:, 2], 1.2 + 3.6 * torch.remainder(0.618034 * number, 1.0)], 1)
         aim = torch.stack([0.35 * along, torch.zeros_like(along), 2.4 + 0.4 * (draws[:, 3] - 0.5)], 1)

@@ -242,12 +242,14 @@ class View:
 
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> View:
         """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them), as ``dtype`` if given."""
-        moved = {
-            key: value.to(device, dtype if value.is_floating_point() else None, non_blocking=True)
-            for key in ("thermal", "rgb", "mask", "clean")
-            if (value := getattr(self, key)) is not None
+        images = {
+            key: image for key in ("thermal", "rgb", "mask", "clean") if (image := getattr(self, key)) is not None
         }
-        return replace(self, **moved)
+        moved = {
+            key: image.to(device, dtype if image.is_floating_point() else None, non_blocking=True)
+            for key, image in images.items()
+        }
+        return self if all(moved[key] is images[key] for key in images) else replace(self, **moved)
 
 
 class ViewSet(Sequence[View]):

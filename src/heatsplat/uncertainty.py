@@ -141,10 +141,8 @@ class Uncertainty:
         By the delta method: the numbers that a Gaussian has for its heat are as uncertain as the views that saw it leave them
         (Gauss-Newton, a block for each Gaussian), with their spread over the scene as the prior. Each view tells a
         temperature as well as noise and misfit allow; what all views have in common, such as a wrong emissivity or air
-        temperature, is not in it. Empty for models that tell nothing.
-
-        Raises:
-            SceneError: Gaussians have more numbers than such a block can hold, or not all the same.
+        temperature, is not in it. Empty for models that tell nothing, and for those of which a Gaussian has more numbers than
+        such a block can hold, or not all the same.
         """
         module = self.module
         told = module.attributes(frame)
@@ -154,10 +152,11 @@ class Uncertainty:
         tensors = [module.splats[name] for name in trained]
         numbers = sum(tensor[0].numel() for tensor in tensors)
         if numbers > MOST_NUMBERS or any(len(tensor) != len(module.splats) for tensor in tensors):
-            raise SceneError(
-                f"{type(module.thermal).__name__} has {numbers} numbers for each Gaussian, or not the same for all: intervals "
-                f"of what it learned are made of {MOST_NUMBERS} at most, the same for all"
-            )
+            log.warning(
+                "%s has %d numbers for each Gaussian, or not as many for all: there are no intervals of what it learned",
+                type(module.thermal).__name__, numbers,
+            )  # fmt: skip
+            return {}
 
         def slopes(values: Tensor) -> Tensor:
             """Derivatives [N, K] of values [N] by the numbers of each."""
@@ -165,9 +164,11 @@ class Uncertainty:
                 return torch.zeros(len(values), numbers, dtype=torch.float64)
             found = torch.autograd.grad(values.sum(), tensors, allow_unused=True)
             rows = (torch.zeros_like(t) if g is None else g for t, g in zip(tensors, found, strict=True))
-            return torch.cat([row.flatten(1) for row in rows], dim=1).cpu().double()
+            return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
-        spread = torch.cat([tensor.detach().flatten(1) for tensor in tensors], dim=1).cpu().double().var(0)
+        spread = (
+            torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1).cpu().double().var(0)
+        )
         precision = torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(module.splats), -1)).clone()
         for view in module.scene.train:
             view = view.to(module.device)

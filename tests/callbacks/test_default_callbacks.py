@@ -54,6 +54,9 @@ def test_an_evaluation_has_the_measuring_part():
         "attributes",
         "attribute_errors",
         "probes",
+        "learned",
+        "surfaces",
+        "turntable",
         "viewer",
         "report",
     ]  # costs first, report last

@@ -32,7 +32,7 @@ def test_defects_stay_warm_by_night_and_the_scene_tells_their_u_values():
     assert len(scene.test) == 3 and scene.weather is not None and max(scene.train.times_s) < DURATION_S
     where = torch.tensor(list(PLACES.values()), dtype=torch.float64)
     night = scene.truth(where, torch.arange(8, 14) * 3600.0).mean(1)
-    assert night[2] > night[1] + 1 > night[0] + 1.3
+    assert night[2] > night[1] + 0.5 > night[0] + 0.8
     told = scene.true_attributes(torch.cat([where, torch.tensor([[0.0, -4.0, 0.0]])]))["u_value_w_m2_k"].tolist()
     assert told[:3] == [pytest.approx(u_value(BODIES[name])) for name in PLACES] and math.isnan(told[3])
     assert {"thin insulation", "no insulation"} < set(DEFECTS)

@@ -62,7 +62,13 @@ def tiny(preset: str) -> Synthetic:
 SEEN_AS_THEY_ARE = [
     name
     for name, preset in PRESETS.items()
-    if not (preset.haze or preset.flaws or preset.gloss or any(one.emissivity < 1 for one in preset.surfaces))
+    if not (
+        preset.carried
+        or preset.haze
+        or preset.flaws
+        or preset.gloss
+        or any(one.emissivity < 1 for one in preset.surfaces)
+    )
     and name not in ("weak_texture", "fine_texture", "swung")
 ]
 

@@ -15,7 +15,7 @@ ALONE = torch.tensor([0])
 # Fields of place or of the direction of view, which are no property of a Gaussian: its children read them where they are.
 PLACED = {
     "thermal3dgs", "ti3dgs", "hexplane_4dgs", "ntr_gaussian", "thermogs", "3dgs_ir", "mftg", "msmg", "ommg", "ravigs",
-    "through_air",
+    "through_air", "physir",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What images tell: gains where nothing was fitted, chance by shuffling, rivals, and too few frames."""
+"""What images tell of effects: clear ones, chance, heat that looks like a camera, and too few frames."""
 
 from types import SimpleNamespace
 
@@ -6,10 +6,9 @@ import pytest
 import torch
 from effects.tracks import FRAMES, PASSED, POINTS, data_of, drawn, fit_to, levels
 
-from heatsplat.effects.joint.certainty import MIN_DB, MIN_SIGMAS, Certainty
+from heatsplat.effects.joint.certainty import MIN_DB, Certainty
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import fit_of
-from heatsplat.effects.joint.held_out import FOLDS, compared, fold_of, shuffled, squares_of
 from heatsplat.effects.joint.model import Model
 
 COOLING = levels() + 0.1 * drawn(POINTS, 1, seed=8) * torch.exp(-3 * PASSED)
@@ -24,43 +23,6 @@ def cooling():
 
 def looked(fit, model):
     return SimpleNamespace(joint=(fit, model), obs=SimpleNamespace(why=""), certainty=Certainty(fit, model))
-
-
-def test_folds_leave_out_every_observation_once_and_no_image_or_point_whole():
-    fold = fold_of(8, 12)
-    for k in range(FOLDS):
-        out = fold == k
-        assert out.sum() == out.numel() / FOLDS
-        assert not out.all(0).any() and not out.all(1).any()
-
-
-def test_what_is_there_gains_where_it_was_not_fitted_and_what_is_not_there_loses(cooling):
-    model = Model.of(relaxation=1)
-    gain = compared(squares_of(cooling, model), squares_of(cooling, NOTHING), cooling.weights)
-    assert gain.db > 3 and gain.sigmas > MIN_SIGMAS and gain.images == FRAMES
-    still = fit_to(levels())
-    gain = compared(squares_of(still, model), squares_of(still, NOTHING), still.weights)
-    assert gain.db < 0
-
-
-@pytest.mark.parametrize("together", [True, False])
-def test_shuffled_images_have_the_same_departures_in_another_order(cooling, together):
-    other = shuffled(cooling, NOTHING, torch.Generator().manual_seed(1), together)
-    before = (cooling.residuals(NOTHING) / cooling.errors)[cooling.weights > 0]
-    left = (other.data.tracks.values - cooling.data.tracks.values + cooling.residuals(NOTHING)) / cooling.errors
-    after = left[cooling.weights > 0]
-    torch.testing.assert_close(after.sort().values, before.sort().values)
-    assert (after - before).abs().max() > 1
-    model = Model.of(relaxation=1)
-    assert cooling.gain(model, NOTHING) > 3 * other.gain(model, NOTHING)
-
-
-def test_points_are_shuffled_alike_or_each_in_its_own_order():
-    fit = fit_to(DRIFTING)
-    model, generator = Model.of(frame_offset=1), torch.Generator().manual_seed(2)
-    alike, apart = (shuffled(fit, NOTHING, generator, together) for together in (True, False))
-    assert alike.gain(model, NOTHING) > 0.8 * fit.gain(model, NOTHING)
-    assert apart.gain(model, NOTHING) < 0.1 * fit.gain(model, NOTHING)
 
 
 def test_a_clear_effect_is_told_and_one_of_chance_is_not(cooling):

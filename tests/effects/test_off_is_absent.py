@@ -533,15 +533,15 @@ def test_a_drift_without_gains_is_one_addition():
 
 
 @pytest.mark.parametrize("frequencies", [0, 4])
-def test_without_a_heat_source_no_gains_are_cleared(monkeypatch, frequencies):
-    cleared, clear = [], fused.kernels.clear_others
-    monkeypatch.setattr(fused.kernels, "clear_others", lambda *arguments: (cleared.append(1), clear(*arguments)))
+def test_without_a_heat_source_no_gradient_of_gains_is_written(monkeypatch, frequencies):
+    written, write = [], fused.kernels.write_gains
+    monkeypatch.setattr(fused.kernels, "write_gains", lambda *arguments: (written.append(1), write(*arguments)))
     model = NewtonHarmonic(frequencies=frequencies)
     model.prepare(scene())
     run = Run(ByHand(model))
     model.features(run.splats, Query(torch.tensor([3, 8]), camera(0.0), HOUR_S)).sum().backward()
     assert run.splats["log_rate"].grad[8] != 0 == run.splats["log_rate"].grad[4]
-    assert bool(cleared) == (frequencies > 0)
+    assert bool(written) == (frequencies > 0)
 
 
 WEATHER = {  # the two other drivers, and the columns in which responses to them are looked up

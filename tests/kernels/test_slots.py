@@ -23,20 +23,26 @@ ROOM = LANES * SUMS + 2 * LANES  # sums of sixteen Gaussians and room for a slot
 
 
 @kernel
-def all_summed(count, seen, with_depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, maps, absgrad):
+def all_summed(
+    count, seen, with_depth, ranks, spans, slots, opacities, raw, sums, v_opacities, v_features, maps, absgrad
+):  # fmt: skip
     row = 0
     for block in range(seen.shape[0]):
         first, lanes = block * LANES, np.int64(seen[block])
         fetch_slots(first, lanes, spans, slots)
         clear_invisible(first, min(LANES, count - first), lanes, ranks, v_opacities, v_features, absgrad)
         row = sum_slots(
-            first, lanes, row, spans, slots, opacities, with_depth, ranks, sums, block * ROOM,
+            first, lanes, row, spans, slots, opacities, raw, with_depth, ranks, sums, block * ROOM,
             v_opacities, v_features, maps, absgrad,
         )  # fmt: skip
     return row
 
 
-@pytest.mark.parametrize("ranks", [False, True], ids=["features of all", "features of the visible"])
+@pytest.mark.parametrize(
+    ("ranks", "raw"),
+    [(False, False), (True, False), (True, True)],
+    ids=["features of all", "features of the visible", "logits"],
+)
 @pytest.mark.parametrize(
     ("modalities", "colours", "depth", "mapped", "absolute"),
     [
@@ -46,7 +52,7 @@ def all_summed(count, seen, with_depth, ranks, spans, slots, opacities, sums, v_
         (2, 9, True, 0, True),
     ],  # 7 columns to 19: past one vector
 )
-def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, depth, mapped, absolute, ranks):
+def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, depth, mapped, absolute, ranks, raw):
     generator = np.random.default_rng(colours)
     visible = np.setdiff1d(np.arange(COUNT), INVISIBLE)
     lengths = generator.integers(1, 9, COUNT)
@@ -68,7 +74,9 @@ def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, dep
     absgrad = np.full((COUNT, 2) if absolute else (0, 0), np.nan, np.float32)
 
     seen = np.array(bits, np.uint16)
-    rows = all_summed(COUNT, seen, depth, ranks, spans, slots, opacities, sums, v_opacities, v_features, maps, absgrad)
+    rows = all_summed(
+        COUNT, seen, depth, ranks, spans, slots, opacities, raw, sums, v_opacities, v_features, maps, absgrad
+    )  # fmt: skip
 
     wanted = np.zeros((COUNT, columns), np.float32)
     for gaussian in visible:
@@ -84,6 +92,7 @@ def test_sums_are_those_of_one_addition_after_the_other(modalities, colours, dep
     np.testing.assert_array_equal(sums[places + LOG_OPACITY_GRADIENT], logs[visible].sum(1))
     np.testing.assert_array_equal(v_features, features[visible] if ranks else features)
     np.testing.assert_array_equal(maps, mapped_sums[visible])
-    np.testing.assert_allclose(v_opacities, np.where(opacities.T >= ALPHA_MIN, logs / opacities.T, 0).T, rtol=1e-6)
+    slopes = logs.T * (1 - opacities) if raw else logs.T / opacities
+    np.testing.assert_allclose(v_opacities, np.where(opacities >= ALPHA_MIN, slopes, 0), rtol=1e-6)
     np.testing.assert_allclose(absgrad, absolutes * TWO_LN_2 if absolute else absgrad, rtol=1e-6)
     assert not v_opacities[:, INVISIBLE].any() and not v_opacities[-1, FAINT].any()

@@ -361,6 +361,19 @@ def test_images_and_gradients_of_plain_scenes(backend, name):
 
 
 @pytest.mark.parametrize("name", ["one channel", "rgb and thermal"])
+def test_sizes_and_opacities_may_be_given_as_they_are_trained(backend, name):
+    """Logarithms and logits, some of them out of the range of their activations, with gradients of their own."""
+    scene = PLAIN[name]
+    logits = scene.opacities.logit().clamp(-90, 90)
+    logits[:, 3], logits[0, 5] = -100.0, 30.0
+    raw = rounded(replace(scene, scales=scene.scales.log(), opacities=logits))
+    actual, expected = run(backend, raw, raw=True), oracle(raw, raw=True)
+    assert_close(actual, expected)
+    activated = replace(raw, scales=raw.scales.exp(), opacities=raw.opacities.sigmoid())
+    assert relative(expected.output.features, oracle(activated).output.features) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["one channel", "rgb and thermal"])
 def test_absolute_screen_gradients(backend, name):
     # Sums of |gradient| over pixels and modalities: gsplat composites each modality on its own and cannot do otherwise.
     # That they are right is tested above; here, that they are what they claim to be.

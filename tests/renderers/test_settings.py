@@ -50,7 +50,7 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
     monkeypatch.setattr(settings, "rasterization", rasterization)
     own = {"backend": "reference", "antialiased": True, "near": 0.3, "far": 40.0, "eps2d": 0.17}
     rows = torch.zeros(3, 3), torch.ones(3, 4), torch.ones(3, 3), torch.zeros(1, 3), torch.ones(3, 1)
-    further = {"absgrad": True, "depth": True, "maps": 2, "signs": torch.ones(8, 8, 2)}
+    further = {"absgrad": True, "depth": True, "maps": 2, "signs": torch.ones(8, 8, 2), "raw": True}
     Renderer(**own)(*rows, SCENE.train.frames[0].camera, torch.tensor([0.3]), (1,), **further)
     assert given.pop("background") == torch.tensor([0.3])
     assert given == own | {"modality_channels": (1,)} | further

@@ -252,6 +252,8 @@ def test_a_night_only_record_works_without_sun():
         ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
         ({"inner": True, "solution": "corrected"}, "inner is solved about a mean only: give solution=linear"),
         ({"nodes": 2, "semi_infinite": True}, "no end or two nodes, not both"),
+        ({"exchange": "table"}, "exchange must be one of learned, iso_6946"),
+        ({"exchange": "iso_6946", "sky": None}, "exchange=iso_6946 is that with sky and wind"),
         ({"indoor_c": 20.0}, "indoor_c tells nothing without heat from within: give inner=true"),
         ({"albedo": 1.0}, r"albedo must lie in \(0, 1\), or be null"),
         ({"shadows": True, "sun": False}, "give sun=true, normals=seen"),
@@ -306,3 +308,14 @@ def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
     torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())
     assert (told["u_value_w_m2_k"] > 0.5).all() and not {"time_constant_h", "areal_heat_capacity_kj_m2_k"} & set(told)
     assert "u_value_w_m2_k" not in plain.attributes(without, Query(time_s=0.0))
+
+
+def test_an_exchange_by_convention_is_not_learned():
+    model, splats = ready(exchange="iso_6946", emissivity=0.9)
+    assert not {"raw_share", "raw_wind"} & set(splats.names)
+    told = model.attributes(splats, Query(time_s=0.0))
+    wind = model.mean_wind.item()
+    torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 4 + 4 * wind), rtol=1e-5, atol=0)
+    torch.testing.assert_close(told["wind_share"], torch.full((6,), 4 * wind / (4 + 4 * wind)), rtol=1e-5, atol=0)
+    with pytest.raises(SceneError, match="exchange=iso_6946 needs wind_m_s"):
+        ready(scene(weather(wind_m_s=None)), exchange="iso_6946")

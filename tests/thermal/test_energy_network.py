@@ -473,24 +473,6 @@ def test_the_balance_is_asked_over_the_whole_record(monkeypatch):
     assert shares.histc(10, 0.0, 1.0).min() > 0
 
 
-def test_the_slab_is_lit_from_its_front_and_half_its_sky_is_the_ground():
-    model, splats = on_slabs(sky="swinbank", depth_m=0.03)
-    time_s, ids = 2.5 * HOUR_S, torch.arange(40)
-    areas = model.balance.areas(splats, ids, 1.0)
-    body = dict(zip(ATTRIBUTES, torch.tensor([[0.9, 0.7, 12.0, 2e6]]).expand(40, -1).T, strict=True))
-    warm_k = torch.full((40,), 300.0)
-    rate = model.balance.rate(warm_k, body, areas, model.weather, time_s)
-    now = model.weather.at(time_s)
-    (sun, direct), (_, diffuse) = sunlight_at(model.weather, time_s)
-    air_k = now.air_c + KELVIN_AT_0_C
-    sky_k = 0.0552 * air_k**1.5
-    for first, (facing, share) in enumerate(((float(sun[2]), 1.0), (max(float(sun[0]), 0.0), 0.5))):
-        around = share * sky_k**4 + (1 - share) * air_k**4
-        watts = 0.7 * (direct * facing + diffuse * share) - 12.0 * (300.0 - air_k)
-        watts -= 0.9 * STEFAN_BOLTZMANN * (300.0**4 - around)
-        torch.testing.assert_close(rate[first::2], torch.full((20,), watts / (2e6 * 0.03)), rtol=1e-4, atol=0)
-
-
 def test_past_weather_is_seen_as_fading_means():
     weather = make_weather()
     step = replace(weather, air_c=torch.where(weather.times_s < 0, 10.0, 20.0).double())

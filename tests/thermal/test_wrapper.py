@@ -2,6 +2,7 @@
 
 import importlib
 import pkgutil
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -71,6 +72,15 @@ class Probe(ThermalModel):
 
     def temperature(self, splats, time_s):
         return torch.full((COUNT,), 321.0)
+
+    @property
+    def removable(self):
+        return ("needle",)
+
+    @contextmanager
+    def without(self, name):
+        self.told.append(f"without {name}")
+        yield
 
     def regularisers(self, splats):
         return {"probe/term": 0.25 * self.own}
@@ -174,6 +184,10 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert model.geometry(splats, QUERY) is MOVED
     if not isinstance(model, ThroughAir):  # whose surfaces are warmer than they are seen
         assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
+    if not isinstance(model, Composed):  # which has parts of its own to leave out
+        assert model.removable == ("needle",)
+        with model.without("needle"):
+            assert probe.told[-1] == "without needle"
     model.features(splats, QUERY)
     assert model.regularisers(splats)["probe/term"].grad_fn is not None
     assert list(model.rows_to_drop(splats, 3)) == [DROPPED]

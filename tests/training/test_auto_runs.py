@@ -54,18 +54,20 @@ def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(
     assert effects["frame_offset"]["parameters"] == len(module.scene.train)
     assert effects["agc"] == {
         "on": False,
+        "told": True,
         "statistic": 0.1,
         "threshold": 1.0,
+        "gain_db": None,
         "reason": "as known",
         "parameters": 0,
         "ms_per_step": 0.0,
     }
     assert all(isinstance(effects[name]["ms_per_step"], float) for name in PRESENT)
     text = (tmp_path / "report.md").read_text()
-    assert "| frame_offset | **yes** | 4 | 1 | as known | 16 |" in text.replace(
+    assert "| frame_offset | **yes** | 4 | 1 | – | – | as known | 16 |" in text.replace(
         f"| {len(module.scene.train)} |", "| 16 |"
     )
-    assert "quickest against quickest" in text and "| agc | no | 0.1 | 1 | as known | 0 | 0 |" in text
+    assert "quickest against quickest" in text and "| agc | no | 0.1 | 1 | – | – | as known | 0 | 0 |" in text
 
 
 def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, tmp_path):

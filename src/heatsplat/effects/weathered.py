@@ -22,7 +22,7 @@ MIN_DB, NOTHING_DB = 0.2, 0.05
 NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
-RATES_PER_S = [1.0 / (60.0 * minutes) for minutes in (5, 12, 30, 75, 180, 450, 1100)]
+RATES_PER_S = [1.0 / (60.0 * minutes) for minutes in (5, 10, 20, 40, 80, 160, 320, 640, 1280)]
 DEEPER = 1.0 / 8.0  # rate of a body's core beside that of its surface
 # What wind adds to the exchange at its mean, as a share of that without wind: none, and McAdams' order of magnitude.
 WINDS = (0.0, 0.5, 1.5)
@@ -30,6 +30,11 @@ EXCHANGE_W_M2_K = 10.0  # typical; light and long waves are counted in what they
 # What a body's own numbers are expected to be: its start in kelvin, and shares. Without expectations few frames would give
 # numbers that are none.
 EXPECTED = {"start": 10.0, "deep air": 0.5, "beam": 0.7, "diffuse": 0.7, "deep light": 0.5, "sky": 0.7}
+SHARE_OF = {"beam": 0, "diffuse": 0, "deep light": 0, "sky": 1}  # column of the shares that a number adds to
+# Least shares that are an effect: absorptivity or emissivity over exchange in units of 10 W/m²K. A dull surface in a strong wind
+# has 0.1 and more, bare metal 0.04 of long waves.
+LEAST = {"solar": 0.05, "radiation": 0.1}
+DARK_W_M2, DARK_FRAMES = 5.0, 0.2  # irradiance, and share of the frames
 MODEL_K = 0.3  # by which a body of two rates errs itself
 
 
@@ -43,16 +48,19 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         return Evidence(None, why, told=False)
     gain = weathered.gain(name)
     found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
-    sure = gain.sigmas > SIGMAS and gain.db > MIN_DB
-    if sure or gain.sigmas < CHANCE or gain.db < NOTHING_DB:
-        return Evidence(gain.sigmas if sure else min(gain.sigmas, CHANCE), found, gain_db=gain.db)
-    needed = math.ceil(gain.images * (SIGMAS / gain.sigmas) ** 2)
-    return Evidence(
-        gain.sigmas,
-        f"{found}: cannot be told from {gain.images} frames, about {needed} would tell",
-        told=False,
-        gain_db=gain.db,
-    )
+    sure, large = gain.sigmas > SIGMAS and gain.db > MIN_DB, True
+    if name in LEAST:
+        share = weathered.shares[name]
+        found, large = f"{found}; bodies take a share of {share:.2f}", share > LEAST[name]
+    if sure and large:
+        return Evidence(gain.sigmas, found, gain_db=gain.db)
+    nothing = gain.sigmas < CHANCE or gain.db < NOTHING_DB
+    if nothing and (name != "radiation" or weathered.dark):
+        return Evidence(min(gain.sigmas, CHANCE), found, gain_db=gain.db)
+    needed = math.ceil(gain.images * (SIGMAS / max(gain.sigmas, CHANCE)) ** 2)
+    what = "more of them in the dark" if name == "radiation" and not weathered.dark else f"about {needed}"
+    why = f"cannot be told from {gain.images} frames, {what} would tell"
+    return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,47 +110,72 @@ class Weathered:
 
     def squares(self, parts: tuple[str, ...]) -> Tensor:
         """Squared errors [P, F], in squares of the expected ones, at observations that the balance with these parts was not
-        fitted to; each point has the rate that fits the others best."""
-        points, frames = self.values.shape
-        fold = fold_of(points, frames)
+        fitted to."""
+        fold = fold_of(*self.values.shape)
         found = torch.zeros_like(self.values)
         for k in range(FOLDS):
-            kept = self.weights * (fold != k)
-            least, squares = torch.full((points, 1), torch.inf, dtype=found.dtype), torch.zeros_like(found)
-            for winds in WINDS if "convection" in parts else WINDS[:1]:
-                each_least, each_squares, total = torch.full_like(least, torch.inf), torch.zeros_like(found), 0.0
-                for number in range(len(RATES_PER_S)):
-                    left, cost = self._fitted(winds, number, parts, kept)
-                    fit = cost[:, None]
-                    each_squares = torch.where(fit < each_least, left, each_squares)
-                    each_least = torch.minimum(fit, each_least)
-                total = float(each_least.sum())
-                if total < float(least.sum()):
-                    least, squares = each_least, each_squares
-            found = torch.where(fold == k, squares, found)
+            found = torch.where(fold == k, self._best(parts, self.weights * (fold != k))[0], found)
         return found
 
-    def _fitted(self, winds: float, number: int, parts: tuple[str, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared errors [P, F] of the likeliest numbers, and how unlikely they and the observations that count are [P].
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """What bodies take of light and of long waves, where they exchange 10 W/m²K with the air; medians over the points."""
+        seen = self.weights.sum(1) > 0
+        light, waves = self._best(self.parts, self.weights)[1][seen].median(0).values.tolist()
+        return {"solar": light, "radiation": waves}
 
-        No sky warms: what would need one to is fitted without.
+    @cached_property
+    def dark(self) -> bool:
+        """Whether enough frames were taken without the sun, under which alone the sky is told from it."""
+        if self.weather.irradiance_w_m2 is None:
+            return False
+        light = weather_record.at(self.weather, self.weather.irradiance_w_m2, self.times_s)
+        return float((light < DARK_W_M2).double().mean()) >= DARK_FRAMES
+
+    def _best(self, parts: tuple[str, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared errors [P, F] and shares [P, 2] of the likeliest balance; each point has its own rate, all the same wind."""
+        found, least = None, math.inf
+        for winds in WINDS if "convection" in parts else WINDS[:1]:
+            squares, shares = torch.zeros_like(self.values), torch.zeros_like(self.values[:, :2])
+            costs = torch.full_like(self.values[:, 0], torch.inf)
+            for number in range(len(RATES_PER_S)):
+                left, taken, cost = self._fitted(winds, number, parts, weights)
+                better = (cost < costs)[:, None]
+                squares, shares = torch.where(better, left, squares), torch.where(better, taken, shares)
+                costs = torch.minimum(cost, costs)
+            if found is None or float(costs.sum()) < least:
+                found, least = (squares, shares), float(costs.sum())
+        return found
+
+    def _fitted(
+        self, winds: float, number: int, parts: tuple[str, ...], weights: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Squared errors [P, F] of the likeliest numbers, shares of light and of long waves [P, 2] that these are, and how
+        unlikely they and the observations that count are [P].
+
+        No sky warms and no sun cools: what would need that is fitted without.
         """
-        base, basis = self._responses(winds, number, parts)
+        base, basis, names = self._responses(winds, number, parts)
         variance = self.errors**2 + MODEL_K**2
         values, used = self.values - base, (weights > 0) / variance
         inner = torch.einsum("pf,pfi,pfj->pij", used, basis, basis) + torch.eye(basis.shape[2], dtype=basis.dtype)
         numbers = torch.linalg.solve(inner, torch.einsum("pf,pfi,pf->pi", used, basis, values))
-        squares = (values - (basis @ numbers[..., None])[..., 0]) ** 2 / variance
+        squares = ((values - (basis @ numbers[..., None])[..., 0]) ** 2 / variance).clamp(max=WORST)
         cost = (squares * (weights > 0)).sum(1) + (numbers**2).sum(1)
-        if "radiation" in parts:
-            others = tuple(part for part in parts if part != "radiation")
-            without, costs = self._fitted(winds, number, others, weights)
-            cools = numbers[:, -1] > 0
-            squares, cost = torch.where(cools[:, None], squares, without), torch.where(cools, cost, costs)
-        return squares.clamp(max=WORST), cost
+        shares = torch.zeros_like(values[:, :2])
+        for column, name in enumerate(names):
+            if name in SHARE_OF:
+                shares[:, SHARE_OF[name]] += EXPECTED[name] * numbers[:, column]
+        for place, part in enumerate(("solar", "radiation")):
+            if part in parts and bool((shares[:, place] < 0).any()):
+                less = self._fitted(winds, number, tuple(one for one in parts if one != part), weights)
+                possible = shares[:, place] >= 0
+                squares, cost = torch.where(possible[:, None], squares, less[0]), torch.where(possible, cost, less[2])
+                shares = torch.where(possible[:, None], shares, less[1])
+        return squares, shares, cost
 
-    def _responses(self, winds: float, number: int, parts: tuple[str, ...]) -> tuple[Tensor, Tensor]:
-        """What the air makes of a body of a rate [F], and what its own numbers multiply [P, F, k]."""
+    def _responses(self, winds: float, number: int, parts: tuple[str, ...]) -> tuple[Tensor, Tensor, list[str]]:
+        """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
         courses = self._courses[winds, number]
         names = ["start"]
         names += ["beam", "diffuse"] if "solar" in parts else []
@@ -150,7 +183,7 @@ class Weathered:
         names += ["deep light"] if DEPTH in parts and "solar" in parts else []
         names += ["sky"] if "radiation" in parts else []
         basis = [(EXPECTED[name] * courses[name]).expand(len(self.values), -1) for name in names]
-        return courses["air"], torch.stack(basis, 2)
+        return courses["air"], torch.stack(basis, 2), names
 
     @cached_property
     def _courses(self) -> dict[tuple[float, int], dict[str, Tensor]]:

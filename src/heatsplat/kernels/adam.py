@@ -16,6 +16,7 @@ from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import LANES, float32x16, load, load_columns, splat, sqrt, store_columns, total
 
 SHARE = 8192  # numbers per task
+SQUARED_ROWS = 512  # rows of a matrix per task of ``square_columns``
 
 # Columns of a row of ``tensors``: addresses of the tensor, its gradient and its moments, how many numbers it has, the first
 # task that works on it, where its decay begins in ``decays`` and after how many numbers it repeats, a multiple of LANES; of
@@ -68,13 +69,18 @@ def _copy(typing_context, target, source, count):
 
 
 @inline
+def updated(x, g, m, v, decay, rates):
+    """Sixteen numbers and their moments after a step with gradient ``g``; ``rates`` is a row as below."""
+    g = g + decay * x
+    m = m + (np.float32(1.0) - rates[KEPT_FIRST]) * (g - m)
+    v = rates[KEPT_SECOND] * v + (np.float32(1.0) - rates[KEPT_SECOND]) * g * g
+    return x - rates[STEP] * m / (sqrt(v) * rates[INVERSE_ROOT] + rates[EPS]), m, v
+
+
+@inline
 def _update(tensor, gradient, first, second, k, decay, rates):
     """Steps sixteen numbers, and returns them."""
-    x, m = _load_at(tensor, k), _load_at(first, k)
-    g = _load_at(gradient, k) + decay * x
-    m = m + (np.float32(1.0) - rates[KEPT_FIRST]) * (g - m)
-    v = rates[KEPT_SECOND] * _load_at(second, k) + (np.float32(1.0) - rates[KEPT_SECOND]) * g * g
-    x = x - rates[STEP] * m / (sqrt(v) * rates[INVERSE_ROOT] + rates[EPS])
+    x, m, v = updated(_load_at(tensor, k), _load_at(gradient, k), _load_at(first, k), _load_at(second, k), decay, rates)
     _store_at(first, k, m)
     _store_at(second, k, v)
     _store_at(tensor, k, x)
@@ -127,25 +133,24 @@ def step(tensors, rates, decays, sums):
 
 
 @inline
-def _square_rows(task, tensor, columns, rows, sums):
-    """Sums of a share of the rows."""
+def square_rows(task, tensor, columns, sums):
+    """``square_columns`` of a share of the rows."""
     count = tensor.shape[0] // columns
     for column in range(0, columns, LANES):
         added = splat(0.0)
-        for row in range(task * rows, min((task + 1) * rows, count)):
+        for row in range(task * SQUARED_ROWS, min((task + 1) * SQUARED_ROWS, count)):
             (x,) = load_columns(tensor, row * columns + column, 1, columns - column)
             added = added + x * x
         store_columns(sums, task * columns + column, (added,), columns - column)
 
 
 @kernel
-def square_columns(tensor, columns, rows, sums):
-    """Sums of squares of the columns of a matrix, share by share.
+def square_columns(tensor, columns, sums):
+    """Sums of squares of the columns of a matrix, over SQUARED_ROWS rows each.
 
     Args:
         tensor: [rows * columns] float32.
         columns: of the matrix.
-        rows: how many make a share.
         sums: out [shares, columns].
     """
-    parallel_for(_square_rows, sums.shape[0], (tensor, columns, rows, sums))
+    parallel_for(square_rows, sums.shape[0], (tensor, columns, sums))

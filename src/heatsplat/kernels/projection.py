@@ -48,6 +48,7 @@ from heatsplat.kernels.simd import (
     absolute,
     bits,
     ceil,
+    exp,
     first_lanes,
     floor,
     load_columns,
@@ -72,6 +73,8 @@ LOWEST_X, HIGHEST_X, LOWEST_Y, HIGHEST_Y = range(16, 20)  # limits of x/z and y/
 NEAR, FAR = 20, 21
 EPS2D, EPS2D_SQUARED = 22, 23  # pixels² added to the screen covariance, and their square
 CAMERA = 24
+
+LARGEST_LOG = np.float32(88.0)  # of a float32
 
 
 @inline
@@ -203,7 +206,21 @@ def box_tiles(gaussian, screen):
 
 
 @inline
-def _seen_from(camera, means, quats, scales, first, rows):
+def _semi_axes(scales, first, rows, raw):
+    """Semi-axes of sixteen Gaussians, which are given as they are or, ``raw``, as logarithms."""
+    x, y, z = load_columns(scales, first, 3, rows)
+    if raw:
+        infinite = splat(np.float32(np.inf))  # which is never seen; so is what is not a number
+        return (
+            select(x <= LARGEST_LOG, exp(x), infinite),
+            select(y <= LARGEST_LOG, exp(y), infinite),
+            select(z <= LARGEST_LOG, exp(z), infinite),
+        )
+    return x, y, z
+
+
+@inline
+def _seen_from(camera, means, quats, scales, raw, first, rows):
     """What both passes need of sixteen Gaussians, from the row ``first`` of their arrays on.
 
     Returns:
@@ -220,16 +237,19 @@ def _seen_from(camera, means, quats, scales, first, rows):
     rotation = _rotation(q)
     row_x, row_y = _jacobian(camera, x_over_z, y_over_z, inverse_z)
     turned = _times_rotation(row_x, rotation), _times_rotation(row_y, rotation)
-    axes = load_columns(scales, first, 3, rows)
+    axes = _semi_axes(scales, first, rows, raw)
     return world, here, (x_over_z, y_over_z, inverse_z), (q, length), rotation, (row_x, row_y), turned, axes
 
 
 @inline
-def _largest_opacity(opacities, first, rows):
-    """The largest opacity over the modalities."""
+def _largest_opacity(opacities, raw, shown, first, rows):
+    """The largest opacity over the modalities. Where they are given as logits, ``raw``, all are written into ``shown``."""
     opacity = splat(0.0)
     for modality in range(opacities.shape[0]):
         (candidate,) = load_columns(opacities[modality], first, 1, rows)
+        if raw:
+            candidate = 1.0 / (1.0 + exp(-maximum(candidate, -LARGEST_LOG)))
+            store_columns(shown[modality], first, (candidate,), rows)
         opacity = maximum(candidate, opacity)
     return opacity
 
@@ -254,16 +274,16 @@ def _write_visible(first, lanes, columns, screen, depths, ids, place, chunk, scr
 
 @inline
 def _project_block(
-    first, means, quats, scales, opacities, camera, eps2d, width, height, antialiased,
-    screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
+    first, means, quats, scales, opacities, raw, camera, eps2d, width, height, antialiased,
+    shown, screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
 ):  # fmt: skip
     """Projects Gaussians ``first`` to ``first + 15``; writes visible ids from ``place`` on, returns the place after."""
     rows = means.shape[0] - first
     _, (x, y, z), (_, _, inverse_z), (_, length), _, _, turned, axes = _seen_from(
-        camera, means, quats, scales, first, rows
+        camera, means, quats, scales, raw, first, rows
     )
     a, b, c, determinant, sharp = _covariance(eps2d, _times(turned[0], axes), _times(turned[1], axes))
-    opacity = _largest_opacity(opacities, first, rows)
+    opacity = _largest_opacity(opacities, raw, shown, first, rows)
     if antialiased:
         opacity = opacity * sqrt(sharp / determinant)
     log_opacity = log2(maximum(opacity, ALPHA_MIN))
@@ -308,8 +328,8 @@ def _project_block(
 
 @inline
 def _project_chunk(
-    chunk, means, quats, scales, opacities, camera, width, height, antialiased,
-    screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
+    chunk, means, quats, scales, opacities, raw, camera, width, height, antialiased,
+    shown, screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
 ):  # fmt: skip
     """Projects the Gaussians of a chunk; leaves how many are visible, and how many tiles they may touch."""
     begin = chunk * CHUNK
@@ -317,8 +337,8 @@ def _project_chunk(
     eps2d = camera[EPS2D], camera[EPS2D_SQUARED]
     for block in range(begin, min(begin + CHUNK, means.shape[0]), LANES):
         place = _project_block(
-            block, means, quats, scales, opacities, camera, eps2d, width, height, antialiased,
-            screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
+            block, means, quats, scales, opacities, raw, camera, eps2d, width, height, antialiased,
+            shown, screen, depths, means2d, radii, seen, ids, place, chunk, scratch,
         )  # fmt: skip
     first_ranks[chunk] = place - begin
     bounds[chunk] = 0
@@ -328,14 +348,16 @@ def _project_chunk(
 
 @kernel
 def project(
-    means, quats, scales, opacities, camera, width, height, antialiased,
-    screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
+    means, quats, scales, opacities, raw, camera, width, height, antialiased,
+    shown, screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch,
 ):  # fmt: skip
     """Writes what the screen sees of each Gaussian; returns how many are visible and how many tiles they may touch.
 
     Args:
         means, quats, scales, opacities: [N, 3], [N, 4], [N, 3], [M, N].
+        raw: whether scales and opacities are given as logarithms and logits.
         camera: [CAMERA], see above.
+        shown: out [M, N], opacities, where they are given as logits.
         screen: out [N, SCREEN], rows of visible Gaussians only.
         depths: out [N], camera z of the visible ones once more, side by side.
         means2d, radii: out [N, 2]; zero where a Gaussian is not seen.
@@ -347,8 +369,8 @@ def project(
     chunks = first_ranks.shape[0]
     parallel_for(
         _project_chunk, chunks,
-        (means, quats, scales, opacities, camera, width, height, antialiased,
-         screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch),
+        (means, quats, scales, opacities, raw, camera, width, height, antialiased,
+         shown, screen, depths, means2d, radii, seen, ids, first_ranks, bounds, scratch),
     )  # fmt: skip
     visible, tiles = np.int64(0), np.int64(0)
     for chunk in range(chunks):
@@ -436,13 +458,13 @@ def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_her
 
 @inline
 def _project_block_backward(
-    first, visible, sums, place, means, quats, scales, camera, eps2d, antialiased,
+    first, visible, sums, place, means, quats, scales, raw, camera, eps2d, antialiased,
     v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
 ):  # fmt: skip
     """Gradients of Gaussians ``first`` to ``first + 15`` from their sums; a name v_x stands for the gradient of x."""
     rows = means.shape[0] - first
     world, here, slopes, (q, length), rotation, jacobian, turned, axes = _seen_from(
-        camera, means, quats, scales, first, rows
+        camera, means, quats, scales, raw, first, rows
     )
     u, v = _times(turned[0], axes), _times(turned[1], axes)
     a, b, c, determinant, sharp = _covariance(eps2d, u, v)
@@ -457,6 +479,8 @@ def _project_block_backward(
     )  # fmt: skip
 
     v_axes = _sum(_times(v_u, turned[0]), 1.0, _times(v_v, turned[1]), 1.0, (0.0, 0.0, 0.0))
+    if raw:
+        v_axes = _times(v_axes, axes)
     v_turned = _times(v_u, axes), _times(v_v, axes)
     v_quat = _rotation_backward(q, length, _outer(jacobian[0], v_turned[0], jacobian[1], v_turned[1]))
     v_row_x, v_row_y = _rotated(rotation, v_turned[0]), _rotated(rotation, v_turned[1])
@@ -481,7 +505,7 @@ def _project_block_backward(
 
 @inline
 def _project_chunk_backward(
-    chunk, means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
+    chunk, means, quats, scales, opacities, raw, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
     sums, v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
     """``project_backward`` of the Gaussians of a chunk."""
@@ -495,23 +519,25 @@ def _project_chunk_backward(
             fetch_slots(block + LANES, np.int64(seen[block // LANES + 1]), spans, slots)
         clear_invisible(block, min(LANES, end - block), lanes, rows_are_ranks, v_opacities, v_features, absgrad)
         row = sum_slots(
-            block, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place,
+            block, lanes, row, spans, slots, opacities, raw, with_depth, rows_are_ranks, sums, place,
             v_opacities, v_features, maps, absgrad,
         )  # fmt: skip
         _project_block_backward(
-            block, mask_of(lanes), sums, place, means, quats, scales, camera, eps2d, antialiased,
+            block, mask_of(lanes), sums, place, means, quats, scales, raw, camera, eps2d, antialiased,
             v_means, v_quats, v_scales, v_means2d, v_cameras, chunk,
         )  # fmt: skip
 
 
 @kernel
 def project_backward(
-    means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots, sums,
+    means, quats, scales, opacities, raw, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots, sums,
     v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras,
 ):  # fmt: skip
     """Gradients of the Gaussians from the gradient slots that compositing filled.
 
     Args:
+        opacities: [M, N], never logits.
+        raw: whether scales are logarithms, and gradients are those of logarithms and logits.
         first_ranks, seen: see ``project``.
         with_depth, rows_are_ranks: see ``binning.find_instances``.
         spans, slots: see ``slots.sum_slots``.
@@ -523,6 +549,6 @@ def project_backward(
     """
     parallel_for(
         _project_chunk_backward, v_cameras.shape[0],
-        (means, quats, scales, opacities, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
+        (means, quats, scales, opacities, raw, camera, antialiased, with_depth, rows_are_ranks, first_ranks, seen, spans, slots,
          sums, v_means, v_quats, v_scales, v_opacities, v_features, maps, absgrad, v_means2d, v_cameras),
     )  # fmt: skip

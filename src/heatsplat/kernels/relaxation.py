@@ -1,9 +1,11 @@
 """Temperatures of the Gaussians in view and their gradients: Newton relaxation with harmonic sources, fused.
 
 The plain-torch twin, which also says what the symbols mean, is heatsplat.physics.relaxation (``temperature`` and
-``response_slope``); heatsplat.physics.fused drives these kernels. Lanes are frequencies: a Gaussian's row of gains is
-read once forward and once backward, where its gradient is written on the way. Every Gaussian is computed and written by
-one thread and sums are ordered, so results do not depend on the number of threads.
+``response_slope``); heatsplat.physics.fused drives these kernels. Lanes are frequencies. ``forward`` reads a Gaussian's row
+of gains and finds values and slopes in one go, so that ``backward`` needs no gains. The gradient of a row of gains is one
+number times the responses of its Gaussian: ``write_gains`` writes it out, ``step_gains`` is Adam's step with it, which reads
+and writes gains and moments once and the gradient never. Every row is computed and written by one thread and sums are
+ordered, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numba
 import numpy as np
 from numba import njit
 
+from heatsplat.kernels.adam import SQUARED_ROWS, square_rows, updated
 from heatsplat.kernels.compilation import exact_kernel, inline, kernel
 from heatsplat.kernels.scheduling import parallel_for
 from heatsplat.kernels.simd import (
@@ -32,7 +35,7 @@ from heatsplat.kernels.simd import (
 )
 from heatsplat.kernels.simd import total as sum_of_lanes
 
-BLOCK = 256  # Gaussians per parallel task: their scratch stays in the first cache
+BLOCK = SQUARED_ROWS // 2  # Gaussians per parallel task: their scratch stays in the first cache
 WORTH_A_SECOND_THREAD = (
     8192  # Gaussians; below, on a busy machine, waiting for the other threads costs 10 times the work
 )
@@ -42,9 +45,14 @@ WORTH_A_SECOND_THREAD = (
 OMEGA, OMEGA_SQUARED, OMEGA_COSC, OMEGA_SQUARED_SINC, NEAR, FAR, X, SINC2, COSC1, COSC3 = range(10)
 TABLE_ROWS = 10
 
-# Rows of a block's scratch: functions of y = at for its Gaussians.
-RATE, INITIAL, Y, PHI, OFFSET, FALL, CHI, THETA, THETA2, CHI2, RELAXED, SOURCE, SLOPE = range(13)
-SCRATCH_ROWS = 13
+# Rows of a block's scratch: of each Gaussian its rate, its slope by what it is given as, its initial temperature, functions of
+# y = at, the temperature without a source, the source over time, and its slope by the rate.
+RATE, FREE, INITIAL, Y, PHI, OFFSET, FALL, CHI, THETA, THETA2, CHI2, RELAXED, SOURCE, SLOPE = range(14)
+SCRATCH_ROWS = 14
+
+# Rows of what ``forward`` leaves for ``backward``: slopes of the value, and the rate that was used.
+BY_RATE, BY_INITIAL, BY_AMBIENT, BY_SCALE, USED_RATE = range(5)
+SLOPES = 5
 
 _f = np.float32
 _LARGEST_RATE = _f(1e18)  # its square still fits
@@ -56,8 +64,11 @@ _SPLIT = 134217729.0  # 2^27 + 1 (Dekker 1971)
 @contextmanager
 def threads_for(count: int) -> Iterator[None]:
     """A context in which kernels take as many threads as ``count`` Gaussians are worth."""
+    if count >= WORTH_A_SECOND_THREAD:
+        yield
+        return
     before = numba.get_num_threads()
-    numba.set_num_threads(before if count >= WORTH_A_SECOND_THREAD else 1)
+    numba.set_num_threads(1)
     try:
         yield
     finally:
@@ -110,13 +121,9 @@ def fill_table(omega, time, table):
 
 
 @inline
-def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch):
-    """Rates, functions of y = at and temperatures without a source of the Gaussians ``ids[start:stop]``."""
-    for j in range(stop - start):
-        row = ids[start + j]
-        scratch[RATE, j] = min(min(rate[row], limit), _LARGEST_RATE)
-        scratch[INITIAL, j] = initial[row]
-    for j in range(0, stop - start, LANES):
+def _fill_functions(count, time, scratch):
+    """Functions of y = at of the first Gaussians of a block, whose rates are in its scratch."""
+    for j in range(0, count, LANES):
         y = load(scratch, RATE * BLOCK + j) * time
         near, far = minimum(y, 1.0), maximum(y, 1.0)
         theta2 = filled(scratch, _SERIES[_LAST])
@@ -127,20 +134,41 @@ def _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch
         fall_far = exp(-far)
         phi_far = (1.0 - fall_far) / far
         small = y < 1.0
-        fall = select(small, 1.0 - near * phi_near, fall_far)
-        phi = select(small, phi_near, phi_far)
-        first = load(scratch, INITIAL * BLOCK + j)
-        above = first - ambient
-        # Each side from its own end, so that time 0 gives the initial temperature exactly and late times the ambient.
-        store(scratch, RELAXED * BLOCK + j, select(small, first - above * (y * phi), ambient + above * fall))
         store(scratch, Y * BLOCK + j, y)
-        store(scratch, PHI * BLOCK + j, phi)
+        store(scratch, PHI * BLOCK + j, select(small, phi_near, phi_far))
         store(scratch, OFFSET * BLOCK + j, select(small, -(near * theta), phi_far))
-        store(scratch, FALL * BLOCK + j, fall)
+        store(scratch, FALL * BLOCK + j, select(small, 1.0 - near * phi_near, fall_far))
         store(scratch, CHI * BLOCK + j, select(small, phi_near - theta, (phi_far - fall_far) / far))
         store(scratch, THETA * BLOCK + j, theta)
         store(scratch, THETA2 * BLOCK + j, theta2)
         store(scratch, CHI2 * BLOCK + j, 0.5 - (1.0 + near) * theta2)
+
+
+@inline
+def _fill_scratch(rate, bounds, initial, ambient, ids, start, stop, time, limit, scratch):
+    """What a block knows of the Gaussians ``ids[start:stop]`` before it looks at gains."""
+    for j in range(stop - start):
+        row = ids[start + j]
+        scratch[RATE, j] = rate[row]
+        scratch[INITIAL, j] = initial[row]
+    for j in range(0, stop - start, LANES):
+        given = load(scratch, RATE * BLOCK + j)
+        if bounds.shape[0] > 0:
+            a = exp(minimum(maximum(given, bounds[0]), bounds[1]))
+            free = select((given >= bounds[0]) & (given <= bounds[1]) & (a <= limit), a, 0.0)
+        else:
+            a, free = given, select(given <= limit, filled(scratch, 1.0), 0.0)
+        store(scratch, FREE * BLOCK + j, free)
+        store(scratch, RATE * BLOCK + j, minimum(minimum(a, limit), _LARGEST_RATE))
+    _fill_functions(stop - start, time, scratch)
+    for j in range(0, stop - start, LANES):
+        y, first = load(scratch, Y * BLOCK + j), load(scratch, INITIAL * BLOCK + j)
+        above = first - ambient
+        # Each side from its own end, so that time 0 gives the initial temperature exactly and late times the ambient.
+        near = first - above * (y * load(scratch, PHI * BLOCK + j))
+        store(scratch, RELAXED * BLOCK + j, select(y < 1.0, near, ambient + above * load(scratch, FALL * BLOCK + j)))
+    scratch[SOURCE] = 0
+    scratch[SLOPE] = 0
 
 
 @inline
@@ -167,43 +195,92 @@ def _responses(table, k, width, a, phi, offset, difference_row):
 
 
 @inline
-def _forward_block(block, rate, initial, ambient, gains, places, scale, ids, time, limit, table, values):
+def _response_slopes(table, k, width, j, scratch, sine, cosine, inverse):
+    """Slopes by rate of the responses to sin and to cos, not over time, for sixteen frequencies from ``k``, y >= 1."""
+    a, rest = scratch[RATE, j], scratch[FALL, j] - cosine
+    omega = load(table, OMEGA * width + k)
+    return -(a * sine + omega * rest) * inverse, (a * rest - omega * sine) * inverse
+
+
+@inline
+def _near_response_slopes(table, k, width, j, scratch, inverse):
+    """As ``_response_slopes`` for y < 1, over time."""
+    a, y, theta, theta2 = scratch[RATE, j], scratch[Y, j], scratch[THETA, j], scratch[THETA2, j]
+    q, o = a * a * inverse, load(table, OMEGA_SQUARED * width + k) * inverse
+    sinc2 = load(table, SINC2 * width + k)
+    inner = (q - o) * (q * theta2 + o * sinc2) - q * scratch[CHI2, j]
+    inner = inner + o * o * (load(table, COSC3 * width + k) * (2.0 * y))
+    cosine_slope = (q - o) * load(table, COSC1 * width + k) + 2.0 * (o * sinc2 * y - q * theta)
+    return load(table, X * width + k) * inner, cosine_slope * o - q * scratch[CHI, j]
+
+
+@inline
+def _heat(j, place, gains, time, table, sloping, scratch):
+    """Source over time of one Gaussian of a block, and its slope by the rate where that is wanted, into the scratch."""
+    frequencies, width, first = gains.shape[2], table.shape[1], place * (2 * gains.shape[2])
+    a, phi, offset, small = scratch[RATE, j], scratch[PHI, j], scratch[OFFSET, j], scratch[Y, j] < 1
+    difference_row = NEAR if small else FAR
+    source, slope = filled(scratch, 0.0), filled(scratch, 0.0)
+    for k in range(0, frequencies, LANES):
+        sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
+        sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
+        cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
+        source = source + sin_gain * sine + cos_gain * cosine
+        if sloping:
+            if small:
+                by_sine, by_cosine = _near_response_slopes(table, k, width, j, scratch, inverse)
+            else:
+                by_sine, by_cosine = _response_slopes(table, k, width, j, scratch, sine, cosine, inverse)
+            slope = slope + sin_gain * by_sine + cos_gain * by_cosine
+    scratch[SOURCE, j] = sum_of_lanes(source)
+    if sloping:
+        scratch[SLOPE, j] = sum_of_lanes(slope) * time if small else sum_of_lanes(slope)
+
+
+@inline
+def _forward_block(
+    block, rate, bounds, initial, ambient, gains, places, scale, ids, time, limit, table, values, slopes
+):  # fmt: skip
     """``forward`` of BLOCK Gaussians."""
-    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
-    start = block * BLOCK
+    start, count, sloping = block * BLOCK, ids.shape[0], slopes.shape[0] > 0
     stop = min(start + BLOCK, count)
-    scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
-    _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
+    scratch = np.empty((SCRATCH_ROWS, BLOCK), initial.dtype)
+    _fill_scratch(rate, bounds, initial, ambient, ids, start, stop, time, limit, scratch)
     heated = np.empty(BLOCK, np.int64)
-    for j in range(stop - start):
-        values[start + j] = scratch[RELAXED, j]
-    for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
-        j = heated[i]
-        row = ids[start + j]
-        a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-        difference_row = NEAR if y < 1 else FAR
-        place = places[row] if places.shape[0] > 0 else row
-        source = filled(scratch, 0.0)
-        first = place * (2 * frequencies)
-        for k in range(0, frequencies, LANES):
-            sine, cosine, _ = _responses(table, k, width, a, phi, offset, difference_row)
-            sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
-            cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
-            source = source + sin_gain * sine + cos_gain * cosine
-        heat = time * sum_of_lanes(source)
-        if scale.shape[0] > 0:
-            heat = heat * scale[row]
-        values[start + j] = scratch[RELAXED, j] + heat
+    for i in range(_heated(places, ids, start, stop, heated) if gains.shape[2] > 0 else 0):
+        row = ids[start + heated[i]]
+        _heat(heated[i], places[row] if places.shape[0] > 0 else row, gains, time, table, sloping, scratch)
+    if scale.shape[0] > 0:
+        for j in range(stop - start):
+            factor = scale[ids[start + j]]
+            if sloping:
+                slopes[BY_SCALE, start + j] = time * scratch[SOURCE, j]
+            scratch[SOURCE, j] *= factor
+            scratch[SLOPE, j] *= factor
+    for j in range(0, stop - start, LANES):
+        rows = stop - start - j
+        heat = time * load(scratch, SOURCE * BLOCK + j)
+        store_columns(values, start + j, (load(scratch, RELAXED * BLOCK + j) + heat,), rows)
+        if sloping:
+            fall, free = load(scratch, FALL * BLOCK + j), load(scratch, FREE * BLOCK + j)
+            above = load(scratch, INITIAL * BLOCK + j) - ambient
+            by_rate = time * load(scratch, SLOPE * BLOCK + j) - above * time * fall
+            by_ambient = load(scratch, Y * BLOCK + j) * load(scratch, PHI * BLOCK + j)
+            store_columns(slopes, BY_RATE * count + start + j, (select(free > 0.0, by_rate * free, 0.0),), rows)
+            store_columns(slopes, BY_INITIAL * count + start + j, (fall,), rows)
+            store_columns(slopes, BY_AMBIENT * count + start + j, (by_ambient,), rows)
+            store_columns(slopes, USED_RATE * count + start + j, (load(scratch, RATE * BLOCK + j),), rows)
 
 
 @kernel
-def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, table, values):
-    """Fills ``values`` [n] with the temperatures of the Gaussians ``ids``.
+def forward(rate, bounds, initial, ambient, gains, places, scale, ids, time, limit, table, values, slopes):
+    """Fills ``values`` [n] with the temperatures of the Gaussians ``ids``, and ``slopes`` with what ``backward`` needs.
 
     Gaussians without a row of gains only relax: their frequencies are passed over.
 
     Args:
         rate, initial: [N] float32 or float64, as is every real number here.
+        bounds: empty; or [2], and ``rate`` holds logarithms, which are taken within them.
         ambient: a number.
         gains: [M, 2, K].
         places: [N] int64 row of ``gains`` of every Gaussian, -1 for none; or empty, M = N: each has its own.
@@ -213,162 +290,149 @@ def forward(rate, initial, ambient, gains, places, scale, ids, time, limit, tabl
         limit: the largest rate used (see relaxation.bounded_rate).
         table: of ``fill_table``.
         values: [n] output.
+        slopes: [SLOPES, n] output, or [0, 0] where they are not wanted.
     """
     parallel_for(
-        _forward_block,
-        (ids.shape[0] + BLOCK - 1) // BLOCK,
-        (rate, initial, ambient, gains, places, scale, ids, time, limit, table, values),
-    )
-
-
-@inline
-def _clear_block(block, written, v_gains):
-    """Clears those of BLOCK rows that are not written."""
-    for row in range(block * BLOCK, min((block + 1) * BLOCK, v_gains.shape[0])):
-        if not written[row]:
-            v_gains[row] = 0
-
-
-@kernel
-def clear_others(ids, written, v_gains):
-    """Writes zeros into the rows of ``v_gains`` [M, 2, K] that are not among ``ids``, which ``backward`` leaves alone.
-
-    Args:
-        ids: [n] int64 rows of gains.
-        written: [M] bool, scratch.
-        v_gains: output.
-    """
-    count = v_gains.shape[0]
-    written[:] = False
-    for j in range(ids.shape[0]):
-        written[ids[j]] = True
-    parallel_for(_clear_block, (count + BLOCK - 1) // BLOCK, (written, v_gains))
+        _forward_block, (ids.shape[0] + BLOCK - 1) // BLOCK,
+        (rate, bounds, initial, ambient, gains, places, scale, ids, time, limit, table, values, slopes),
+    )  # fmt: skip
 
 
 @inline
 def _backward_block(
-    block,
-    rate,
-    initial,
-    ambient,
-    gains,
-    places,
-    scale,
-    ids,
-    time,
-    limit,
-    table,
-    v_values,
-    v_rate,
-    v_initial,
-    v_ambient,
-    v_gains,
-    v_scale,
-):
+    block, ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls
+):  # fmt: skip
     """``backward`` of BLOCK Gaussians."""
-    count, frequencies, width = ids.shape[0], gains.shape[2], table.shape[1]
-    start = block * BLOCK
-    stop = min(start + BLOCK, count)
-    scratch = np.empty((SCRATCH_ROWS, BLOCK), rate.dtype)
-    _fill_scratch(rate, initial, ambient, ids, start, stop, time, limit, scratch)
-    scratch[SOURCE] = 0
-    scratch[SLOPE] = 0
-    heated = np.empty(BLOCK, np.int64)
-    for i in range(_heated(places, ids, start, stop, heated) if frequencies > 0 else 0):
-        j = heated[i]
-        row = ids[start + j]
-        a, y, phi, offset = scratch[RATE, j], scratch[Y, j], scratch[PHI, j], scratch[OFFSET, j]
-        fall, small = scratch[FALL, j], scratch[Y, j] < 1
-        difference_row = NEAR if small else FAR
-        v_gain = v_values[start + j] * time
-        if scale.shape[0] > 0:
-            v_gain = v_gain * scale[row]
-        source, slope = filled(scratch, 0.0), filled(scratch, 0.0)
-        place = places[row] if places.shape[0] > 0 else row
-        first = place * (2 * frequencies)
-        for k in range(0, frequencies, LANES):
-            sine, cosine, inverse = _responses(table, k, width, a, phi, offset, difference_row)
-            sin_gain = load_columns(gains, first + k, 1, frequencies - k)[0]
-            cos_gain = load_columns(gains, first + frequencies + k, 1, frequencies - k)[0]
-            store_columns(v_gains, first + k, (sine * v_gain,), frequencies - k)
-            store_columns(v_gains, first + frequencies + k, (cosine * v_gain,), frequencies - k)
-            source = source + sin_gain * sine + cos_gain * cosine
-            if small:
-                q, o = a * a * inverse, load(table, OMEGA_SQUARED * width + k) * inverse
-                sinc2 = load(table, SINC2 * width + k)
-                theta, theta2 = scratch[THETA, j], scratch[THETA2, j]
-                inner = (q - o) * (q * theta2 + o * sinc2) - q * scratch[CHI2, j]
-                inner = inner + o * o * (load(table, COSC3 * width + k) * (2.0 * y))
-                sine_slope = load(table, X * width + k) * inner
-                cosine_slope = (q - o) * load(table, COSC1 * width + k) + 2.0 * (o * sinc2 * y - q * theta)
-                cosine_slope = cosine_slope * o - q * scratch[CHI, j]
-                slope = slope + (sin_gain * sine_slope + cos_gain * cosine_slope) * time
-            else:
-                omega, rest = load(table, OMEGA * width + k), fall - cosine
-                slope = slope + (cos_gain * (a * rest - omega * sine) - sin_gain * (a * sine + omega * rest)) * inverse
-        scratch[SOURCE, j] = sum_of_lanes(source)
-        scratch[SLOPE, j] = v_gain * sum_of_lanes(slope)
     ambient_sum = _f(0.0)  # becomes a double among doubles
-    for j in range(stop - start):
-        row, v, fall = ids[start + j], v_values[start + j], scratch[FALL, j]
-        above = scratch[INITIAL, j] - ambient
-        v_initial[row] = v * fall
-        ambient_sum += v * (scratch[Y, j] * scratch[PHI, j])
+    for j in range(block * BLOCK, min((block + 1) * BLOCK, ids.shape[0])):
+        row, v = ids[j], v_values[j]
+        v_rate[row] = v * slopes[BY_RATE, j]
+        v_initial[row] = v * slopes[BY_INITIAL, j]
+        ambient_sum += v * slopes[BY_AMBIENT, j]
+        pull = v * time
         if scale.shape[0] > 0:
-            v_scale[row] = v * time * scratch[SOURCE, j]
-        if rate[row] <= limit:
-            v_rate[row] = scratch[SLOPE, j] - v * above * time * fall
-        else:
-            v_rate[row] = 0
+            v_scale[row] = v * slopes[BY_SCALE, j]
+            pull = pull * scale[row]
+        if row_pulls.shape[0] > 0:
+            place = places[row] if places.shape[0] > 0 else row
+            if place >= 0:
+                row_rates[place] = slopes[USED_RATE, j]
+                row_pulls[place] = pull
     v_ambient[block] = ambient_sum
 
 
 @kernel
-def backward(
-    rate,
-    initial,
-    ambient,
-    gains,
-    places,
-    scale,
-    ids,
-    time,
-    limit,
-    table,
-    v_values,
-    v_rate,
-    v_initial,
-    v_ambient,
-    v_gains,
-    v_scale,
-):
+def backward(ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls):
     """Writes the rows ``ids`` of the gradients; ids must not repeat.
 
     Args:
-        rate, initial, ambient, gains, places, scale, ids, time, limit, table: as in ``forward``.
+        ids, places, scale, time: as in ``forward``, which left ``slopes``.
         v_values: [n] gradient of the values.
-        v_rate, v_initial, v_gains, v_scale: outputs, shaped as what they are gradients of.
+        v_rate, v_initial, v_scale: outputs, shaped as what they are gradients of.
         v_ambient: [blocks] output, a sum for each block of Gaussians.
+        row_rates, row_pulls: [M] outputs, of each row of gains that is seen the rate of its Gaussian and what its responses
+            are multiplied by for the gradient; or empty where there are no gains.
     """
     parallel_for(
-        _backward_block,
-        (ids.shape[0] + BLOCK - 1) // BLOCK,
-        (
-            rate,
-            initial,
-            ambient,
-            gains,
-            places,
-            scale,
-            ids,
-            time,
-            limit,
-            table,
-            v_values,
-            v_rate,
-            v_initial,
-            v_ambient,
-            v_gains,
-            v_scale,
-        ),
+        _backward_block, v_ambient.shape[0],
+        (ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls),
+    )  # fmt: skip
+
+
+@inline
+def _fill_rows(block, row_rates, row_pulls, time, scratch):
+    """Rates, and functions of y = at, of a block of rows of gains; how many rows it has, and whether any is seen."""
+    start = block * BLOCK
+    count, seen = min(BLOCK, row_rates.shape[0] - start), False
+    for j in range(count):
+        scratch[RATE, j] = row_rates[start + j]
+        seen = seen or row_pulls[start + j] != 0
+    if seen:
+        _fill_functions(count, time, scratch)
+    return count
+
+
+@inline
+def _row_gradient(pull, j, k, time, table, scratch):
+    """Gradients of the gains of sin and of cos of row ``j`` of a block, for sixteen frequencies from ``k``."""
+    difference_row = NEAR if scratch[Y, j] < 1 else FAR
+    sine, cosine, _ = _responses(
+        table, k, table.shape[1], scratch[RATE, j], scratch[PHI, j], scratch[OFFSET, j], difference_row
     )
+    return sine * pull, cosine * pull
+
+
+@inline
+def _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, out, place):
+    """Writes the gradient of a block's rows from ``place`` of ``out`` on, which has room for a vector after them."""
+    count = _fill_rows(block, row_rates, row_pulls, time, scratch)
+    for j in range(count):
+        pull = row_pulls[block * BLOCK + j]
+        for k in range(0, frequencies, LANES):  # whole vectors, of which the next one overwrites what is too much
+            by_sine, by_cosine = filled(scratch, 0.0), filled(scratch, 0.0)
+            if pull != 0:
+                by_sine, by_cosine = _row_gradient(pull, j, k, time, table, scratch)
+            store_columns(out, place + k, (by_sine,), frequencies - k)
+            store_columns(out, place + frequencies + k, (by_cosine,), frequencies - k)
+        place += 2 * frequencies
+    return count
+
+
+@inline
+def _write_block(block, row_rates, row_pulls, time, table, v_gains):
+    """``write_gains`` of BLOCK rows."""
+    scratch, frequencies = np.empty((SCRATCH_ROWS, BLOCK), v_gains.dtype), v_gains.shape[2]
+    place = block * BLOCK * 2 * frequencies
+    _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, v_gains, place)
+
+
+@kernel
+def write_gains(row_rates, row_pulls, time, table, v_gains):
+    """Writes the gradient of gains [M, 2, K]: all rows, zeros where a row pulls nowhere.
+
+    Args:
+        row_rates, row_pulls: [M] of ``backward``.
+        time, table: of ``forward``.
+        v_gains: output.
+    """
+    parallel_for(_write_block, (row_rates.shape[0] + BLOCK - 1) // BLOCK, (row_rates, row_pulls, time, table, v_gains))
+
+
+@inline
+def _step_block(block, row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares):
+    """``step_gains`` of BLOCK rows."""
+    scratch, frequencies = np.empty((SCRATCH_ROWS, BLOCK), gains.dtype), gains.shape[2]
+    gradient = np.empty(BLOCK * 2 * frequencies + LANES, gains.dtype)  # stays in the first cache
+    count = _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, gradient, 0)
+    begin, numbers, period = block * BLOCK * 2 * frequencies, count * 2 * frequencies, decay.shape[0]
+    added, phase = filled(scratch, 0.0), 0
+    for k in range(0, numbers, LANES):
+        rest, decays = numbers - k, load(decay, phase)
+        (x,), (m,) = load_columns(gains, begin + k, 1, rest), load_columns(first, begin + k, 1, rest)
+        (v,), (g,) = load_columns(second, begin + k, 1, rest), load_columns(gradient, k, 1, rest)
+        x, m, v = updated(x, g, m, v, decays, rates)
+        store_columns(gains, begin + k, (x,), rest)
+        store_columns(first, begin + k, (m,), rest)
+        store_columns(second, begin + k, (v,), rest)
+        added = added + x
+        phase = phase + LANES if phase + LANES < period else 0
+    sums[block] = sum_of_lanes(added)
+    square_rows(block, gains.reshape(gains.size), frequencies, squares)
+
+
+@kernel
+def step_gains(row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares):
+    """Adam's step of gains [M, 2, K] with the gradient that ``write_gains`` would write; float32.
+
+    Args:
+        row_rates, row_pulls, time, table: of ``write_gains``.
+        gains, first, second: the gains and their moments.
+        decay: weight decay of each frequency, as often as it takes to be whole vectors.
+        rates: [5], a row of what ``adam.step`` takes.
+        sums: out [blocks of BLOCK rows]: sums after the step.
+        squares: out [blocks, K], sums of squares after the step, as ``adam.square_columns`` finds them.
+    """
+    parallel_for(
+        _step_block, sums.shape[0],
+        (row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares),
+    )  # fmt: skip

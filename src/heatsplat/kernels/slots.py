@@ -48,7 +48,8 @@ def clear_invisible(first, count, lanes, rows_are_ranks, v_opacities, v_features
 
 @inline
 def sum_slots(
-    first, lanes, row, spans, slots, opacities, with_depth, rows_are_ranks, sums, place, v_opacities, v_features, maps, absgrad
+    first, lanes, row, spans, slots, opacities, raw, with_depth, rows_are_ranks, sums, place,
+    v_opacities, v_features, maps, absgrad,
 ):  # fmt: skip
     """Adds up the slots of sixteen Gaussians and finishes the gradients that need no projection; the next row.
 
@@ -57,6 +58,7 @@ def sum_slots(
         row: the row of the first visible one in what is given for the visible ones only.
         spans: [N, 2] the first slot of a Gaussian and the one after its last.
         slots: [slots, slot_size].
+        raw: whether gradients of opacities are those of their logits.
         opacities, v_opacities: [M, N]; v_features: [N, C], or [n, C] where ``rows_are_ranks``; maps: [n, S];
             absgrad: [N, 2] or [0, 0].
         sums: scratch, of which sixteen rows of SUMS numbers from ``place`` on are filled for the visible ones, and which has
@@ -82,7 +84,8 @@ def sum_slots(
         for modality in range(modalities):
             v_log_opacity = sums[column + modality]
             opacity = opacities[modality, gaussian]
-            v_opacities[modality, gaussian] = v_log_opacity / opacity if opacity >= ALPHA_MIN else np.float32(0.0)
+            v_opacity = v_log_opacity * (np.float32(1.0) - opacity) if raw else v_log_opacity / opacity
+            v_opacities[modality, gaussian] = v_opacity if opacity >= ALPHA_MIN else np.float32(0.0)
             of_all += v_log_opacity
         sums[mine + LOG_OPACITY_GRADIENT] = of_all
         column += modalities

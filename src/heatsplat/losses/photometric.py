@@ -102,8 +102,8 @@ class Photometric:
             raise ValueError(f"mask must be {list(target.shape[:2])} like the images, got {list(mask.shape)}")
         on_cpu = prediction.device.type == "cpu" and prediction.dtype == target.dtype == torch.float32
         if on_cpu and self.dssim_weight > 0.0:
-            difference, dissimilarity = _Fused.apply(prediction, target, mask)
-            return {"l1": self.l1_weight * difference, "dssim": self.dssim_weight * dissimilarity}
+            difference, dissimilarity = _Fused.apply(prediction, target, mask, self.l1_weight, self.dssim_weight)
+            return {"l1": difference, "dssim": dissimilarity}
         if mask is not None:
             prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))
         terms = {"l1": self.l1_weight * _mean(l1(prediction, target), mask).mean()}
@@ -128,10 +128,10 @@ _TAPS = window().numpy()
 
 
 class _Fused(torch.autograd.Function):
-    """Mean |x - y| and 1 - mean SSIM by the kernel; the gradient goes to the prediction only."""
+    """Mean |x - y| and 1 - mean SSIM, each times a weight, by the kernel; the gradient goes to the prediction only."""
 
     @staticmethod
-    def forward(ctx, prediction, target, mask):
+    def forward(ctx, prediction, target, mask, *weights):
         prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
         height, width, channels = prediction.shape
         valid, outside = _everywhere(height, width, channels) if mask is None else _coverage(mask, channels)
@@ -141,8 +141,9 @@ class _Fused(torch.autograd.Function):
         scratch = [plane.view(-1).numpy() for plane in (planes[0], planes[1], planes[2:])]
         sums = kernel.forward(*images, valid.numpy(), outside.numpy(), *shape, *scratch)
         ctx.save_for_backward(prediction, target, valid, planes)
-        ctx.shape, ctx.count = shape, max(prediction.numel() if mask is None else int(mask.sum()) * channels, 1)
-        return prediction.new_tensor(sums[0] / ctx.count), prediction.new_tensor(sums[1] / ctx.count)
+        count = max(prediction.numel() if mask is None else int(mask.sum()) * channels, 1)
+        ctx.shape, ctx.weights = shape, [weight / count for weight in weights]
+        return tuple(prediction.new_tensor(weight * found) for weight, found in zip(ctx.weights, sums, strict=True))
 
     @staticmethod
     @once_differentiable
@@ -151,9 +152,10 @@ class _Fused(torch.autograd.Function):
         v_prediction = torch.empty_like(prediction)
         images = [image.view(-1).numpy() for image in (prediction, target, valid)]
         scratch = [plane.view(-1).numpy() for plane in (planes[0], planes[1], planes[2:], v_prediction)]
-        weights = [np.float32(weight.item() / ctx.count) for weight in (v_difference, v_dissimilarity)]
+        slopes = v_difference.item(), v_dissimilarity.item()
+        weights = [np.float32(weight * slope) for weight, slope in zip(ctx.weights, slopes, strict=True)]
         kernel.backward(*images, *ctx.shape, *scratch[:3], *weights, scratch[3])
-        return v_prediction, None, None
+        return v_prediction, None, None, None, None
 
 
 def _coverage(mask: Tensor, channels: int) -> tuple[Tensor, Tensor]:

@@ -309,9 +309,9 @@ class Climate:
             return forced if constant is None else forced + constant * (1 - kept), kept
 
         if surface.core is None:
-            log_rate = surface.log_rate if stiffness is None else surface.log_rate + stiffness.log()
-            if self.semi_infinite and stiffness is not None:
-                log_rate = log_rate + stiffness.log()  # H counts twice in its rate
+            log_rate = surface.log_rate
+            if stiffness is not None:  # a holds the square of H
+                log_rate = log_rate + (2 * stiffness.log() if self.semi_infinite else stiffness.log())
             forced, kept = response(log_rate)
             left = surface.start * kept
         else:

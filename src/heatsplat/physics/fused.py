@@ -32,6 +32,7 @@ def visible_temperature(
     inverse_capacity: Tensor | None = None,
     ids: Tensor | None = None,
     places: Tensor | None = None,
+    log_bounds: tuple[float, float] | None = None,
 ) -> Tensor:
     """Temperature at a time of the Gaussians ``ids``, [n]; only their rows are read.
 
@@ -49,6 +50,7 @@ def visible_temperature(
         ids: [n] int64 Gaussians, each at most once; None is all of them.
         places: [N] int64, the row of ``gains`` of every Gaussian, in their order, -1 for one that has no source; None is
             M = N, a row each.
+        log_bounds: where given, ``rate`` holds logarithms of rates, which are taken within these bounds.
 
     Raises:
         ValueError: the shape of the gains or of the places does not fit.
@@ -64,17 +66,19 @@ def visible_temperature(
             gains = places = inverse_capacity = None
         elif rows == count:  # in the order of the Gaussians: each has its own
             places = None
-    arguments = (time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
     if _fits_kernel(rate, omega):
-        return _VisibleTemperature.apply(*arguments)
-    return _reference(*arguments)
+        return _VisibleTemperature.apply(
+            time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places, log_bounds
+        )
+    rate = rate if log_bounds is None else rate.clamp(*log_bounds).exp()
+    return _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
 
 
 def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
     """Whether the kernel can be used: on a CPU, and no ω of (almost) zero."""
     if rate.device.type != "cpu" or rate.dtype not in NUMPY_TYPES:
         return False
-    return omega.numel() == 0 or omega.abs().min().item() >= SMALLEST_OMEGA
+    return omega.numel() == 0 or np.abs(omega.numpy()).min() >= SMALLEST_OMEGA
 
 
 def _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places) -> Tensor:
@@ -128,56 +132,95 @@ class _SpareMemory:
 _gain_gradients = {dtype: _SpareMemory(plain) for dtype, plain in NUMPY_TYPES.items()}
 
 
+class Unwritten:
+    """A gradient of gains [M, 2, K] that nobody has written out: of each row, one number times the responses to its rate.
+
+    A leaf with the attribute ``unwritten`` (a list) gets its gradient in there in place of ``grad``; so an optimiser asks
+    for it that steps the gains with it (``step``). Everybody else finds in ``grad`` what ``written`` gives.
+    """
+
+    def __init__(self, rates: Tensor, pulls: Tensor, time: np.floating, table: np.ndarray, frequencies: int) -> None:
+        self._rows = rates.numpy(), pulls.numpy(), time, table
+        self._shape = torch.Size((len(rates), 2, frequencies))
+        self._count = len(rates)
+
+    def written(self) -> Tensor:
+        """The gradient, [M, 2, K]; zeros in rows out of view."""
+        rates = self._rows[0]
+        v_gains = _gain_gradients[torch.from_numpy(rates).dtype].take(self._shape)
+        with kernels.threads_for(self._count):
+            kernels.write_gains(*self._rows, v_gains.numpy())
+        return v_gains
+
+    def step(
+        self, gains: Tensor, first: Tensor, second: Tensor, decay: np.ndarray, rates: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Adam's step of the gains in place; sums of what was written, and of its squares by column [.., K] (step_gains)."""
+        blocks = -(-self._count // kernels.BLOCK)
+        sums, squares = np.empty(blocks, np.float32), np.empty((blocks, self._shape[2]), np.float32)
+        tensors = [tensor.detach().numpy() for tensor in (gains, first, second)]
+        with kernels.threads_for(self._count):
+            kernels.step_gains(*self._rows, *tensors, np.tile(decay, LANES), rates, sums, squares)
+        return sums, squares
+
+
+_NO_SLOPES = {kind: np.empty((0, 0), kind) for kind in NUMPY_TYPES.values()}
+
+
 class _VisibleTemperature(torch.autograd.Function):
     """The kernel. Gradients have all rows, zero in those out of view: that is what the optimiser reads."""
 
     @staticmethod
-    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places) -> Tensor:
+    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places, log_bounds) -> Tensor:
         count = rate.shape[0]
         ids = torch.arange(count) if ids is None else ids
         gains = rate.new_empty(count, 2, 0) if gains is None else gains
         scale = rate.new_empty(0) if inverse_capacity is None else inverse_capacity
         places = ids.new_empty(0) if places is None else places
-        tensors = tuple(x.contiguous() for x in (rate, initial, gains, places, scale, ids))
-        ctx.save_for_backward(*tensors)
         seconds, frequencies = time.item(), gains.shape[2]
         limit = BACKWARD_TIME_CONSTANTS / -seconds if seconds < 0 else math.inf
         kind = NUMPY_TYPES[rate.dtype]
-        ctx.table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), kind)
-        ctx.numbers = kind(ambient.item()), kind(seconds), kind(limit)
+        table = np.empty((kernels.TABLE_ROWS, -(-frequencies // LANES) * LANES), kind)
         values = rate.new_empty(ids.shape[0])
-        with kernels.threads_for(ids.shape[0]):
-            kernels.fill_table(omega.numpy()[:frequencies], seconds, ctx.table)
-            kernels.forward(*_kernel_arguments(ctx, tensors), values.numpy())
+        slopes = _NO_SLOPES[kind]
+        if any(ctx.needs_input_grad):
+            slopes = np.empty((kernels.SLOPES, len(ids)), kind)
+            ctx.save_for_backward(initial, rate, gains, places, scale, ids)
+            ctx.slopes, ctx.table, ctx.time = slopes, table, kind(seconds)
+        bounds = np.array(() if log_bounds is None else log_bounds, kind)
+        arrays = [x.detach().contiguous().numpy() for x in (rate, initial, gains, places, scale, ids)]
+        rate, initial, gains, places, scale, ids = arrays
+        with kernels.threads_for(len(ids)):
+            kernels.fill_table(omega.numpy()[:frequencies], seconds, table)
+            kernels.forward(
+                rate, bounds, initial, kind(ambient.item()), gains, places, scale, ids, kind(seconds), kind(limit), table,
+                values.numpy(), slopes,
+            )  # fmt: skip
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_values: Tensor):
-        tensors = ctx.saved_tensors
-        rate, initial, gains, places, scale, ids = tensors
-        v_rate, v_initial, v_scale = (torch.zeros_like(x) for x in (rate, initial, scale))
-        v_gains = _gain_gradients[rate.dtype].take(gains.shape)
+        initial, rate, gains, places, scale, ids = ctx.saved_tensors
+        wanted = ctx.needs_input_grad
+        v_initial, v_rate, v_scale = (torch.zeros_like(x) for x in (initial, rate, scale))
         v_ambient = rate.new_empty(-(-ids.shape[0] // kernels.BLOCK))
-        outputs = (v_rate, v_initial, v_ambient, v_gains, v_scale)
-        with kernels.threads_for(ids.shape[0]):
-            rows = ids
-            if places.shape[0] > 0 and ids.shape[0] < rate.shape[0]:
-                rows = places[ids]
-                rows = rows[rows >= 0]
-            # Clearing all of it would double the memory traffic.
-            if gains.numel() > 0 and rows.shape[0] < gains.shape[0]:
-                kernels.clear_others(rows.numpy(), np.empty(gains.shape[0], np.bool_), v_gains.numpy())
-            gradient = v_values.contiguous().numpy()
-            kernels.backward(*_kernel_arguments(ctx, tensors), gradient, *(x.numpy() for x in outputs))
-        v_ambient = v_ambient.sum() if ctx.needs_input_grad[1] else None
-        v_gains = v_gains if ctx.needs_input_grad[5] else None
-        v_scale = v_scale if ctx.needs_input_grad[6] else None
-        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None
-
-
-def _kernel_arguments(ctx, tensors: tuple[Tensor, ...]) -> tuple:
-    """What both kernels take first, in their order."""
-    rate, initial, gains, places, scale, ids = (x.detach().numpy() for x in tensors)
-    ambient, time, limit = ctx.numbers
-    return rate, initial, ambient, gains, places, scale, ids, time, limit, ctx.table
+        rates, pulls = rate.new_zeros(2, gains.shape[0] if wanted[5] and gains.numel() > 0 else 0)
+        arrays = [x.detach().contiguous().numpy() for x in (ids, places, scale, v_values)]
+        ids, places, scale, v_values = arrays
+        outputs = [x.numpy() for x in (v_rate, v_initial, v_ambient, v_scale, rates, pulls)]
+        with kernels.threads_for(len(ids)):
+            kernels.backward(ids, places, scale, ctx.time, ctx.slopes, v_values, *outputs)
+        v_gains = None
+        if wanted[5]:
+            v_gains = torch.zeros_like(gains) if gains.numel() == 0 else None
+        if len(rates) > 0:
+            unwritten = Unwritten(rates, pulls, ctx.time, ctx.table, gains.shape[2])
+            box = getattr(gains, "unwritten", None)
+            if box is None:
+                v_gains = unwritten.written()
+            else:
+                box.append(unwritten)
+        v_ambient = v_ambient.sum() if wanted[1] else None
+        v_scale = v_scale if wanted[6] else None
+        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None, None

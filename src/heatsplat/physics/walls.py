@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 OUTSIDE_M2_K_W = 0.04  # resistance between surface and air outside, by convention (ISO 6946, table 7)
+CONVECTION = (4.0, 4.0)  # W/(m² K) in still air, and W s/(m³ K) for wind, by convention (ISO 6946, annex C)
 LEAST_K = 1.0  # between indoors and the outer surface: below, a loss says nothing of the wall
 
 

@@ -43,6 +43,7 @@ class RenderInputs:
     depth: bool
     eps2d: float = EPS2D
     maps: int = 0
+    raw: bool = False
 
 
 def rasterization(
@@ -66,6 +67,7 @@ def rasterization(
     eps2d: float = EPS2D,
     maps: int = 0,
     signs: Tensor | None = None,
+    raw: bool = False,
 ) -> RenderOutput:
     """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
 
@@ -92,6 +94,7 @@ def rasterization(
         eps2d: pixels² added to both variances of the projected covariance (3DGS: 0.3; Mip-Splatting: 0.1, antialiased).
         maps: how many maps over pixels the backward pass sums by blending weights (``RenderOutput.weighted``).
         signs: [N] numbers, constant, that are composited like a feature of the first modality (``RenderOutput.signed``).
+        raw: whether ``scales`` holds logarithms and ``opacities`` logits, as they are trained.
 
     Returns:
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
@@ -124,6 +127,8 @@ def rasterization(
         backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
     if backend not in BACKENDS:
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
+    if raw and backend != "cpu":
+        scales, opacities, raw = scales.exp(), opacities.sigmoid(), False
     native = maps if backend == "cpu" else 0  # the others sum maps as gradients of channels that are zero
     probe = _Probe(features, means, maps - native, signs) if maps > native or signs is not None else None
     if probe is not None:
@@ -134,7 +139,7 @@ def rasterization(
     inputs = RenderInputs(
         means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
         background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
-        native,
+        native, raw,
     )  # fmt: skip
     output = import_module(f"heatsplat.renderers.{backend}").render(inputs)
     return output if probe is None else probe.read(output)

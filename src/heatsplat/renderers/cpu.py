@@ -114,10 +114,12 @@ class _Frame:
         self.seen = array("seen", np.int32, -(-count // LANES))
         self.first_ranks = array("first_ranks", np.int64, chunks)
         ids = torch.empty(count, dtype=torch.int64)
+        given = _numpy(inputs.opacities)
+        self.opacities = array("opacities", np.float32, *given.shape) if inputs.raw else given
         visible, self.bound = projection.project(
-            _numpy(inputs.means), _numpy(inputs.quats), _numpy(inputs.scales), _numpy(inputs.opacities),
+            _numpy(inputs.means), _numpy(inputs.quats), _numpy(inputs.scales), given, inputs.raw,
             self.camera, inputs.width, inputs.height, inputs.antialiased,
-            self.screen, self.depths, self.means2d.numpy(), self.radii.numpy(), self.seen, ids.numpy(),
+            self.opacities, self.screen, self.depths, self.means2d.numpy(), self.radii.numpy(), self.seen, ids.numpy(),
             self.first_ranks, array("bounds", np.int64, chunks), array("columns", np.float32, chunks, RANK, LANES),
         )  # fmt: skip
         self.means2d.requires_grad_(inputs.means.requires_grad or inputs.viewmat.requires_grad)
@@ -143,7 +145,7 @@ class _Frame:
         counts = array("counts", np.int64, slabs, self.tiles_x * (self.tiles_y + 1))
         binning.find_instances(
             self.workers, self.ids, self.screen, inputs.width, _numpy(features), callable(inputs.features),
-            self.first_ranks, _numpy(inputs.opacities), inputs.depth, np.zeros((2, 1), np.int64),
+            self.first_ranks, self.opacities, inputs.depth, np.zeros((2, 1), np.int64),
             self.records, found, found_starts, found_counts, counts,
         )  # fmt: skip
         self.spans = array("spans", np.int32, self.count, 2)
@@ -197,8 +199,9 @@ class _Frame:
         v_cameras = np.zeros((self.chunks, 12 if camera else 0))
         scratch = LANES * SUMS + -(-self.backward_layout.slot_size // LANES) * LANES
         projection.project_backward(
-            _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), self.camera, self.inputs.antialiased,
-            self.inputs.depth, callable(self.inputs.features), self.first_ranks, self.seen, self.spans, self.slots,
+            _numpy(means), _numpy(quats), _numpy(scales), self.opacities, self.inputs.raw, self.camera,
+            self.inputs.antialiased, self.inputs.depth, callable(self.inputs.features), self.first_ranks, self.seen,
+            self.spans, self.slots,
             self.buffers.array("sums", np.float32, self.chunks * scratch),
             *(gradient.numpy() for gradient in v), sums.numpy(), _UNWANTED if absgrad is None else absgrad.numpy(),
             v_means2d.numpy(), v_cameras,
@@ -219,10 +222,11 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 def _camera_vector(inputs: RenderInputs) -> np.ndarray:
     """The camera as ``heatsplat.kernels.projection`` takes it."""
     width, height = inputs.width, inputs.height
-    viewmat, intrinsics = inputs.viewmat.detach().numpy(), inputs.K.detach().numpy()
-    (fx, _, cx), (_, fy, cy) = intrinsics[:2]
+    viewmat, intrinsics = inputs.viewmat.detach().tolist(), inputs.K.detach().tolist()
+    (fx, _, cx), (_, fy, cy), _ = intrinsics
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
     limits = -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
-    numbers = (*viewmat[:3, :3].flat, *viewmat[:3, 3], fx, fy, cx, cy, *limits, inputs.near, inputs.far)
+    rows = viewmat[:3]
+    numbers = [number for row in rows for number in row[:3]] + [row[3] for row in rows]
     eps2d = np.float32(inputs.eps2d)  # squared here: a square inside the kernel could melt into a fused multiply-add
-    return np.array((*numbers, eps2d, eps2d * eps2d), np.float32)
+    return np.array((*numbers, fx, fy, cx, cy, *limits, inputs.near, inputs.far, eps2d, eps2d * eps2d), np.float32)

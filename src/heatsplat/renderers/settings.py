@@ -68,6 +68,7 @@ class Renderer:
         maps: int = 0,
         ratio: float = 1.0,
         signs: Tensor | None = None,
+        raw: bool = False,
     ) -> RenderOutput:
         """What ``camera`` sees; arguments and result as ``heatsplat.renderers.rasterization``.
 
@@ -107,6 +108,7 @@ class Renderer:
             eps2d=blur,
             maps=maps,
             signs=signs,
+            raw=raw,
         )
         if given == dtype:
             return seen

@@ -12,7 +12,13 @@ from heatsplat.geometry.smoothing import kept_opacity, sampling_intervals, smoot
 
 
 class Smoothing(nn.Module):
-    """Leaves Gaussians as they are: nothing is stored and nothing is computed. Filters in space are subclasses."""
+    """Leaves Gaussians as they are: nothing is stored and nothing is computed. Filters in space are subclasses.
+
+    Attributes:
+        changes: whether it does anything to Gaussians.
+    """
+
+    changes = False
 
     def prepare(self, scene: SceneData, means: Tensor) -> None:
         """Takes what it needs from the scene and from the centres [N, 3] of the Gaussians before the first step."""
@@ -45,6 +51,8 @@ class SamplingFilter(Smoothing):
     Raises:
         ValueError: an option is out of its range.
     """
+
+    changes = True
 
     def __init__(self, variance: float = 0.2, every: int = 100, near: float = 0.2, margin: float = 0.15) -> None:
         super().__init__()

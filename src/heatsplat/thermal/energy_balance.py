@@ -17,7 +17,7 @@ from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, S
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.walls import u_value
+from heatsplat.physics.walls import CONVECTION, u_value
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
@@ -36,6 +36,7 @@ from heatsplat.thermal.coordinates import ImageRange
 log = logging.getLogger(__name__)
 
 SOLUTIONS = ("linear", "corrected")
+EXCHANGES = ("learned", "iso_6946")
 SURFACES = ("seen", "level")
 SKIES = ("auto", *sky.LAWS)
 SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
@@ -97,6 +98,9 @@ class EnergyBalance(ThermalModel):
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
         inner: whether there is heat from within (with solution "linear").
+        exchange: "learned" has each Gaussian find radiation's and wind's share of its exchange; "iso_6946" takes them from the
+            emissivity and the convention of building physics, 4 W/(m² K) and 4 more for each m/s of wind, which leaves
+            images to tell heat from within.
         indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
@@ -125,6 +129,7 @@ class EnergyBalance(ThermalModel):
         sun: bool = True,
         semi_infinite: bool = False,
         inner: bool = False,
+        exchange: str = "learned",
         indoor_c: float | None = None,
         normals: str = "seen",
         shadows: bool = False,
@@ -145,15 +150,24 @@ class EnergyBalance(ThermalModel):
             ("solution", solution, SOLUTIONS),
             ("normals", normals, SURFACES),
             ("clip", clip, CLIPS),
+            ("exchange", exchange, EXCHANGES),
             ("sky", sky, (*SKIES, None)),
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
-        for name, asked in (("nodes=2", nodes == 2), ("semi_infinite", semi_infinite), ("inner", inner)):
+        by_convention = exchange != "learned"
+        for name, asked in (
+            ("nodes=2", nodes == 2),
+            ("semi_infinite", semi_infinite),
+            ("inner", inner),
+            (f"exchange={exchange}", by_convention),
+        ):
             if asked and solution != "linear":
                 raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
         if nodes == 2 and semi_infinite:
             raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
+        if by_convention and (sky is None or not wind):
+            raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
         if indoor_c is not None and not inner:
             raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
         if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
@@ -167,6 +181,7 @@ class EnergyBalance(ThermalModel):
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
+        self.exchange = exchange
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
@@ -227,6 +242,8 @@ class EnergyBalance(ThermalModel):
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
+        if self.exchange != "learned":
+            return tensors if drivers.up is None else tensors | surface_normals(seeds)
         if drivers.sky is not None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
@@ -348,17 +365,30 @@ class EnergyBalance(ThermalModel):
             return Core(state("initial_core"), query.rows(splats["log_core_rate"]).clamp(*LOG_RATES), coupling)
 
         drivers = self.climate.drivers
+        log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
+        if self.exchange == "learned":
+            share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
+            wind = bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None
+        else:
+            share, wind = (torch.full_like(log_rate, value) for value in self._convention())
         return Surface(
             start=state("initial_state"),
-            log_rate=query.rows(splats["log_rate"]).clamp(*LOG_RATES),
+            log_rate=log_rate,
             sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
-            share=bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None,
-            wind=bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None,
+            share=share,
+            wind=wind,
             normals=query.normals(splats) if drivers.up is not None else None,
             exposure=Exposure(*(query.rows(splats[n].detach()) if n in splats else None for n in (SUN_SEEN, SKY_SEEN))),
             core=core() if self.nodes == 2 else None,
             inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
         )
+
+    def _convention(self) -> tuple[float, float]:
+        """Radiation's share of the exchange at mean wind, and the wind's of convection."""
+        windy = CONVECTION[1] * self.mean_wind.item()
+        convection = CONVECTION[0] + windy
+        radiation = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
+        return radiation / (radiation + convection), windy / convection
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -409,6 +439,8 @@ class EnergyBalance(ThermalModel):
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
             parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
             effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
+        elif self.exchange != "learned":
+            raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)

@@ -240,11 +240,15 @@ class NewtonHarmonic(ThermalModel):
             beyond = torch.tensor(spans - within, dtype=torch.float64, device=state.device)
             return relax(beyond, self.ambient, state, Query(ids).rows(self._rate(splats)))
 
+    def _given_rate(self, splats: Splats) -> tuple[Tensor, tuple[float, float] | None]:
+        """h/C of every Gaussian per span, [N]; or its logarithm, and the bounds within which that is taken."""
+        faithful = self.param == "faithful"
+        return splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"], LOG_RATES
+
     def _rate(self, splats: Splats) -> Tensor:
         """h/C of every Gaussian per span, [N]."""
-        faithful = self.param == "faithful"
-        log_rate = splats["log_conductance"] - splats["log_capacity"] if faithful else splats["log_rate"]
-        return log_rate.clamp(*LOG_RATES).exp()
+        rate, log_bounds = self._given_rate(splats)
+        return rate if log_bounds is None else rate.clamp(*log_bounds).exp()
 
     def _gain_factor(self, splats: Splats) -> Tensor | None:
         """What gains are multiplied by to drive a temperature, [N], 1/C; None is 1."""
@@ -253,16 +257,18 @@ class NewtonHarmonic(ThermalModel):
     def _recorded(self, splats: Splats, spans: float, ids: Tensor | None) -> Tensor:
         """As ``_state`` at a time within the record, counted in spans."""
         source = self.omega.numel() > 0
+        rate, log_bounds = self._given_rate(splats)
         return visible_temperature(
             torch.tensor(spans, dtype=torch.float64, device=self.omega.device),
             self.ambient,
             splats["initial_state"],
-            self._rate(splats),
+            rate,
             self.omega,
             splats["source_gains"] if source else None,
             self._gain_factor(splats) if source else None,
             ids,
             splats.places("source_gains") if source else None,
+            log_bounds,
         )
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:

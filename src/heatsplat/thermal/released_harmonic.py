@@ -104,8 +104,8 @@ class ReleasedHarmonic(NewtonHarmonic):
     def _lr_gains(self, harmonics: int) -> float:
         return self.lr_gains
 
-    def _rate(self, splats: Splats) -> Tensor:
-        return splats["time_constant"].clamp_min(SHORTEST_S / self.clock.span_s).reciprocal()
+    def _given_rate(self, splats: Splats) -> tuple[Tensor, None]:
+        return splats["time_constant"].clamp_min(SHORTEST_S / self.clock.span_s).reciprocal(), None
 
     def _gain_factor(self, splats: Splats) -> Tensor:
         return splats["source_scale"].clamp_min(SMALLEST / self.range.bounds.span_k) * self._rate(splats)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -117,6 +118,16 @@ class Wrapper(ThermalModel):
     def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
         """That of what is wrapped: what a camera would see without anything in between."""
         return self._models[0].temperature(splats, time_s)
+
+    @property
+    def removable(self) -> tuple[str, ...]:
+        """Those of what is wrapped."""
+        return self._models[0].removable
+
+    @contextmanager
+    def without(self, name: str) -> Iterator[None]:
+        with self._models[0].without(name):
+            yield
 
     @property
     def beyond_record(self) -> str:

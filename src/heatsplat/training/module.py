@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +221,8 @@ class SplatTraining(pl.LightningModule):
         for name, gradient in self._waiting.items():
             self.get_parameter(name).grad = gradient.to(self.device)
         self._waiting = {}
+        if self.trainer.gradient_clip_val:  # Lightning clips what is in grad
+            self.trainer.optimizers[0].takes_unwritten = False
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -262,8 +266,9 @@ class SplatTraining(pl.LightningModule):
             told = self.thermal.features(self.splats, query) if values is None else values.index_select(0, ids)
             return self.composite.encode(told, channels)
 
+        raw = moved is None and not self.smoothing.changes
         output = self.renderer(
-            *self._shapes(moved),
+            *(self._raw_shapes() if raw else self._shapes(moved)),
             emitted,
             frame.camera,
             self.background,
@@ -273,8 +278,15 @@ class SplatTraining(pl.LightningModule):
             maps=maps,
             ratio=ratio,
             signs=signs,
+            raw=raw,
         )
-        return replace(output, features=self.composite.decode(output.features, channels))
+        image = self.composite.decode(output.features, channels)
+        return output if image is output.features else replace(output, features=image)
+
+    def _raw_shapes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, rotations, logarithms of scales and logits of opacities of all Gaussians."""
+        splats = self.splats
+        return splats.means, splats.quats, splats["log_scales"], splats["opacity_logits"].T
 
     def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are."""
@@ -287,14 +299,14 @@ class SplatTraining(pl.LightningModule):
         ratio = self.resolution.ratio(progress)
         camera = rendered(view.camera, self.supersample / ratio)
         view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
-        frame = replace(view.frame, camera=camera)
+        frame = view.frame if camera is view.camera else replace(view.frame, camera=camera)
         self.thermal.on_step(here)
         signs = self.overlap.signs_at(here, len(self.splats), self.seed)
         maps = self.density.maps_at(here)
         output = self.render(
             frame, depth=self.sensor.needs_depth, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs
         )
-        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
             prediction,
@@ -311,13 +323,18 @@ class SplatTraining(pl.LightningModule):
         if signs is not None:
             terms["entropy"] = self.overlap.entropy(output, here)
         self._rendered = (output, camera)
-        loss = sum(terms.values())
+        loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
             target = resampled(inputs.target, camera.height, camera.width, "area")
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
+
+    def _images(self, output: RenderOutput) -> Sequence[Tensor]:
+        """The image of each modality, the model's own first."""
+        channels = self.thermal.modality_channels
+        return [output.features] if len(channels) == 1 else output.features.split(channels, dim=-1)
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
@@ -359,7 +376,7 @@ class SplatTraining(pl.LightningModule):
         if self._exposed and step + 1 in self.exposure.refresh:
             self._expose()
         if change is not None:
-            for group in optimizer.param_groups:
+            for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
 
@@ -397,7 +414,7 @@ class SplatTraining(pl.LightningModule):
         Last comes "clean", what a camera without the flaws of the sensor chain would record.
         """
         output = self.render(frame, depth=self.sensor.needs_depth)
-        image, *companions = output.features.split(self.thermal.modality_channels, dim=-1)
+        image, *companions = self._images(output)
         images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}

@@ -26,8 +26,12 @@ class OnePassAdam(torch.optim.Adam):
 
     A group may have one more option, "group_penalty": the weight of a penalty Σ_k √(Σ_i x_ik²) over the columns k of the
     last dimension of its tensors. Its gradient is that of a weight decay of weight / √(Σ_i x_ik²), and is added like that.
+
+    From ``zero_grad`` to ``step`` parameters take gradients that are not written out (``physics.fused.Unwritten``), unless
+    ``takes_unwritten`` is False: then all gradients are in ``grad``, where those of several views add up.
     """
 
+    takes_unwritten = True
     _sums: np.ndarray | None = None
 
     def finite(self) -> bool | None:
@@ -39,6 +43,8 @@ class OnePassAdam(torch.optim.Adam):
         for group in self.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
+                if self.takes_unwritten and _fits_kernel(parameter):
+                    parameter.unwritten = []
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -47,10 +53,23 @@ class OnePassAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        stepped = [(group, x) for group in self.param_groups for x in group["params"] if x.grad is not None]
-        if all(_fits_kernel(x) for _, x in stepped):
-            self._step_in_kernel(stepped)
+        stepped, by_rows = [], []
+        for group in self.param_groups:
+            for x in group["params"]:
+                box = x.__dict__.pop("unwritten", None)
+                if box and x.grad is None and len(box) == 1:
+                    by_rows.append((group, x, box[0]))
+                    continue
+                for unwritten in box or ():
+                    x.grad = unwritten.written() if x.grad is None else x.grad + unwritten.written()
+                if x.grad is not None:
+                    stepped.append((group, x))
+        if all(_fits_kernel(x) and x.grad.dtype == x.dtype for _, x in stepped):
+            self._step_in_kernel(stepped, by_rows)
         else:
+            for group, x, unwritten in by_rows:
+                x.grad = unwritten.written()
+                stepped.append((group, x))
             for group, x in stepped:
                 if group.get("group_penalty"):
                     x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
@@ -58,7 +77,11 @@ class OnePassAdam(torch.optim.Adam):
             self._sums = None
         return loss
 
-    def _step_in_kernel(self, stepped: list[tuple[dict[str, Any], torch.Tensor]]) -> None:
+    def _step_in_kernel(
+        self,
+        stepped: list[tuple[dict[str, Any], torch.Tensor]],
+        by_rows: list[tuple[dict[str, Any], torch.Tensor, Any]],
+    ) -> None:
         tensors, rates, kept, tasks = [], [], [], 0
         decays = [np.array([group["weight_decay"] for group, _ in stepped], np.float32).repeat(LANES)]
         decayed = decays[0].size
@@ -67,19 +90,40 @@ class OnePassAdam(torch.optim.Adam):
             kept.append(gradient)  # its memory, until the kernel has read it
             decay, period = row * LANES, LANES
             if group.get("group_penalty") and count > 0:
-                decays.append(_group_decay(group, parameter))
+                decays.append(np.tile(self._group_decay(group, parameter), LANES))
                 decay, period = decayed, decays[-1].size
                 decayed += period
             places = parameter, gradient, state["exp_avg"], state["exp_avg_sq"]
             tensors.append((*(tensor.data_ptr() for tensor in places), count, tasks, decay, period))
             tasks += -(-count // kernel.SHARE)
-            state["step"] += 1
-            beta1, beta2 = group["betas"]
-            done = state["step"].item()
-            rates.append((group["lr"] / (1 - beta1**done), beta1, beta2, 1 / math.sqrt(1 - beta2**done), group["eps"]))
+            rates.append(_counted(group, state))
         self._sums = np.zeros(tasks, np.float32)
         if tasks > 0:
             kernel.step(np.array(tensors), np.array(rates, np.float32), np.concatenate(decays), self._sums)
+        for group, parameter, unwritten in by_rows:
+            decay = np.full(parameter.shape[-1], group["weight_decay"], np.float32)
+            if group.get("group_penalty"):
+                decay = self._group_decay(group, parameter)
+            state = self._state_of(parameter)
+            rate = np.array(_counted(group, state), np.float32)
+            sums, squares = unwritten.step(parameter, state["exp_avg"], state["exp_avg_sq"], decay, rate)
+            self._squares = parameter, parameter._version, squares
+            self._sums = np.concatenate([self._sums, sums])
+
+    _squares: tuple[torch.Tensor, int, np.ndarray] | None = None  # of the last tensor stepped by rows, and when
+
+    def _group_decay(self, group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
+        """Decay of each column of a parameter with a penalty of groups."""
+        known = self._squares
+        if known is not None and known[0] is parameter and known[1] == parameter._version:
+            sums = known[2]
+        else:
+            columns = parameter.shape[-1]
+            sums = np.empty((-(-parameter.numel() // (kernel.SQUARED_ROWS * columns)), columns), np.float32)
+            kernel.square_columns(parameter.detach().view(-1).numpy(), columns, sums)
+        norms = np.sqrt(sums.sum(axis=0, dtype=np.float64).astype(np.float32))
+        pulls = np.divide(1, norms, out=np.zeros_like(norms), where=norms > 0)
+        return np.float32(group["weight_decay"]) + np.float32(group["group_penalty"]) * pulls
 
     def _state_of(self, parameter: torch.Tensor) -> dict[str, torch.Tensor]:
         """Moments and number of steps of a parameter, made at its first step."""
@@ -91,20 +135,16 @@ class OnePassAdam(torch.optim.Adam):
 
 
 def _fits_kernel(parameter: torch.Tensor) -> bool:
-    """Whether a parameter and its gradient are what the kernel steps."""
-    kinds = parameter.dtype == parameter.grad.dtype == torch.float32
-    return kinds and parameter.device.type == "cpu" and parameter.is_contiguous()
+    """Whether a parameter is one that the kernel steps."""
+    return parameter.dtype == torch.float32 and parameter.device.type == "cpu" and parameter.is_contiguous()
 
 
-def _group_decay(group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
-    """Decay of the columns of a parameter with a penalty of groups, as often as it takes to be whole vectors."""
-    columns = parameter.shape[-1]
-    rows = max(1, kernel.SHARE // columns)
-    sums = np.empty((-(-parameter.numel() // (rows * columns)), columns), np.float32)
-    kernel.square_columns(parameter.detach().view(-1).numpy(), columns, rows, sums)
-    norms = torch.from_numpy(sums.sum(axis=0, dtype=np.float64).astype(np.float32)).sqrt()
-    decay = np.float32(group["weight_decay"]) + np.float32(group["group_penalty"]) * _reciprocals(norms).numpy()
-    return np.tile(decay, LANES)
+def _counted(group: dict[str, Any], state: dict[str, torch.Tensor]) -> tuple[float, ...]:
+    """Counts a step of a parameter; its row of rates for the kernel."""
+    done = state["step"].numpy()
+    done += 1
+    (beta1, beta2), count = group["betas"], float(done)
+    return group["lr"] / (1 - beta1**count), beta1, beta2, 1 / math.sqrt(1 - beta2**count), group["eps"]
 
 
 def _reciprocals(norms: torch.Tensor) -> torch.Tensor:
@@ -193,6 +233,7 @@ class Optimisation:
             progress: function of a step to the share of the decay that is done (``Schedule.round_progress``).
         """
         optimizer = OnePassAdam(groups, betas=self.betas, eps=self.eps, fused=True)
+        optimizer.takes_unwritten = self.accumulate == 1
         ends = [group.get("lr_end", 1.0) ** self.decay for group in optimizer.param_groups]
         factors = [lambda step, end=end: end ** progress(step) for end in ends]
         return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, factors)

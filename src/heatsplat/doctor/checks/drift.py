@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.doctor.courses import beside_courses
 from heatsplat.effects.observations import Tracks
 
 MIN_POINTS, MIN_FRAMES = 40, 5
@@ -14,6 +15,9 @@ LEAST = 3.0  # times the noise of a pixel
 # what leaps from frame to frame and of what wanders slowly. Where a scene warms, cools or hazes the ratio is 1.66 and more,
 # and where it is not, the correlation 0.3; where a sensor drifts 1.27 and less, and 0.66 (m3t_heath: 0.95 and 1.16).
 LEAPS, WANDERS = (0.55, 0.75, 1.4), (0.98, 0.9, 1.1)
+# Beside each point's own course: a drifting sensor before a scene that cools has 0.98 and 1.07; a lamp, haze and weather 1.4
+# and more, and a scene that only cools leaves no level above the noise.
+BESIDE = (0.9, 0.8, 1.25)
 JUMP = 3.0  # times the usual step between frames
 
 
@@ -24,7 +28,13 @@ def find(material: Material) -> list[Finding]:
     values, weights = tracks.values, tracks.weights
     levels = frame_levels(values, weights)
     if float(levels.std()) < LEAST * material.noise or not _in_common(tracks, levels, material.noise):
-        return []
+        values, weights = beside_courses(values, weights, material)
+        levels = frame_levels(values, weights)
+        leaps = float(_leaps(levels).std()) > LEAST * material.noise
+        if not leaps or not all(
+            _same(_leaps(one), _leaps(other), *BESIDE) for one, other in _halves(tracks, values, weights)
+        ):
+            return []
     before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
     shutters = [material.name(f) for f in _shutters(levels)]
     resets = f", and is set back at {some(shutters)} (shutter)" if shutters else ""
@@ -53,18 +63,24 @@ def frame_levels(values: Tensor, weights: Tensor) -> Tensor:
 
 def _in_common(tracks: Tracks, levels: Tensor, noise: float) -> bool:
     """Whether points that change most and points that change least, warm ones and cold ones tell of the same levels."""
-    used = tracks.weights > 0
-    count = used.sum(1).clamp_min(1)
-    mean = (tracks.values * used).sum(1) / count
-    change = (((tracks.values - mean[:, None]) * used).square().sum(1) / count).sqrt()
-    halves = []
-    for order in (change, mean):
-        upper = order > order.median()
-        halves.append([frame_levels(tracks.values[keep], tracks.weights[keep]) for keep in (upper, ~upper)])
+    halves = _halves(tracks, tracks.values, tracks.weights)
     leaps = float(_leaps(levels).std()) > LEAST * noise
     return (leaps and all(_same(_leaps(one), _leaps(other), *LEAPS) for one, other in halves)) or all(
         _same(one, other, *WANDERS) for one, other in halves
     )
+
+
+def _halves(tracks: Tracks, values: Tensor, weights: Tensor) -> list[list[Tensor]]:
+    """Levels [F] by the points that change more and less than others, and by warm ones and cold ones."""
+    used = weights > 0
+    some, count = used.any(1), used.sum(1).clamp_min(1)
+    mean = (tracks.values * used).sum(1) / count
+    change = (((tracks.values - mean[:, None]) * used).square().sum(1) / count).sqrt()
+    halves = []
+    for order in (change, mean):
+        upper = order > order[some].median()
+        halves.append([frame_levels(values[keep], weights[keep]) for keep in (upper & some, ~upper & some)])
+    return halves
 
 
 def _leaps(levels: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.doctor.base import Check, Finding, Material
-from heatsplat.effects.image_motion import centred, gradient
+from heatsplat.doctor.courses import beside_courses
+from heatsplat.effects.image_motion import gradient
 from heatsplat.effects.observations import between
 
 WIDTHS = (24, 48, 96, 192)  # pixels across of the images in which it is looked for, one after the other
@@ -66,7 +67,7 @@ def fitting_factor(material: Material) -> tuple[float, float]:
             values, slopes = torch.stack(read, 1).split([1, 2], dim=2)
             pulled = (slopes * (factor * away * half)).sum(2)
             seen = (tracks.weights > 0) & (places.abs() < 1.0).all(2)
-            share, error = _share(values[..., 0], pulled, seen)
+            share, error = _share(material, values[..., 0], pulled, seen)
             factor = min(max(factor * (1.0 - share), 1.0 / WIDEST), WIDEST)
     return factor, error
 
@@ -78,18 +79,19 @@ def _from_the_middle(material: Material) -> tuple[Tensor, Tensor]:
     return material.tracks.positions - middle, middle
 
 
-def _share(values: Tensor, pulled: Tensor, seen: Tensor) -> tuple[float, float]:
-    """What of ``pulled`` [P, F] is in values beside a level for each point and each frame, and its standard error; robust."""
+def _share(material: Material, values: Tensor, pulled: Tensor, seen: Tensor) -> tuple[float, float]:
+    """What of ``pulled`` [P, F] is in values beside each point's own course, and its standard error; robust."""
     weights = seen.double()
     for _ in range(ROUNDS):
-        value, pull = centred(torch.stack([values, pulled], 2), weights).unbind(2)
-        inner = (weights * pull * pull).sum().clamp_min(1e-30)
-        share = (weights * pull * value).sum() / inner
+        value, counts = beside_courses(values, weights, material)
+        pull, _ = beside_courses(pulled, weights, material)
+        inner = (counts * pull * pull).sum().clamp_min(1e-30)
+        share = (counts * pull * value).sum() / inner
         left = value - share * pull
         own = 1.4826 * torch.where(seen, left.abs(), torch.nan).nanmedian(1, keepdim=True).values
         own = own.nan_to_num(torch.inf).clamp_min(float(own[own.isfinite()].median().clamp_min(1e-9)))
         weights = (1.0 - (left / (5.0 * own)) ** 2).clamp_min(0.0) ** 2 * seen / own**2
-    pulls = weights * left * pull
+    pulls = counts * left * pull
     error = max(float(pulls.sum(axis).square().sum().sqrt() / inner) for axis in (0, 1))
     return float(share), error
 
@@ -100,9 +102,9 @@ def _spread(material: Material, factor: float, other: float) -> float:
     places = middle + factor * away
     seen = (material.tracks.weights > 0) & (places.abs() < 1.0).all(2) & ((middle + other * away).abs() < 1.0).all(2)
     images = material.images.nan_to_num()
-    values = torch.stack([between(image[..., None], places[:, f]) for f, image in enumerate(images)], 1)
-    left = torch.where(seen, centred(values, seen.double())[..., 0].abs(), torch.nan)
-    return 1.4826 * float(left.nanmedian())
+    values = torch.stack([between(image[..., None], places[:, f])[:, 0] for f, image in enumerate(images)], 1)
+    left, counts = beside_courses(values, seen.double(), material)
+    return 1.4826 * float(torch.where(counts > 0, left.abs(), torch.nan).nanmedian())
 
 
 CHECK = Check("focal", "whether images fit poses and points best with the focal length that they have", find)

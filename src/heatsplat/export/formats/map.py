@@ -43,7 +43,8 @@ class Map(Format):
         gps: table of camera positions, "auto" or None (``export.place``); without one the map has no CRS.
         above: [x, y, z] direction in the world from which the map is seen; None finds it (``export.place``).
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
-        uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``).
+        uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``), and
+            the last ones are those of the attributes.
         against: such a map of another run on the same scene: a picture beside the file (.png) compares this map with it and with
             a mosaic of the recorded images, seams and all (``export.seams``). None draws none.
     """
@@ -160,11 +161,19 @@ class Map(Format):
         unit = seen.unit.replace("°", "deg ")
         unit = f" [{unit}]" if unit else ""
         bands = {f"{moment.quantity}{unit}": moment.of_blended(means[..., 0]).numpy()}
+        intervals: dict[str, np.ndarray] = {}
         if self.uncertainty:
             frame = at_time(module.scene, Frame("map", first_free_id(module.scene), camera), moment.time_s)
-            deviation = Uncertainty(module).deviation(frame)
+            certainty = Uncertainty(module)
+            deviation = certainty.deviation(frame)
             bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
-        return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)}
+            shown = means[..., 0].isfinite().cpu()
+            with torch.no_grad():
+                for name, spread in certainty.of_attributes(frame).items():
+                    seen_of = module.composited(frame, spread[:, None].nan_to_num().to(module.device))
+                    spread = (seen_of.features[..., 0] / seen_of.alpha[0]).cpu()
+                    intervals[f"{name} {DEVIATION}"] = spread.where(shown, torch.nan).numpy()
+        return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)} | intervals
 
 
 def _method(moment: Moment) -> str:

@@ -52,7 +52,7 @@ def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
         "entries": [_told(entry, board, folder) for entry in entries],
         "beside": [
             {"method": method, "track": track, "ratio": ratio, "scenes": count}
-            for (method, track), (ratio, count) in beside.items()
+            for (method, track), (ratio, count) in sorted(beside.items(), key=lambda item: item[1][0])
         ],
     }  # fmt: skip
     data = json.dumps(content, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")

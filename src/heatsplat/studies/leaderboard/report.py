@@ -76,10 +76,11 @@ def _clock(board: Board) -> str:
 
 
 def order(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
-    """Methods of a track, the best first; those without results last."""
+    """Methods of a track: those that ran on more scenes first, the better of equally many before the worse."""
     beside = beside_reference(entries, board)
     names = list(dict.fromkeys(entry.method for entry in entries))
-    return sorted(names, key=lambda name: beside.get((name, track), (float("inf"), 0))[0])
+    last = (float("inf"), 0)
+    return sorted(names, key=lambda name: (-beside.get((name, track), last)[1], beside.get((name, track), last)[0]))
 
 
 def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:

@@ -1,0 +1,37 @@
+"""A report in Markdown becomes one page that needs no other file."""
+
+import numpy as np
+from PIL import Image
+
+from heatsplat.callbacks.page import page, write_page
+
+TEXT = """# etgs on <b>
+
+## Scores
+
+| score | value |
+|---|---:|
+| psnr | 39 |
+
+![a view](renders/a.png)
+
+![not there](renders/no.png)
+
+[numbers](a.csv)
+
+## Versions
+
+- torch: 2
+"""
+
+
+def test_pictures_are_in_it_and_details_are_folded(tmp_path):
+    (tmp_path / "renders").mkdir()
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "renders" / "a.png")
+    write_page(tmp_path / "report.html", TEXT)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert text == page(TEXT, tmp_path)
+    assert text.count("<img") == 1 and 'src="data:image/webp;base64,' in text and 'width="8" height="6"' in text
+    assert "<title>etgs on &lt;b&gt;</title>" in text and "<b>" not in text
+    assert '<td style="text-align:right">39</td>' in text and '<a href="a.csv">numbers</a>' in text
+    assert "<details><summary>Versions</summary>" in text and ">Versions</a>" not in text

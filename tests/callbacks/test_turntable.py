@@ -1,0 +1,17 @@
+"""The moving picture: as many images as asked for, all of one size, in a file that stands alone."""
+
+import torch
+from fake_run import FakeModule, wall
+from PIL import Image
+
+from heatsplat.callbacks.turntable import TURNTABLE_FILE, Turntable
+
+
+def test_it_turns(tmp_path):
+    module = FakeModule(wall(), tmp_path)
+    seen = iter(range(1, 9))
+    module.predict = lambda frame: torch.full((frame.camera.height, frame.camera.width, 1), next(seen) / 9)
+    Turntable(frames=5, size=48, milliseconds=80).on_test_epoch_end(None, module)
+    with Image.open(tmp_path / TURNTABLE_FILE) as picture:
+        assert picture.n_frames == 5 and picture.is_animated and picture.info["loop"] == 0
+        assert picture.convert("RGB").getcolors(maxcolors=100_000) is not None and min(picture.size) > 100

@@ -1,0 +1,30 @@
+"""A focal length that fits neither poses nor points is found, before scenes that change too, and the true one is not."""
+
+from dataclasses import replace
+
+import pytest
+from materials import checks, clean
+
+from heatsplat.contracts import Camera
+from heatsplat.doctor.checks.focal import fitting_factor
+
+
+def wrong(material, factor):
+    """The recording with cameras of another focal length."""
+
+    def lens(camera):
+        K = camera.K.clone()
+        K[[0, 1], [0, 1]] *= factor
+        return Camera(camera.viewmat, K, camera.width, camera.height)
+
+    views = [replace(view, frame=replace(view.frame, camera=lens(view.camera))) for view in material.views]
+    return replace(material, cameras=[lens(camera) for camera in material.cameras], views=views)
+
+
+@pytest.mark.parametrize("scene", ["static", "cooling"])
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_wrong_focal_length_is_found_and_the_true_one_named(scene, factor):
+    bad = wrong(clean(scene), factor)
+    assert "focal" in checks(bad)
+    assert factor * fitting_factor(bad)[0] == pytest.approx(1.0, abs=0.04)
+    assert "focal" not in checks(clean(scene))
