@@ -242,8 +242,8 @@ class Balance:
         self.reference_k, self.times = climate.drivers.reference_k, climate.drivers.times_s.tolist()
         rows = climate.rows.to(dtype)
         self.air, self.wind_anomaly = climate.rows[0].tolist(), climate.rows[4].tolist()
-        self.sky, self.around, self.light, self.beams = rows[1], rows[2], rows[3], rows[5:]
-        self.seen = None if self.normals is None else climate.share_of_sky(self.normals)
+        self.sky, self.around, self.light, self.beams = rows[1], rows[2], rows[3], rows[5:8]
+        self.seen = None if self.normals is None else climate.share_of_sky(surface).to(dtype)
         self.interval = -1
         self.linear = self.share is None
         self.constant_rate = self.linear and self.wind is None
@@ -346,7 +346,7 @@ def weather_problem(gaussians: int, frames: int, name: str, title: str, span_s: 
     kinks = tuple(t for t in drivers.times_s.tolist() if 0 < t < moments[-1])
 
     def cast(kind: str) -> Surface:
-        return Surface(*(None if x is None else x.to(getattr(torch, kind)) for x in surface))
+        return Surface(*(x.to(getattr(torch, kind)) if isinstance(x, torch.Tensor) else x for x in surface))
 
     def stepped(kind: str) -> Moment:
         own, record = cast(kind), Climate(drivers)

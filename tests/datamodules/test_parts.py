@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.synthetic_scene.film import camera_path, frame_times
+from heatsplat.datamodules.synthetic_scene.paths import camera_path, frame_times
 from heatsplat.datamodules.synthetic_scene.parts import parts_of
 
 

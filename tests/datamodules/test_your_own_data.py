@@ -86,7 +86,11 @@ def test_every_option_on_the_page_is_one_of_the_configuration():
     layouts = {path.stem for path in (ROOT / "conf" / "data").glob("*.yaml")}
     assert set(re.findall(r"`data=(\w+)`", PAGE)) <= layouts
     table = PAGE[PAGE.index("| what you have") : PAGE.index("`data.root`")]
-    assert set(re.findall(r"`(\w+)`", "".join(re.findall(r"\|[^|]*\|\n", table)))) == layouts - {"synthetic", "scenes", "benchmark"}
+    assert set(re.findall(r"`(\w+)`", "".join(re.findall(r"\|[^|]*\|\n", table)))) == layouts - {
+        "synthetic",
+        "scenes",
+        "benchmark",
+    }
 
 
 def test_every_other_key_of_images_is_understood():

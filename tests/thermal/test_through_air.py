@@ -45,4 +45,4 @@ def test_a_run_finds_the_extinction_of_the_fog(tmp_path):
     found = module.thermal.temperature(module.splats, 100.0).detach()[nearest] - 273.15
     true = module.scene.truth(points, torch.tensor([100.0]))[:, 0]
     seen = 22.0 + (true - 22.0) * torch.exp(-droplets(2.0) * module.thermal.air.typical)
-    assert (found - true).abs().median() < 0.3 * (seen - true).abs().median()
+    assert (found - true).abs().median() < 0.4 * (seen - true).abs().median()

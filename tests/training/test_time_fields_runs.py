@@ -28,9 +28,12 @@ def test_before_training_images_are_those_of_3dgs_and_the_field_is_asked_once(re
     first = ours.thermal.first_steps
     assert first == (300 if "thermalgs" in recipe[0] else 100)
     ours.thermal.on_step(first - 1)
-    assert torch.equal(ours.predict(frame), expected) and not calls
+    # Sizes and opacities of a model that moves are activated before projection, which may round the last digit differently.
+    torch.testing.assert_close(ours.predict(frame), expected, rtol=0, atol=1e-5)
+    assert not calls
     ours.thermal.on_step(first)
-    assert torch.equal(ours.predict(frame), expected) and calls == [1]
+    torch.testing.assert_close(ours.predict(frame), expected, rtol=0, atol=1e-5)
+    assert calls == [1]
 
 
 def test_a_change_of_one_head_shows_in_the_image(tmp_path):

@@ -30,6 +30,8 @@ def only_if_asked(inspected: Inspection) -> Evidence:
 
 def directed(scene: SceneData) -> str | None:
     """What a record lacks that says from where light comes; None where it lacks nothing."""
+    if scene.weather is None:
+        return "the scene lacks weather, which it needs"
     lacks = [name for name in ("sun", "direct_w_m2", "diffuse_w_m2") if getattr(scene.weather, name) is None]
     return f"the weather lacks {', '.join(lacks)}, which it needs" if lacks else None
 

@@ -14,8 +14,13 @@ CITATION_FILE = "CITATION.cff"
 
 
 def citations(method: str | None) -> list[str]:
-    """Lines of text for a list of references: heatsplat first, then what the file notes as the paper of the method."""
+    """Lines of text for a list of references: heatsplat first, then what the file notes as the paper of the method.
+
+    None where a copy of the sources came without the file.
+    """
     file = yaml.safe_load(_text())
+    if file is None:
+        return []
     own = f"{_names(file['authors'])}: {file['title']}, version {file['version']}. {file['abstract'].rstrip('.')}."
     papers = [entry for entry in file["references"] if method in re.findall(r"\w+", entry["notes"].partition(";")[0])]
     also = [entry for entry in file["references"] if method in re.findall(r"\w+", entry["notes"].partition(";")[2])]
@@ -25,7 +30,8 @@ def citations(method: str | None) -> list[str]:
 def _text() -> str:
     """The file in the source tree, or what an installed package has of it."""
     if CHECKOUT is not None:
-        return (CHECKOUT / CITATION_FILE).read_text(encoding="utf-8")
+        file = CHECKOUT / CITATION_FILE
+        return file.read_text(encoding="utf-8") if file.exists() else ""
     try:
         return distribution("heatsplat").read_text(f"licenses/{CITATION_FILE}") or ""
     except PackageNotFoundError:
