@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.synthetic_scene.paths import camera_path, frame_times
 from heatsplat.datamodules.synthetic_scene.parts import parts_of
+from heatsplat.datamodules.synthetic_scene.paths import camera_path, frame_times
 
 
 def recorded(count: int) -> tuple[np.ndarray, np.ndarray]:
