@@ -4,16 +4,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from effects.tracks import FRAMES, PASSED, POINTS, data_of, drawn, fit_to, levels
+from effects.tracks import COOLING, DRIFTING, FRAMES, NOTHING, PASSED, POINTS, data_of, drawn, fit_to, levels
 
 from heatsplat.effects.joint.certainty import MIN_DB, Certainty
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import fit_of
 from heatsplat.effects.joint.model import Model
-
-COOLING = levels() + 0.1 * drawn(POINTS, 1, seed=8) * torch.exp(-3 * PASSED)
-DRIFTING = levels() + 0.02 * drawn(FRAMES, seed=9)
-NOTHING = Model()
 
 
 @pytest.fixture(scope="module")

@@ -2,15 +2,11 @@
 
 import pytest
 import torch
-from effects.tracks import FRAMES, PASSED, POINTS, drawn, fit_to, levels
+from effects.tracks import COOLING, DRIFTING, FRAMES, NOTHING, fit_to, levels
 
 from heatsplat.effects.joint.certainty import MIN_SIGMAS
 from heatsplat.effects.joint.held_out import FOLDS, compared, fold_of, shuffled, squares_of
 from heatsplat.effects.joint.model import Model
-
-COOLING = levels() + 0.1 * drawn(POINTS, 1, seed=8) * torch.exp(-3 * PASSED)
-DRIFTING = levels() + 0.02 * drawn(FRAMES, seed=9)
-NOTHING = Model()
 
 
 @pytest.fixture(scope="module")

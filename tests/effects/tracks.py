@@ -6,6 +6,7 @@ from torch.nn import functional
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.fit import fit_of
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.observations import Tracks
 
 POINTS, FRAMES, NOISE = 60, 30, 0.01
@@ -20,6 +21,11 @@ def drawn(*shape, seed=0):
 def levels(seed=1):
     """A level for each point, [P, 1]."""
     return 0.5 + 0.15 * drawn(POINTS, 1, seed=seed)
+
+
+COOLING = levels() + 0.1 * drawn(POINTS, 1, seed=8) * torch.exp(-3 * PASSED)
+DRIFTING = levels() + 0.02 * drawn(FRAMES, seed=9)
+NOTHING = Model()
 
 
 def positions():
