@@ -15,9 +15,10 @@ from heatsplat.callbacks.images import ImagePanels
 from heatsplat.callbacks.metrics import CURVE_COLUMNS, QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves
 from heatsplat.callbacks.progress import Progress
-from heatsplat.callbacks.report import Report, hyperparameters
+from heatsplat.callbacks.report import Report, hyperparameters, pictures_of
 from heatsplat.callbacks.statistics import SplatStatistics
 from heatsplat.callbacks.timing import CostMeter
+from heatsplat.contracts import Camera, Frame
 from heatsplat.io.results import COST, TEST, RunResults
 from heatsplat.io.tables import read_csv
 
@@ -165,6 +166,18 @@ def test_pictures_show_what_they_say(run):
     for path in drawn:
         picture = cv2.imread(str(folder / path))
         assert picture.shape[1] > 3 * picture.shape[0] > 600
+
+
+def test_a_view_s_companions_come_after_it_and_take_no_other_view_s_place(tmp_path):
+    camera = Camera(torch.eye(4), torch.eye(3), 8, 6)
+    frames = [Frame(f"a[{i}].png", i, camera) for i in range(4)]
+    for i in (0, 1, 3):  # of frame 2 nothing was drawn
+        for ending in ("", "_clean"):
+            (tmp_path / f"{i:04d}_a[{i}]{ending}.png").touch()
+    assert [path.name for path in pictures_of(tmp_path, frames, 2)] == [
+        "0000_a[0].png", "0000_a[0]_clean.png", "0003_a[3].png", "0003_a[3]_clean.png",
+    ]  # fmt: skip
+    assert pictures_of(tmp_path, frames, 0) == []
 
 
 def test_curves_at_probes(run):

@@ -127,7 +127,7 @@ def panels(
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
     thermal_range = _range_of(scene, modality)
-    title = [view.frame.name]
+    title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
     if view.frame.time_s is not None:
         title.append(f"t = {view.frame.time_s:.4g} s")
     scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from glob import escape
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from rich.table import Table
 
 from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.board import board
+from heatsplat.callbacks.images import file_stem
 from heatsplat.callbacks.metrics import TEST_FILE
 from heatsplat.callbacks.page import PAGE_FILE, write_page
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
-from heatsplat.contracts import SceneData, evenly_spread
+from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
@@ -59,7 +61,7 @@ class Report(pl.Callback):
     * The table on the screen.
 
     Args:
-        pictures: test pictures in the report.
+        pictures: test views in the report, each with its companions.
         show: print the table.
         html: write report.html.
     """
@@ -80,8 +82,7 @@ class Report(pl.Callback):
         results.effects = results.effects or describe_effects(module)
         results.versions = collect_versions()
         curves = draw_curves(folder)
-        pictures = sorted((folder / "renders" / "test").glob("*.png"))
-        shown = [pictures[i] for i in evenly_spread(len(pictures), self.pictures)]
+        shown = pictures_of(folder / "renders" / "test", module.scene.test.frames, self.pictures)
         text = report(results, folder, shown, curves)
         write_atomically(folder / REPORT_FILE, text)
         if self.html:
@@ -93,6 +94,15 @@ class Report(pl.Callback):
         results.write(folder / METRICS_FILE)  # last: it says that the run is over, and nothing of it is made again
         if self.show:
             show(results, folder, shown[0] if shown else None)
+
+
+def pictures_of(folder: Path, frames: Iterable[Frame], count: int) -> list[Path]:
+    """Pictures of at most ``count`` views, evenly spread over those of which there are some, each before its companions'."""
+    stems = [stem for stem in map(file_stem, frames) if (folder / f"{stem}.png").exists()]
+    found: list[Path] = []
+    for i in evenly_spread(len(stems), count):
+        found += [folder / f"{stems[i]}.png", *sorted(folder.glob(f"{escape(stems[i])}_*.png"))]
+    return found
 
 
 # What is written -----------------------------------------------------------------------------------------------------
@@ -228,8 +238,9 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
     lines += ["", "## What the scores mean", "", *_bullets(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"])]
-    lines += ["", "## How to cite", "", *(f"- {entry}" for entry in citations(run.get("method"))), ""]
-    return "\n".join(lines)
+    if entries := citations(run.get("method")):
+        lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
+    return "\n".join([*lines, ""])
 
 
 def _picture_section(title: str, folder: Path, name: str, alternative: str) -> list[str]:

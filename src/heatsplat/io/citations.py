@@ -16,7 +16,7 @@ CITATION_FILE = "CITATION.cff"
 def citations(method: str | None) -> list[str]:
     """Lines of text for a list of references: heatsplat first, then what the file notes as the paper of the method.
 
-    None where a copy of the sources came without the file.
+    Empty where a copy of the sources came without the file.
     """
     file = yaml.safe_load(_text())
     if file is None:
