@@ -39,17 +39,18 @@ in the presence of the others. Where metadata is missing an effect is off, and t
 What was taken in has to show it where it was not fitted (`effects/joint/certainty.py`): on observations that were left out, a
 quarter at a time, it has to gain 0.3 dB, and 3.5 standard errors over the images; images whose departures are shuffled must not
 gain as much; and what an image has in common must be common to all of its points. Sun, sky and wind are judged by balances of
-heat fitted with and without them (`effects/weathered.py`). What fails, what would take its place, and what the record has too
-few frames for **cannot be told**, and its reason says what would be needed. It is then simulated only where the joint
-fit took it in, as the best explanation of the images that there is. A run's table has the decibels beside
-the milliseconds that they cost; `effects.least_db_per_ms` asks for a least ratio of the two.
+heat fitted with and without them (`effects/weathered.py`), massive walls by balances of bodies of one rate, with a core, and
+without an end. What fails, what would take its place, and what the record has too few frames for **cannot be told**, and its
+reason says what would be needed. It is then simulated only where the joint fit took it in, as the best explanation of the
+images that there is. A run's table has the decibels beside the milliseconds that they cost; `effects.least_db_per_ms` asks for
+a least ratio of the two.
 
-`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow, `effects=none` nothing.
-`effects.<name>=on|off|auto` overrules any of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what
-the evidence would start from. The papers' systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the
-effects that they simulate, whatever the scene. That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera;
-where a paper has a network, the catalogue has a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its
-source.
+`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow (bodies without an end,
+which stand in the place of others, where the scene says so), `effects=none` nothing. `effects.<name>=on|off|auto` overrules any
+of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what the evidence would start from. The papers'
+systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the effects that they simulate, whatever the scene.
+That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera; where a paper has a network, the catalogue has a
+closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
 
 ## Add an effect
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,23 +19,34 @@ from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.frames import Reading, read_recording
+from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section
 
 log = logging.getLogger(__name__)
 
+DONE = {"dead_pixels": "The masks of the prepared scene leave them out."}  # what a preparation does by itself
 
-def check(folder: str, target: Path | None = None, downscale: float = 1.0) -> list[Finding]:
+
+def check(
+    folder: str,
+    target: Path | None = None,
+    downscale: float = 1.0,
+    counts: Mapping[str, Any] | None = None,
+    bounds_c: Sequence[float] | None = None,
+) -> list[Finding]:
     """Looks for what is wrong with a folder, prints a table of it, and writes it to doctor.json.
 
     Args:
         folder: a scene with a COLMAP model or transforms.json, or a camera's files.
         target: where doctor.json is written; None: in the working directory.
         downscale: factor by which images of a scene shrink before they are looked at.
+        counts, bounds_c: of ``Meaning``, for a camera's files.
 
     Raises:
         SceneError: the folder holds neither.
     """
-    found = examine(material_in(Path(folder).expanduser(), downscale))
+    reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c))
+    found = examine(material_in(Path(folder).expanduser(), downscale, reading))
     show(found, str(folder))
     path = (target or Path()) / FINDINGS_FILE
     write_findings(found, path)
@@ -41,14 +54,16 @@ def check(folder: str, target: Path | None = None, downscale: float = 1.0) -> li
     return found
 
 
-def section(folder: Path) -> Section:
-    """The part of a preparation's report on what is wrong with a camera's files."""
-    found = examine(material_in(folder))
+def section(folder: Path, reading: Reading | None = None) -> Section:
+    """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
+    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material_in(folder, 1.0, reading))]
+    for one in found:
+        log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
 
 
-def material_in(folder: Path, downscale: float = 1.0) -> Material:
+def material_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> Material:
     """What there is to look at in a folder. Raises SceneError where it holds neither scene nor recording."""
     if not folder.is_dir():
         raise SceneError(f"check={folder}: there is no such folder")
@@ -56,7 +71,7 @@ def material_in(folder: Path, downscale: float = 1.0) -> Material:
         return material_of(_colmap(folder, downscale))
     if find_transforms(folder):
         return material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)
-    return _recorded(folder)
+    return _recorded(folder, reading or Reading())
 
 
 def _colmap(folder: Path, downscale: float) -> SceneData:
@@ -67,9 +82,9 @@ def _colmap(folder: Path, downscale: float) -> SceneData:
     return Colmap(root=str(folder), raw=raw, rgb=rgb, time_csv=times, downscale=downscale).scene
 
 
-def _recorded(folder: Path) -> Material:
+def _recorded(folder: Path, reading: Reading) -> Material:
     """A camera's files, without poses."""
-    frames = read_recording(folder, Reading()).frames
+    frames = read_recording(folder, reading).frames
     chosen = evenly_spread(len(frames), MAX_FRAMES)
     images = [frames[i].pixels() for i in chosen]
     kept = [k for k, image in enumerate(images) if image.shape == images[0].shape]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ import torch
 from heatsplat.contracts import SceneError
 
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
+DESCRIPTOR = 128  # numbers of a descriptor of ALIKED
 
 
 class Features(ABC):
@@ -75,7 +78,20 @@ class Aliked(Features):
 
     most: int = 2048
 
+    def __post_init__(self) -> None:
+        """Says before any work is done what is missing: SceneError for weights, ImportError for an old kornia."""
+        try:
+            from kornia.feature import ALIKED, LightGlue  # noqa: F401
+        except ImportError as error:
+            raise ImportError("poses/features=aliked needs kornia 0.9 or newer: pip install -U kornia") from error
+        if missing := [name for name in WEIGHTS if not (_weights_folder() / name).is_file()]:
+            raise SceneError(
+                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {_weights_folder()} (from "
+                "the releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses/features=sift"
+            )
+
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
+        pycolmap.Database.open(database).close()  # which has to be there
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, [name], reader)
         grey = cv2.imread(str(images / name), cv2.IMREAD_GRAYSCALE)
         image = torch.from_numpy(grey).float()[None, None] / 255.0
@@ -121,18 +137,34 @@ class Aliked(Features):
 
     @cached_property
     def _networks(self) -> tuple[Any, Any]:
-        """Detector and matcher. Raises SceneError where their weights are not on disk, ImportError where kornia is too old."""
-        try:
-            from kornia.feature import ALIKED, LightGlue
-        except ImportError as error:
-            raise ImportError("poses.features of ALIKED needs kornia 0.9 or newer: pip install -U kornia") from error
-        folder = Path(torch.hub.get_dir()) / "checkpoints"  # where both look before they would ask the network
-        if missing := [name for name in WEIGHTS if not (folder / name).is_file()]:
-            raise SceneError(
-                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {folder} (from the "
-                "releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses/features=sift"
-            )
-        return ALIKED.from_pretrained("aliked-n16", max_num_keypoints=self.most), LightGlue("aliked").eval()
+        """Detector and matcher. Raises SceneError for a file that holds other weights."""
+        from kornia.feature import ALIKED, LightGlue
+
+        one, other = (_weights_folder() / name for name in WEIGHTS)
+        detector = ALIKED("aliked-n16", max_num_keypoints=self.most)
+        return _filled(detector, one), _filled(LightGlue(None, input_dim=DESCRIPTOR, weights=None), other)
+
+
+def _weights_folder() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _filled(network: Any, file: Path) -> Any:
+    """A network with the weights of a file as it was released, ready for use."""
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+        # LightGlue's releases call the halves of a layer self_attn.3 and cross_attn.3, kornia transformers.3.self_attn.
+        renamed = {re.sub(r"^(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", key): v for key, v in state.items()}
+        lacking = {name for name, _ in network.named_parameters()} & set(
+            network.load_state_dict(renamed, strict=False).missing_keys
+        )
+    except (OSError, RuntimeError, AttributeError, pickle.UnpicklingError) as error:
+        raise SceneError(f"{file} holds no weights of {type(network).__name__} ({error}); download it again") from error
+    if lacking:
+        raise SceneError(
+            f"{file} lacks {len(lacking)} weights of {type(network).__name__}, such as {min(lacking)}; download it again"
+        )
+    return network.eval()
 
 
 def _descriptors(database: Path, name: str) -> Path:

@@ -93,8 +93,9 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     there = [kind for kind in KINDS if kinds.get(kind)]
     if len([kind for kind in there if kind != "grey"]) > 1:
         raise SceneError(
-            f"{folder} holds {' and '.join(f'{len(kinds[k])} {KINDS[k]} (such as {kinds[k][0].name})' for k in there)}; "
-            "prepare folders of one kind each"
+            f"{folder} holds several kinds of thermal images: "
+            f"{', '.join(f'{len(kinds[k])} {KINDS[k]} (such as {kinds[k][0].name})' for k in there)}. Put each kind into a "
+            "folder of its own and prepare those"
         )
     if not there:
         raise SceneError(

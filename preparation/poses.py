@@ -6,7 +6,7 @@ import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,13 @@ import numpy as np
 import pycolmap
 from rich.progress import Progress, track
 
-from heatsplat.contracts import SceneError, check_option
+from heatsplat.contracts import SceneError, check_option, evenly_spread
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.report import Section
+from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ WORK = ".poses"  # folder in the prepared one: copies, features and matches, fro
 PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
 FEW_FEATURES = 60
+STILL_PX = 0.5  # median motion of the image between frames below which the camera stands still
 PAIRS_AT_ONCE = 200
 
 
@@ -83,7 +84,7 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
-        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)  # it would fill the screen
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)  # it would fill the screen
         search = Search(self, frames, target)
         search.copies()
         search.find_features()
@@ -99,7 +100,7 @@ class Search:
         self.options, self.target, self.work = options, target, target / WORK
         if len(frames) < 3:
             raise SceneError(
-                f"{len(frames)} frame(s) are too few to find cameras; three or more that overlap are needed"
+                f"{counted(len(frames), 'frame')} cannot tell where cameras stood; three or more that overlap are needed"
             )
         index = ImageIndex(target / "images")
         self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
@@ -405,7 +406,19 @@ class Search:
             reasons[self.name_of[copy]] = reason
         return reasons
 
+    def _stands_still(self) -> bool:
+        """Whether images hardly move from frame to frame (phase correlation, Kuglin and Hines 1975)."""
+        few = [list(self.copy_of.values())[i] for i in evenly_spread(len(self.copy_of), 9)]
+        copies = [cv2.imread(str(self.work / "images" / copy), cv2.IMREAD_GRAYSCALE).astype(np.float32) for copy in few]
+        moved = [np.hypot(*cv2.phaseCorrelate(a, b)[0]) for a, b in pairwise(copies) if a.shape == b.shape]
+        return bool(moved) and float(np.median(moved)) < STILL_PX
+
     def _nothing(self) -> str:
+        if self._stands_still():
+            return (
+                "no cameras could be found: the image does not move, and where cameras stand shows only in frames from several "
+                "places"
+            )
         features, partners = self._counts()
         thermal = [features[copy] for copy in self.name_of]
         return (

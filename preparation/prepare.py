@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ log = logging.getLogger(__name__)
 
 # How cameras are found: gets the frames and the prepared folder, whose images/ has a file for each frame, and writes sparse/0.
 Poses = Callable[[list[Frame], Path], Section]
-# What is wrong with the files of a folder (prepared or not), the most costly first.
-Doctor = Callable[[Path], Section]
+# What is wrong with the files of a folder (prepared or not), read as they are here, the most costly first.
+Doctor = Callable[[Path, Reading], Section]
 
 
 def prepare(
@@ -46,8 +47,8 @@ def prepare(
     """Makes of a camera's files a scene that trains, and returns the path of its report.
 
     The folder then has images/ (float32 TIFF in °C, each with a .json of all that is known of it), masks/ where pixels are
-    dead, frames.csv (times, places), temperature_bounds.json, report.md, and what ``poses`` adds. Nothing in ``source`` is
-    changed.
+    dead, frames.csv (times, places), temperature_bounds.json, report.md, report.html, and what ``poses`` adds. Nothing in
+    ``source`` is changed.
 
     Args:
         source: folder of the camera's files.
@@ -58,11 +59,12 @@ def prepare(
         bounds_c, band_um: of ``Meaning``.
         zone, table, table_columns: of ``Reading``.
         keep_counts: also write the numbers as the camera stored them.
-        doctor: looks at the folder first, or None.
+        doctor: looks at the folder first, and at the scene once it has cameras, or None.
         poses: finds the cameras, or None.
 
     Raises:
-        SceneError: what is in the folder cannot be read, or ``target`` lies in ``source``.
+        SceneError: what is in the folder cannot be read, ``target`` lies in ``source``, or no cameras can be found; the
+            temperatures and the report are written all the same.
     """
     folder = Path(source).expanduser().resolve()
     if not folder.is_dir():
@@ -76,7 +78,7 @@ def prepare(
         Path(table).expanduser() if table else None,
         table_columns or {},
     )
-    sections = [doctor(folder)] if doctor else []
+    sections = [doctor(folder, reading)] if doctor else []
     found = read_recording(folder, reading)
     frames = [given.settled(frame) for frame in found.frames]
     writer = Writer(target, uncertain, keep_counts)
@@ -89,7 +91,8 @@ def prepare(
         fresh += written
     writer.finish(frames, records)
     writer.write_masks(frames)
-    log.info("%d frames, %d of them written now, the others were there", len(frames), fresh)
+    there = len(frames) - fresh
+    log.info("%s%s", report.counted(len(frames), "frame"), f", {there} of them were there already" if there else "")
     frames = [replace(f, rgb=writer.photo_of(f)) if writer.photo_of(f).exists() else f for f in frames]
     notes = [*found.notes, *([f"{dead} pixels of the detector are dead; masks/ leaves them out"] if dead else [])]
     parts = [
@@ -98,8 +101,25 @@ def prepare(
         report.pictures(target, frames, records),
     ]
     sections += [part for part in parts if part is not None]
-    page = report.write_report(target, sections)  # there already, should the cameras not be found
     if poses:
-        page = report.write_report(target, [*sections, poses(frames, target)])
-    log.info("%s", page)
+        sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, target, sections)
+    page = report.write_report(target, sections)
+    log.info("%s", page.with_suffix(".html"))
     return page
+
+
+def _cameras(
+    poses: Poses, doctor: Callable[[], Section] | None, frames: list[Frame], target: Path, before: Sequence[Section]
+) -> list[Section]:
+    """What became of the cameras, and what the doctor sees with them. Where there are none the report says why."""
+    report.write_report(target, before)  # a search may be stopped
+    try:
+        found = poses(frames, target)
+    except SceneError as error:
+        report.write_report(target, [*before, Section("Poses", [f"**{error}.**"])])
+        raise SceneError(
+            f"{error}. The temperatures are in {target / 'images'} all the same (poses=none leaves out the search)"
+        ) from error
+    log.info("%s", found.lines[0])
+    log.info("it trains: python src/train.py data=colmap data.root=%s", target)
+    return [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from heatsplat.callbacks.page import PAGE_FILE, write_page
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
@@ -34,6 +35,10 @@ LABELS = {
     "camera": "camera",
 }
 SUFFIX = {"reflected_k": " °C", "distance_m": " m", "air_k": " °C", "humidity": " %", "window_k": " °C"}
+APPARENT = (
+    "Apparent temperatures: neither files nor settings say what stands between surface and camera, so emissivity is 1, and no "
+    "air and no window are corrected. `conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
+)
 NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
 
 
@@ -53,12 +58,19 @@ class Section:
 
 
 def write_report(target: Path, sections: Sequence[Section]) -> Path:
-    """Writes report.md and returns its path."""
+    """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
     lines = [f"# {target.name}, prepared from a camera's files", ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
-    write_atomically(target / REPORT, "\n".join(lines))
+    text = "\n".join(lines)
+    write_atomically(target / REPORT, text)
+    write_page(target / PAGE_FILE, text)
     return target / REPORT
+
+
+def counted(number: int, what: str) -> str:
+    """ten frames, one frame."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
@@ -67,14 +79,15 @@ def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], not
         {" ".join(filter(None, (f.camera.make, f.camera.model, f.camera.serial))) or "unknown" for f in frames}
     )
     sizes = sorted({"x".join(map(str, r["size"])) for r in records})
-    lines = [f"- {len(frames)} frames of {', '.join(sizes)} pixels, camera {', '.join(cameras)}"]
+    lines = [f"- {counted(len(frames), 'frame')} of {', '.join(sizes)} pixels, camera {', '.join(cameras)}"]
     timed = [f.time for f in frames if f.time is not None]
     if timed:
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
-        lines.append(f"- {len(timed)} have a time, from {timed[0].isoformat()} to {timed[-1].isoformat()}{zones}")
-    lines.append(f"- {sum(f.position is not None for f in frames)} have a GPS position")
+        ends = dict.fromkeys(time.isoformat() for time in (timed[0], timed[-1]))
+        lines.append(f"- with a time: {len(timed)}, {' to '.join(ends)}{zones}")
+    lines.append(f"- with a GPS position: {sum(f.position is not None for f in frames)}")
     if photos := sum(r["photo"] is not None for r in records):
-        lines.append(f"- {photos} have a photo of the same moment")
+        lines.append(f"- with a photo of the same moment: {photos}")
     if unknown := sum(r["unknown_pixels"] for r in records):
         lines.append(f"- {unknown} pixels lie outside the camera's calibration and are NaN")
     if any(f.calibration is not None for f in frames):
@@ -122,8 +135,9 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
     ]
     unsure.append(["**all, standard**", "", *three(parts["combined"], ".2f")])
     unsure.append(["**all, expanded (k = 2, 95 %)**", "", *three(2 * parts["combined"], ".2f")])
+    unsure = [row for row in unsure if any(float(cell or 0.0) for cell in row[2:])]
     different = len({repr(f.conditions) for f in frames})
-    lines = [
+    stated = [
         f"Temperatures of surfaces, frame {frame.name}; the air lets {float(c.transmittance()):.4f} pass.",
         *(
             [f"The conditions differ between frames ({different} sets); each frame has its own."]
@@ -132,6 +146,9 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
         ),
         "",
         *markdown_table(head, table, "llrrrr"[: len(head)]),
+    ]
+    lines = [
+        *(stated if any(f.sources for f in frames) else [APPARENT]),
         "",
         "Uncertainty in °C by the GUM's law of propagation, for inputs that are independent of each other:",
         "",
@@ -166,7 +183,7 @@ def _doubts(frames: Sequence[Frame]) -> list[str]:
 
 
 def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> Section:
-    """Histogram of every frame, and how its temperatures run over time."""
+    """Histogram of every frame, and how temperatures run over time where there are several."""
     known = [(row, r["quantiles"]) for row, r in zip(rows(frames, records), records, strict=True) if r["quantiles"]]
     if not known:
         return Section("Pictures", ["No frame has a temperature."])
@@ -191,6 +208,9 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     figure.colorbar(image, label=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}")
     axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
     save_picture(figure, target / "report" / "histograms.png")
+    lines = ["![histogram of every frame](report/histograms.png)", ""]
+    if len(known) == 1:
+        return Section("Pictures", lines)
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
@@ -205,10 +225,8 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     axes.margins(x=0.01)
     save_picture(figure, target / "report" / "over_time.png")
     middle = quantiles[:, MIDDLE]
-    jump = np.abs(np.diff(middle)).max() if len(middle) > 1 else 0.0
-    lines = [
-        "![histogram of every frame](report/histograms.png)",
-        "",
+    jump = np.abs(np.diff(middle)).max()
+    lines += [
         "![temperatures over time](report/over_time.png)",
         "",
         f"The median runs from {middle.min():.2f} to {middle.max():.2f} {unit}; from one frame to the next it moves by up to "

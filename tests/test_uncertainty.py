@@ -1,6 +1,8 @@
 """Intervals of what a trained scene shows: against closed forms, and against the truth of a synthetic scene."""
 
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +13,7 @@ from weathered import CAMERA
 from heatsplat.composition import build
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
-from heatsplat.uncertainty import Uncertainty, evidence
+from heatsplat.uncertainty import Uncertainty, evidence, redundancy
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
 
@@ -86,25 +88,84 @@ def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path):
     assert told.deviation(turned).median() > max(5 * seen, 0.9 * told.prior * told.unit)
 
 
-def test_what_is_learned_is_as_certain_as_what_it_does_to_images():
-    """Of one level for each of two Gaussians, seen by least squares with noise; what is told is twice the level."""
+@contextmanager
+def off(module, by):
+    """While it lasts, what the camera gets beside the levels is so much more than is taken for granted."""
+    module.thermal.beside = by
+    try:
+        yield
+    finally:
+        module.thermal.beside = 0.0
+
+
+def levels(values, views=5, doubt=None):
+    """``Uncertainty`` about one level for each of some Gaussians, seen by least squares with noise of 0.1; told is its double."""
 
     class Levels(dict):
         names = ("level",)
 
         def __len__(self) -> int:
-            return 2
+            return len(values)
 
-    module, views = opaque(2), 5
-    module.splats, module.constants = Levels(level=torch.tensor([0.2, 0.4], requires_grad=True)), frozenset()
+    module = opaque(len(values))
+    module.splats, module.constants = Levels(level=torch.tensor(values, requires_grad=True)), frozenset()
     module.thermal = SimpleNamespace(
-        features=lambda splats, query: splats["level"][:, None],
+        beside=0.0,
+        features=lambda splats, query: splats["level"][:, None] + module.thermal.beside,
         attributes=lambda splats, query: {"double": 2 * splats["level"]},
+        doubts=lambda: {} if doubt is None else {"beside": partial(off, module, doubt)},
     )
     module.attributes = lambda frame: module.thermal.attributes(module.splats, None)
-    seen = View(FRAME, thermal=torch.full((CAMERA.height, CAMERA.width, 1), 0.25))
-    module.scene = SimpleNamespace(train=[seen] * views)
+    # Residuals of turning signs tell as much as independent ones.
+    images = [torch.full((CAMERA.height, CAMERA.width, 1), 0.25 + 0.01 * (-1) ** view) for view in range(views)]
+    seen = [View(FRAME, thermal=image) for image in images]
+    module.scene = SimpleNamespace(train=seen)
     told = object.__new__(Uncertainty)
-    told.module, told.stretch, told.noise, told.evidence = module, 1.0, 0.1, evidence(module, [seen] * views)
-    exact = 2 / (told.evidence.weight / 0.1**2 + 1 / (4 * 0.02)).sqrt()  # their variance over the scene is 0.02
-    torch.testing.assert_close(told.of_attributes(FRAME)["double"], exact.float())
+    told.module, told.stretch, told.noise, told.evidence = module, 1.0, 0.1, evidence(module, seen)
+    return told
+
+
+def of_least_squares(told):
+    """Standard deviations of the doubles of ``levels`` 0.2 and 0.4, whose variance over the scene is 0.02."""
+    each = told.evidence.weight / len(told.module.scene.train)
+    tells = each / (0.1**2 + each * told.evidence.misfit)
+    return 2 / (tells * len(told.module.scene.train) + 1 / (4 * 0.02)).sqrt()
+
+
+def test_what_is_learned_is_as_certain_as_what_it_does_to_images():
+    told = levels([0.2, 0.4])
+    torch.testing.assert_close(told.of_attributes(FRAME)["double"], of_least_squares(told).float())
+
+
+def test_what_is_taken_for_granted_is_as_uncertain_as_the_model_says():
+    """Levels that views see with something beside them that may be 0.5 larger are 0.5 lower then, as far as views tell them."""
+    sure, doubted = levels([0.2, 0.4]), levels([0.2, 0.4], doubt=0.5)
+    alone = of_least_squares(sure)
+    share = 1 - alone.square() / (4 * 4 * 0.02)  # of the prior, that views leave
+    expected = (alone.square() + (2 * 0.5 * share).square()).sqrt()
+    torch.testing.assert_close(doubted.of_attributes(FRAME)["double"], expected.float())
+
+
+def test_gaussians_of_a_pixel_that_disagree_make_it_less_certain():
+    frame = replace(FRAME, frame_id=1)
+    told, apart = (levels([0.2 + by, 0.4 - by]) for by in (0.1, -0.2))
+    agree, disagree = (one.attribute_deviations(frame)["double"] for one in (told, apart))
+    own = told.of_attributes(frame)["double"]
+    seen = agree.isfinite()
+    torch.testing.assert_close(agree[seen], own.mean().expand(int(seen.sum())), rtol=0.05, atol=1e-6)  # both are 0.3
+    weights = apart.module.composited(FRAME, torch.eye(2)).features[seen].double()
+    weights = weights / weights.sum(1, keepdim=True)
+    doubles = torch.tensor([0.0, 1.2], dtype=torch.float64)
+    spread = (weights.square() * (doubles - (weights @ doubles)[:, None]).square()).sum(1)
+    exact = (spread + apart.of_attributes(frame)["double"].double().mean() ** 2).sqrt()
+    assert (disagree[seen].double() / exact - 1).abs().max() < 0.35  # 32 draws
+
+
+@pytest.mark.parametrize("kept, expected", [(0.0, 1.0), (0.5, 3.0), (0.8, 9.0)])
+def test_views_whose_errors_are_alike_count_as_fewer(kept, expected):
+    """Of a chain in which each keeps a share of the one before the autocorrelation time is (1 + share) / (1 - share)."""
+    draws = torch.randn(200, 400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    chain = [draws[0]]
+    for draw in draws[1:]:
+        chain.append(kept * chain[-1] + (1 - kept**2) ** 0.5 * draw)
+    assert redundancy(torch.stack(chain), torch.ones_like(draws)) == pytest.approx(expected, rel=0.15)

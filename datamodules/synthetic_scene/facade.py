@@ -1,4 +1,5 @@
-"""A heated house from the front in two calm winter nights after dull days: an insulated wall, and what is wrong with it.
+"""Fronts of houses in two calm winter nights after dull days: an insulated wall of a heated one, and what is wrong with it; and
+an old one of thick stone that nobody heats, with the day between the nights.
 
 Metres; x is east, y north, z up; the front faces south. Every body is solved through all its layers, with a room of 20 °C behind
 walls (``layered_heat``; nothing of ``heatsplat.physics`` is used but constants). No dew falls, and what is not sky is as warm as
@@ -47,6 +48,12 @@ INSIDE_W_M2_K = 1 / 0.13  # between a wall and the air of its room (ISO 6946, ta
 OUTSIDE_M2_K_W = 0.04
 
 PLASTER, INSULATION, BRICK, CONCRETE = (0.8, 1.6e6), (0.04, 4e4), (0.6, 1.4e6), (1.8, 2.1e6)  # k and ρ c
+TUFF, LIMESTONE, GRANITE = (0.5, 1.1e6), (1.4, 1.9e6), (2.8, 2.2e6)
+THICK_M = 0.9
+
+
+def _stone(material: tuple[float, float]) -> Body:
+    return Body((Layer(*material, THICK_M),), 0.93, 5.0, 2.5, WINTER.warm_c, INSIDE_W_M2_K)
 
 
 def _wall(*layers: tuple[tuple[float, float], float]) -> Body:
@@ -63,6 +70,9 @@ BODIES = {
     "left window": _wall(((0.05, 2.5e5), 0.025)),
     "right window": _wall(((0.05, 2.5e5), 0.025)),
     "door": _wall(((0.14, 8e5), 0.05)),
+    "tuff": _stone(TUFF),
+    "limestone": _stone(LIMESTONE),
+    "granite": _stone(GRANITE),
 }
 DEFECTS = ("thin insulation", "no insulation", "slab edge")
 
@@ -71,6 +81,13 @@ def u_value(body: Body) -> float:
     """Thermal transmittance of a wall in W/(m² K)."""
     within = sum(layer.thickness_m / layer.conductivity for layer in body.layers)
     return 1.0 / (OUTSIDE_M2_K_W + within + 1.0 / body.back_w_m2_k)
+
+
+def effusivity(body: Body) -> float:
+    """√(k ρ c) in J/(m² K √s) of a body that the record does not heat through, NaN of another."""
+    first = body.layers[0]
+    reached_m = math.sqrt(first.conductivity / first.heat_capacity * DURATION_S)
+    return math.sqrt(first.conductivity * first.heat_capacity) if first.thickness_m > reached_m else math.nan
 
 
 def _part(name: str, x: tuple[float, float], z: tuple[float, float], absorbs: Pattern, color) -> OutdoorSurface:
@@ -95,14 +112,27 @@ FRONT = (
     _part("right window", (1.6, 3.2), (0.9, 2.2), Pattern(0.5, 0.0, 1.0, 0.03, 0.4), (0.4, 0.5, 0.6)),
     _part("door", (-0.6, 0.5), (0.0, 2.1), Pattern(0.6, 0.0, 1.0, 0.05, 0.35), (0.5, 0.35, 0.25)),
 )  # fmt: skip
+STONES = (
+    FRONT[0],
+    OutdoorSurface(
+        "limestone", Box((0.0, 0.2, 2.75), (10.0, 0.4, 5.5)), BODIES["limestone"], _PAINT, (0.9, 0.85, 0.7), label=CLASSES[0]
+    ),
+    _part("granite", (-4.98, 4.98), (0.0, 1.2), Pattern(0.6, 0.05, 1.5, 0.05, 0.6), (0.6, 0.6, 0.65)),
+    _part("tuff", (-3.0, -0.5), (2.4, 4.6), _PAINT, (0.85, 0.75, 0.5)),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class FacadePreset(OutdoorPreset):
-    """A front; see ``OutdoorPreset``."""
+    """A front; see ``OutdoorPreset``.
+
+    Args:
+        filmed_s: when images are taken, from the start and a day later.
+    """
 
     surfaces: tuple[OutdoorSurface, ...] = FRONT
     duration_s: float = DURATION_S
+    filmed_s: tuple[float, float] = NIGHT_S
     ambient_c: float = 2.0
     point_noise_m: float = 0.01
     bounds_c: tuple[float, float] = (-12.0, 28.0)
@@ -110,6 +140,13 @@ class FacadePreset(OutdoorPreset):
 
 
 FACADE = FacadePreset()
+STONE = FacadePreset(
+    surfaces=STONES,
+    duration_s=2 * DAY_S,
+    filmed_s=(1800.0, DAY_S - 1800.0),
+    bounds_c=(-10.0, 20.0),
+    effects=FACADE.effects | {"semi_infinite"},
+)
 
 
 class _History:
@@ -129,7 +166,7 @@ class FacadeScene(OutdoorScene):
 
     def __init__(self, preset: FacadePreset) -> None:
         if preset.weather != FACADE.weather:
-            raise SceneError(f"data.weather={preset.weather}: scene 'facade' has the weather of two winter nights only")
+            raise SceneError(f"data.weather={preset.weather}: these fronts have the weather of two winter nights only")
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
         self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
@@ -150,7 +187,8 @@ class FacadeScene(OutdoorScene):
         )
 
     def attributes(self, points: Tensor) -> dict[str, Tensor]:
-        """True properties [n] of the surface nearest to each of ``points`` [n, 3], by name with unit; U is NaN on the ground."""
+        """True properties [n] of the surface nearest to each of ``points`` [n, 3], by name with unit; U is NaN on the ground,
+        effusivity where the record reaches through the body."""
         on_surface, which = self.nearest(points)
         wind = float(self.weather.wind_m_s.mean())
         walls = [math.nan if s.name == "ground" else u_value(s.material) for s in self.preset.surfaces]
@@ -162,16 +200,17 @@ class FacadeScene(OutdoorScene):
             "absorptivity": self.heat_at(on_surface, which).absorptivity,
             "emissivity": by_surface(body.emissivity for body in self.materials),
             "convection_w_m2_k": by_surface(b.convection_still + b.convection_per_wind * wind for b in self.materials),
+            "effusivity_j_m2_k_s05": by_surface(effusivity(body) for body in self.materials),
             "u_value_w_m2_k": by_surface(walls),
         }
 
     def route(self, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
-        """Times [F] in both nights, and world-to-camera matrices [F, 4, 4] of a camera that goes to and fro before it."""
+        """Times [F] on both days, and world-to-camera matrices [F, 4, 4] of a camera that goes to and fro before it."""
         draws = torch.rand(frames, 4, generator=generator_for(seed, 0, "facade"), dtype=torch.float64)
         number = torch.arange(frames, dtype=torch.float64)
         place = 2.0 * (number + 0.2 + 0.6 * draws[:, 0]) / frames
-        nights = place.floor()
-        times = np.round((nights * DAY_S + NIGHT_S[0] + (place - nights) * (NIGHT_S[1] - NIGHT_S[0])).numpy(), 3)
+        nights, (first, last) = place.floor(), self.preset.filmed_s
+        times = np.round((nights * DAY_S + first + (place - nights) * (last - first)).numpy(), 3)
         along = 5.0 * torch.sin(2.39996 * number + draws[:, 1])
         center = torch.stack([along, -8.5 - 1.5 * draws[:, 2], 1.2 + 3.6 * torch.remainder(0.618034 * number, 1.0)], 1)
         aim = torch.stack([0.35 * along, torch.zeros_like(along), 2.4 + 0.4 * (draws[:, 3] - 0.5)], 1)

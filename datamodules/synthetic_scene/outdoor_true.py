@@ -20,7 +20,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneError, ThermalRange, Weather
 from heatsplat.datamodules.sun import split_irradiance
 from heatsplat.datamodules.synthetic_scene import layered_heat
-from heatsplat.datamodules.synthetic_scene.facade import FACADE, FacadeScene
+from heatsplat.datamodules.synthetic_scene.facade import FACADE, STONE, FacadeScene
 from heatsplat.datamodules.synthetic_scene.layered_heat import VAPOUR_J_KG_K, Body, Course, Layer, Patches
 from heatsplat.datamodules.synthetic_scene.outdoor import (
     OUTDOOR,
@@ -243,5 +243,6 @@ YARDS: dict[str, tuple[type[OutdoorScene], OutdoorPreset]] = {
     **{name: (OutdoorScene, preset) for name, preset in OUTDOOR.items()},
     "outdoor_true": (OutdoorTrueScene, TRUE),
     "facade": (FacadeScene, FACADE),
+    "stone": (FacadeScene, STONE),
 }
 """Scenes under the sky: how they are solved, and what they show."""

@@ -407,7 +407,8 @@ class RenderOutput:
             expected depth), or None when it was not asked for.
         meta: "means2d" [N, 2] in pixels, a tensor whose .grad is filled by the backward pass (and whose .absgrad is,
             with absgrad=True: sums over pixels and modalities); "radii" [N, 2] int32 extents in pixels, 0 where a
-            Gaussian is not seen; "visible_ids" [n] int64.
+            Gaussian is not seen; "visible_ids" [n] int64. Where rows of splats become several Gaussians, training adds
+            their "opacities" [M, N] as rendered, and "rows_in_view", bool. Empty for fields, which have no Gaussians.
         weighted: sums of maps over pixels, where they were asked for.
         signed: [H, W] composited ``signs`` of the first modality, where they were given.
     """

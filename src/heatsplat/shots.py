@@ -17,6 +17,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible, write_figure, write_png
+from heatsplat.io.quantities import moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
 
@@ -200,7 +201,7 @@ def write_shot(
             stem, share = Path(frame.name).stem, 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
-            title = stem if frame.time_s is None else f"{stem}   {frame.time_s:.1f} s"
+            title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s)}"
             title += f"   {share:.0%} seen" if share < 0.995 else ""
             title += f"   prediction, {beyond:.0f} s beyond the record" if beyond else ""
             panels = []

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor, nn
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
+# What a row may be to the thermal model: a Gaussian; an anchor, from which the model makes several for every view; or there
+# are no rows, because the model is a field that has no Gaussians at all.
+GAUSSIANS, ANCHORS, NOTHING = "gaussians", "anchors", "nothing"
 
 
 class Splats(nn.Module):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,7 @@ STRETCHES = tuple(10.0**power for power in range(7))
 
 
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")  # tensors of Gaussians that heat is not told by
+DRAWS = 32  # of signs, by which Gaussians that disagree are weighed: deviations are then known to an eighth
 MOST_NUMBERS = 64  # of each Gaussian, of which intervals are made: their matrices have its square
 
 
@@ -55,6 +56,39 @@ def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
         counted = maps.isfinite() if view.mask is None else maps.isfinite() & view.mask[..., None]
         (found,) = torch.autograd.grad((seen.features * maps.where(counted, 0.0)).sum(), values)
     return found.cpu().double().clamp(min=0.0)
+
+
+def _residual(module: Any, view: View) -> tuple[Tensor, Tensor]:
+    """What a view says of the Gaussians, [N] each: ``Evidence.weight``, and the mean of what it has above the rendered image."""
+    with torch.no_grad():
+        above = (view.image(module.modality) - module.predict(view.frame)).mean(-1)
+    weight, more, less = _gathered(
+        module, view, torch.stack([above * 0.0 + 1.0, above.clamp(min=0.0), (-above).clamp(min=0.0)], dim=-1)
+    ).unbind(1)
+    return weight, (more - less) / weight.clamp(min=LEAST)
+
+
+def redundancy(residuals: Tensor, weights: Tensor) -> float:
+    """How many views tell as much as one would if their errors were independent, 1 or more: the integrated autocorrelation
+    time of residuals, up to the first lag at which they are not alike.
+
+    Args:
+        residuals: [V, N] of each Gaussian in each view, in the order of time.
+        weights: [V, N] by which they count.
+    """
+    scaled, found = residuals * weights.sqrt(), 1.0
+
+    def alike(lag: int) -> float:
+        ahead, behind = scaled[lag:], scaled[: len(scaled) - lag]
+        both = (weights[lag:] * weights[: len(weights) - lag]).sqrt()
+        return float((ahead * behind).sum() / both.sum().clamp(min=LEAST))
+
+    for lag in range(1, len(residuals) // 2):
+        share = alike(lag) / max(alike(0), LEAST)
+        if share <= 0.0:
+            break
+        found += 2.0 * share
+    return found
 
 
 @torch.no_grad()
@@ -139,10 +173,14 @@ class Uncertainty:
         """Standard deviations [N] of what the thermal model tells of every Gaussian at the time of a frame, by name.
 
         By the delta method: the numbers that a Gaussian has for its heat are as uncertain as the views that saw it leave them
-        (Gauss-Newton, a block for each Gaussian), with their spread over the scene as the prior. Each view tells a
-        temperature as well as noise and misfit allow; what all views have in common, such as a wrong emissivity or air
-        temperature, is not in it. Empty for models that tell nothing, and for those of which a Gaussian has more numbers than
-        such a block can hold, or not all the same.
+        (Gauss-Newton, a block for each Gaussian), with their spread over the scene as the prior. Each view tells a temperature
+        as well as noise and misfit allow; what views leave is much alike in neighbouring ones, which then count as fewer
+        (``redundancy``). What the model takes for granted (``Heat.doubts``) is each wrong by one standard deviation, and the
+        numbers are what views then make of it. Not in it is what else all views have in common, such as a wrong emissivity or
+        air temperature, and what an observed surface is that the model's is not.
+
+        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or
+        not all the same.
         """
         module = self.module
         told = module.attributes(frame)
@@ -166,26 +204,76 @@ class Uncertainty:
             rows = (torch.zeros_like(t) if g is None else g for t, g in zip(tensors, found, strict=True))
             return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
+        def wrong(tell: Callable[[], Tensor], now: Tensor) -> Tensor:
+            """What becomes of values [N] that the model tells where each of its doubts comes true, [N, D]."""
+            found = []
+            for doubt in module.thermal.doubts().values():
+                with torch.no_grad(), doubt():
+                    found.append((tell() - now).cpu().double())
+            return torch.stack(found, dim=1) if found else torch.zeros(len(now), 0, dtype=torch.float64)
+
         spread = (
             torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1).cpu().double().var(0)
         )
-        precision = torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(module.splats), -1)).clone()
-        for view in module.scene.train:
+        known, pulled, weights, residuals = 0.0, 0.0, [], []
+        for view in sorted(module.scene.train, key=lambda view: view.time_s or 0.0):
             view = view.to(module.device)
-            one = torch.ones(view.camera.height, view.camera.width, 1, device=module.device)
-            weight = _gathered(module, view, one)[:, 0]
+            weight, residual = _residual(module, view)
             tells = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
+            query = Query(None, view.camera, view.time_s, view.frame.frame_id)
+
+            def sends(query: Query = query) -> Tensor:
+                return module.thermal.features(module.splats, query)[:, 0]
+
             with torch.enable_grad():
-                query = Query(None, view.camera, view.time_s, view.frame.frame_id)
-                by = slopes(module.thermal.features(module.splats, query)[:, 0])
-            precision += tells[:, None, None] * by[:, :, None] * by[:, None, :]
+                now = sends()
+                by = slopes(now)
+            known = known + tells[:, None, None] * by[:, :, None] * by[:, None, :]
+            pulled = pulled + (tells[:, None] * by)[:, :, None] * wrong(sends, now.detach())[:, None, :]
+            weights.append(tells)
+            residuals.append(residual)
+        repeated = redundancy(torch.stack(residuals), torch.stack(weights))
+        precision = known / repeated + torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(known), -1))
         factor = torch.linalg.cholesky(precision)
+        moved = -torch.cholesky_solve(pulled / repeated, factor) if pulled.shape[2] else pulled
+        now = Query(None, frame.camera, frame.time_s, frame.frame_id)
         found = {}
         for name in told:
+
+            def tells(name: str = name) -> Tensor:
+                return module.thermal.attributes(module.splats, now)[name]
+
             with torch.enable_grad():
-                now = Query(None, frame.camera, frame.time_s, frame.frame_id)
-                by = slopes(module.thermal.attributes(module.splats, now)[name])
-            found[name] = torch.linalg.solve_triangular(factor, by[..., None], upper=False).norm(dim=(1, 2)).float()
+                values = tells()
+                by = slopes(values)
+            variance = torch.linalg.solve_triangular(factor, by[..., None], upper=False).square().sum((1, 2))
+            off = wrong(tells, values.detach()) + (by[:, None] @ moved)[:, 0]
+            found[name] = (variance + off.square().sum(1)).sqrt().float()
+        return found
+
+    @torch.no_grad()
+    def attribute_deviations(self, frame: Frame) -> dict[str, Tensor]:
+        """Standard deviations [H, W] of what a pixel of a frame shows of each attribute, by name; see ``of_attributes``.
+
+        A pixel shows the mean of its Gaussians, which are taken to err together by what each is uncertain, as one surface;
+        that they disagree on top tells what none of them knows of itself, for each was certain with the others as they are.
+        It counts as it would in a mean of independent ones: the spread of that mean under random signs of their departures
+        (a wild bootstrap over Gaussians).
+        """
+        module, deviations = self.module, self.of_attributes(frame)
+        if not deviations:
+            return {}
+        told = module.attributes(frame)
+        signs = torch.randn(len(module.splats), DRAWS, generator=torch.Generator().manual_seed(0)).sign()
+        found = {}
+        for name, deviation in deviations.items():
+            values = told[name].detach().nan_to_num().cpu()[:, None]
+            columns = torch.cat([values, deviation.nan_to_num()[:, None], signs, signs * values], dim=1)
+            seen = module.composited(frame, columns.to(module.device))
+            blended = (seen.features / seen.alpha[0][..., None]).cpu()
+            mean, together, drawn = blended[..., :1], blended[..., 1], blended[..., 2:]
+            apart = (drawn[..., DRAWS:] - mean * drawn[..., :DRAWS]).square().mean(-1)
+            found[name] = (together.square() + apart).sqrt()
         return found
 
     @property

@@ -187,6 +187,8 @@ def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
 def test_the_study_sets_options_that_every_growing_method_has(tmp_path):
     for method in sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml")):
         density = running.compose_run(tmp_path, f"method={method}").density
+        if method in ("scaffold_gs", "instant_ngp", "thermonerf"):  # anchors, and fields that do not grow
+            continue
         assert {"cap_max", "multiple"} <= set(density) or {"cap_max", "reset_every"} <= set(density), method
 
 

@@ -29,7 +29,7 @@ def test_the_warm_patch_is_found(tmp_path):
     assert hottest["kind"] == "hottest" and hottest["time_s"] == pytest.approx(300.0)
     assert hottest["mean_c"] == pytest.approx(float(RANGE.to_celsius(warmth(300.0))), abs=0.01)
     assert hottest["area"] == pytest.approx(0.2, rel=0.2) and hottest["unit"] == "square units"
-    assert [hottest[axis] for axis in "xyz"] == pytest.approx([-0.5, 0.1, 4.0], abs=0.06)
+    assert [hottest[axis] for axis in "xyz"] == pytest.approx([-0.5, 0.1, 4.0], abs=0.08)
     assert rows[-1]["kind"] == "coldest" and rows[-1]["mean_c"] < 15
     assert (tmp_path / SURFACES_PICTURE).stat().st_size > 1000 and WIDTH == 56
 

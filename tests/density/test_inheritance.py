@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import ALL_METHODS
+from helpers import OF_GAUSSIANS
 from running import TINY
 
 from heatsplat.composition import compose
@@ -19,7 +19,7 @@ PLACED = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=ALL_METHODS)
+@pytest.fixture(scope="module", params=OF_GAUSSIANS)
 def lone(request, tmp_path_factory):
     """A module whose cloud is one Gaussian, nearly round and some pixels large, with heat and networks as if trained."""
     begun = begin(compose([*TINY, f"method={request.param}", "max_steps=100"]), tmp_path_factory.mktemp(request.param))

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from helpers import ALL_METHODS
+from helpers import OF_GAUSSIANS
 from running import TINY, run
 
 from heatsplat.training.checkpoints import load_checkpoint
@@ -93,9 +93,9 @@ def test_a_whole_pass_of_the_views_is_judged_in_every_round(tmp_path, monkeypatc
     assert len(judged) == len(set(judged)) == len(module.scene.train)
 
 
-PAIRS = [  # every method under one of the rules; under the others where there is time
+PAIRS = [  # every method of Gaussians under one of the rules; under the others where there is time
     pytest.param(rule, method, marks=() if i % len(RULES) == j else pytest.mark.slow)
-    for i, method in enumerate(ALL_METHODS)
+    for i, method in enumerate(OF_GAUSSIANS)
     for j, rule in enumerate(RULES)
 ]
 

@@ -19,6 +19,8 @@ def test_photos_of_other_moments_and_photos_that_lie_beside_are_found():
     assert "2 frame(s)" in next(
         f.what for f in examine(Material(**about, rgb=photos[2:] + photos[:2])) if f.check == "pairing"
     )
+    mixed = [photos[k] for k in (7, 3, 9, 0, 5, 8, 1, 4, 2, 6)]
+    assert "do not fit" in next(f.what for f in examine(Material(**about, rgb=mixed)) if f.check == "pairing")
     aside = [torch.roll(photo, 5, 0) for photo in photos]
     assert "beside" in next(f.what for f in examine(Material(**about, rgb=aside)) if f.check == "pairing")
 

@@ -164,7 +164,7 @@ def test_every_selection_of_one_effect_can_be_built():
 
 
 def test_every_part_tells_its_effect_under_the_name_of_the_catalogue():
-    outdoors = {"solar", "radiation", "convection", "shadows", "sky_view", "albedo"}
+    outdoors = {"semi_infinite", "solar", "radiation", "convection", "shadows", "sky_view", "albedo"}
     thermal = build(assembled(*set(assembly.NAMES) - outdoors)["thermal"])
     assert set(thermal.effects()) <= set(assembly.NAMES)
     assert {"relaxation", "conduction", *ON_THE_WAY, "thermal_opacity"} <= set(thermal.effects())
@@ -239,6 +239,8 @@ def test_an_effect_that_costs_more_than_it_brings_is_left_out_when_that_is_asked
     assert of[0.0] == of[0.2] == known
     assert {name for name, one in of[0.5].items() if one.on} == {"agc"}  # conduction stands on relaxation
     assert "1.0 dB for 4.00 ms a step" in of[0.5]["relaxation"].reason
+    lost = {name: replace(one, gain_db=-0.2) for name, one in known.items()}  # on, though images cannot tell
+    assert assembly.affordable(lost, prices, 0.0) == lost
 
 
 # Choices ---------------------------------------------------------------------------------------------------
@@ -248,7 +250,7 @@ def test_selections_and_single_choices():
     assert set(assembly.choices(config("method=auto")["effects"]).values()) == {"auto"}
     assert set(assembly.choices(config("method=auto", "effects=none")["effects"]).values()) == {"off"}
     one = assembly.choices(config("method=auto", "effects=all", "effects.agc=off", "effects.tone=auto")["effects"])
-    assert one == dict.fromkeys(assembly.NAMES, "on") | {"agc": "off", "tone": "auto"}
+    assert one == dict.fromkeys(assembly.NAMES, "on") | {"agc": "off", "tone": "auto", "semi_infinite": "auto"}
     assert assembly.explicit_choices({"solar": True, "agc": False}) == {
         "solar": "on",
         "agc": "off",

@@ -10,9 +10,9 @@ from heatsplat.effects.base import STAGES
 from heatsplat.effects.catalogue import CATALOGUE, decide
 
 NAMES = (
-    "relaxation", "harmonic_source", "solar", "radiation", "convection", "conduction", "shadows", "sky_view", "albedo",
-    "view_dependence", "reflection", "mirrored_sky", "attenuation", "thermal_opacity", "point_spread", "thermal_lag",
-    "rolling_readout", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
+    "relaxation", "harmonic_source", "semi_infinite", "solar", "radiation", "convection", "conduction", "shadows",
+    "sky_view", "albedo", "view_dependence", "reflection", "mirrored_sky", "attenuation", "thermal_opacity",
+    "point_spread", "thermal_lag", "rolling_readout", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
 )  # fmt: skip
 
 

@@ -279,6 +279,7 @@ CASES = {
         lambda: ByHand(air(wind=True), chain={"frame_offset": FrameOffset()}),
         ("raw_sun", "normals"),
     ),
+    "semi_infinite": Case(("relaxation", "convection"), lambda: ByHand(air(wind=True)), ()),
     "radiation": Case(
         ("relaxation", "solar", "reflection"),
         lambda: ByHand(open_air(sun=True), {"reflection": Reflection(degree=2)}),
@@ -455,7 +456,7 @@ def test_with_it_on_all_of_that_differs(name):
     off, on = switched_off(name), switched_on(name)
     assert on.operators - off.operators
     shown, without = on.shown, off.shown  # which draws a graph of neighbours, where there is one
-    if CASES[name].traces:  # albedo is one more driver and nothing to learn
+    if CASES[name].traces:  # albedo is one more driver, and bodies without an end other tables: nothing to learn
         assert on.held() != off.held()
         assert on.numbers() > off.numbers()
     if name == "thermal_opacity":  # the visible image beside the thermal one, each with opacities of its own

@@ -5,7 +5,7 @@ import torch
 
 from heatsplat.contracts import Camera
 from heatsplat.geometry.extremes import extremes
-from heatsplat.geometry.looks import Look
+from heatsplat.geometry.looks import Look, surface_points
 from heatsplat.geometry.projection import look_at
 
 
@@ -48,3 +48,14 @@ def test_surfaces_are_found_where_they_are_and_as_large_as_they_are(shown):
 def test_nothing_is_seen_where_there_is_no_surface():
     seen = look(0.0)
     assert extremes([Look(seen.camera, torch.full_like(seen.depth, torch.inf), seen.values)]) == ([], [])
+
+
+def test_the_centre_lies_on_the_surface():
+    """Of a hot ring about a cool middle, which holds its centre of mass."""
+    seen = look(0.0)
+    points = surface_points(seen.camera, seen.depth)
+    away = (points[..., :2] - torch.tensor([0.1, 0.2], dtype=torch.float64)).norm(dim=-1)
+    ring = torch.where((away > 0.5) & (away < 0.7), 30.0, 20.0).double()
+    (hot, *_), _ = extremes([Look(seen.camera, seen.depth, ring)], share=0.03)
+    assert hot.mean == pytest.approx(30.0)
+    assert 0.45 < (hot.centre[:2] - torch.tensor([0.1, 0.2], dtype=torch.float64)).norm() < 0.75

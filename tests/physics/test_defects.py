@@ -24,3 +24,14 @@ def test_dead_pixels_are_found_beside_each_other_too_and_edges_that_move_are_non
 
 def test_few_frames_say_nothing():
     assert not dead_pixels(recording(3)).any()
+
+
+def test_an_image_that_stands_still_has_no_dead_pixels():
+    generator = torch.Generator().manual_seed(1)
+    scene = 0.04 * torch.randn(24, 32, generator=generator)
+    scene[4:20:5, 3:30:6] = 1.0  # specks that differ from what is around them
+    still = scene + 0.02 * torch.randn(8, 24, 32, generator=generator)
+    assert not dead_pixels(still).any()
+    moving = torch.stack([torch.roll(image, 3 * f, 1) for f, image in enumerate(still)])
+    moving[:, 10, 10] = 5.0
+    assert dead_pixels(moving).nonzero().tolist() == [[10, 10]]

@@ -102,7 +102,7 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     palette = cv2.applyColorMap((y * 16 + x), cv2.COLORMAP_INFERNO)
     with pytest.raises(SceneError, match="coloured pictures alone .such as a.png.: colours of a palette"):
         read_frames(write_images(tmp_path / "colours", {"a.png": palette}))
-    with pytest.raises(SceneError, match="floating-point images .* and .* 16-bit images .*one kind each"):
+    with pytest.raises(SceneError, match="several kinds.*floating-point images .*16-bit images .*folder of its own"):
         read_frames(write_images(tmp_path / "mixed", {"a.tiff": FLOATS, "b.png": (FLOATS * 100).astype(np.uint16)}))
     with pytest.raises(SceneError, match="a.png and .*a.tif would both become"):
         both = {"a.png": (FLOATS * 5).astype(np.uint8), "a.tif": (FLOATS * 5).astype(np.uint8)}

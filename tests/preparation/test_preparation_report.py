@@ -26,6 +26,14 @@ def test_conditions_stand_with_what_they_change_and_what_they_leave_unsure(tmp_p
     assert section.values["combined_c"][1] == pytest.approx(middle, rel=1e-2)
 
 
+def test_without_conditions_temperatures_are_said_to_be_apparent(tmp_path):
+    frames = read_frames(
+        write_images(tmp_path / "files", {"a.tiff": np.linspace(10, 30, 64, dtype=np.float32).reshape(8, 8)})
+    )
+    text = "\n".join(report.radiometry(frames, prepared(frames, tmp_path / "scene"), Uncertainty()).lines)
+    assert "Apparent temperatures" in text and "| distance |" not in text and "| emissivity | 0.02 |" in text
+
+
 def test_doubtful_statements_of_files_are_asked_about(tmp_path):
     frames = read_frames(write_flir(tmp_path / "files"))
     records = prepared(frames, tmp_path / "scene")
@@ -53,7 +61,10 @@ def test_greys_have_no_radiometry(tmp_path):
     records = prepared(frames, tmp_path / "scene")
     assert report.radiometry(frames, records, Uncertainty()) is None
     assert "greys" not in "\n".join(report.recording(frames, records, []).lines)
-    assert report.pictures(tmp_path / "scene", frames, records).values["largest_step"] == 0
+    assert report.pictures(tmp_path / "scene", frames, records).lines[:1] == [
+        "![histogram of every frame](report/histograms.png)"
+    ]
+    assert not (tmp_path / "scene" / "report" / "over_time.png").exists()  # of one frame
 
 
 def test_frames_of_one_temperature_have_a_histogram(tmp_path):

@@ -15,6 +15,7 @@ from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.io.tiff import read_temperature
+from heatsplat.preparation.doctor import check, section
 from heatsplat.preparation.features import Sift
 from heatsplat.preparation.frames import read_frames
 from heatsplat.preparation.poses import FindPoses
@@ -92,16 +93,35 @@ def test_a_swung_camera_s_frames_become_a_scene_with_cameras_that_share_one_lens
     assert len(Colmap(root=str(tmp_path / "scene")).scene.train) >= 3
 
 
+def test_frames_without_cameras_keep_their_temperatures_and_the_page_says_why(tmp_path):
+    image = np.random.default_rng(0).normal(20.0, 3.0, (64, 80)).astype(np.float32)
+    noise = np.random.default_rng(1).normal(0.0, 0.1, (6, 64, 80)).astype(np.float32)
+    source = write_images(tmp_path / "files", {f"{i}.tiff": image + noise[i] for i in range(6)})
+    with pytest.raises(SceneError, match=r"the image does not move.*temperatures are in .*scene/images all the same"):
+        prepare(str(source), tmp_path / "scene", **PLAIN, poses=FindPoses(Sift(most=200)))
+    assert len(list((tmp_path / "scene" / "images").glob("*.tiff"))) == 6
+    assert "the image does not move" in (tmp_path / "scene" / "report.html").read_text()
+
+
 def test_the_doctor_comes_first_and_sees_the_source(tmp_path):
     seen = []
 
-    def doctor(folder):
+    def doctor(folder, reading):
         seen.append(folder)
         return Section("Findings", ["none"])
 
     source = write_flir(tmp_path / "files", 2)
     page = prepare(str(source), tmp_path / "scene", **PLAIN, doctor=doctor)
     assert seen == [source] and page.read_text().index("## Findings") < page.read_text().index("## The recording")
+
+
+def test_what_counts_are_said_to_mean_is_what_the_doctor_reads_too(tmp_path):
+    counts = np.random.default_rng(0).integers(19000, 19900, (4, 16, 20)).astype(np.uint16)
+    source = write_images(tmp_path / "files", {f"{i}.png": image for i, image in enumerate(counts)})
+    said = {**PLAIN, "counts": {"scale": 0.015625}}
+    page = prepare(str(source), tmp_path / "scene", **said, doctor=section)
+    assert "## Doctor" in page.read_text()
+    assert check(str(source), tmp_path, counts=said["counts"]) == []
 
 
 def test_the_command_prepares_and_goes_on(tmp_path):
@@ -113,8 +133,8 @@ def test_the_command_prepares_and_goes_on(tmp_path):
         "conditions.emissivity=0.9",
         "poses=none",
     ]
-    assert "3 frames, 3 of them written now" in succeeds(command, tmp_path)
-    assert "3 frames, 0 of them written now" in succeeds(command, tmp_path)
+    assert "already" not in (said := succeeds(command, tmp_path)) and "3 frames" in said
+    assert "3 frames, 3 of them were there already" in succeeds(command, tmp_path)
     record = json.loads((tmp_path / "scene" / "images" / "1.json").read_text())
     assert record["conditions"]["emissivity"] == {"value": 0.9, "from": "given", "standard_uncertainty": 0.02}
     assert "give the folder" in succeeds([*command[:1], "source=files"], tmp_path, 1)

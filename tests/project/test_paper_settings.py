@@ -91,6 +91,7 @@ SHARED = {  # what a method has of others
     "ntr_gaussian": (GAUSSIANS, FROZEN, PHOTOMETRIC),
     "ommg": (GAUSSIANS, ADAPTIVE, BOTH_IMAGES, BOTH_PHOTOMETRIC),
     "ravigs": (GAUSSIANS, ADAPTIVE, BOTH_PHOTOMETRIC),
+    "scaffold_gs": (PHOTOMETRIC,),
     "srgs": (GAUSSIANS, ADAPTIVE, COLOUR),
     "supirgs": (GAUSSIANS, ADAPTIVE, COLOUR),
     "thermal3dgs": (GAUSSIANS, ADAPTIVE, DEFORMING_FIELD),
@@ -288,6 +289,33 @@ OWN = {
         "thermal.surface_area": ("printed", "Eq. 6"),
         "thermal.sky": ("none", "Eq. 4: empty space"),
     },
+    "scaffold_gs": {  # arguments/__init__.py of the authors' code unless another source is named
+        "optim.means": (0.0, "position_lr_init"),
+        "optim.log_scales": (7e-3, "scaling_lr"),
+        "optim.length_power": (0.0, "the same rates, whatever --iterations"),
+        "thermal.gaussians": (10, "n_offsets"),
+        "thermal.feature_size": (32, "feat_dim"),
+        "thermal.distance": (True, "section 3.2"),
+        "thermal.volume": (0.01, "train.py: scaling_reg"),
+        "thermal.lr_feature": (7.5e-3, "feature_lr"),
+        "thermal.lr_offsets": (1e-2, "offset_lr_init"),
+        "thermal.lr_reach": (7e-3, "scaling_lr"),
+        "thermal.lr_opacity": (2e-3, "mlp_opacity_lr_init"),
+        "thermal.lr_shape": (4e-3, "mlp_cov_lr_init"),
+        "thermal.lr_value": (8e-3, "mlp_color_lr_init"),
+        "thermal.ends": ([0.01, 0.01, 1.0, 5e-5 / 8e-3], "offset_lr_final and so on, over the rates"),
+        "density.start": (500, "start_stat"),
+        "density.grow_from": (1500, "update_from"),
+        "density.stop": (15000, "update_until"),
+        "density.every": (100, "update_interval"),
+        "density.seen": (0.8, "success_threshold"),
+        "density.grad_threshold": (2e-4, "densify_grad_threshold"),
+        "density.prune_opacity": (0.005, "min_opacity"),
+        "density.coarsest": (16, "update_init_factor"),
+        "density.finer": (4, "update_hierachy_factor"),
+        "density.levels": (3, "update_depth"),
+        "density.voxel": (None, "voxel_size of 0: the median distance"),
+    },
     "ti3dgs": {
         "thermal.frames_per_cycle": (None, "Eq. 9"),
         "thermal.applies_to": ("harmonics", "Eq. 12"),
@@ -308,7 +336,7 @@ DEPARTURES = {  # ours, also with the recipe, and the published number
     "supirgs": {"teacher": ("lanczos", "SwinIR-S"), f"{TERM}.term.boost_weight": (0.0, "undefined")},
     "thermogs": {"thermal.features": ("learned", "given: of Feature-3DGS")},
 }
-STEPS = ("start", "stop", "every", "first_steps", "sh_degree_interval", "reset_every")
+STEPS = ("start", "grow_from", "stop", "every", "first_steps", "sh_degree_interval", "reset_every")
 SHARE_ROUNDED = 0.005  # 0.0167 of a run for 500 of 30000 steps, 0.1667 for 5000
 
 

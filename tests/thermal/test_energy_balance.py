@@ -252,6 +252,7 @@ def test_a_night_only_record_works_without_sun():
         ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
         ({"inner": True, "solution": "corrected"}, "inner is solved about a mean only: give solution=linear"),
         ({"nodes": 2, "semi_infinite": True}, "no end or two nodes, not both"),
+        ({"convection_error": 1.0}, "convection_error must lie in"),
         ({"exchange": "table"}, "exchange must be one of learned, iso_6946"),
         ({"exchange": "iso_6946", "sky": None}, "exchange=iso_6946 is that with sky and wind"),
         ({"indoor_c": 20.0}, "indoor_c tells nothing without heat from within: give inner=true"),
@@ -317,5 +318,9 @@ def test_an_exchange_by_convention_is_not_learned():
     wind = model.mean_wind.item()
     torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 4 + 4 * wind), rtol=1e-5, atol=0)
     torch.testing.assert_close(told["wind_share"], torch.full((6,), 4 * wind / (4 + 4 * wind)), rtol=1e-5, atol=0)
+    with model.doubts()["convection"]():
+        more = model.attributes(splats, Query(time_s=0.0))["convection_w_m2_k"]
+    torch.testing.assert_close(more, 1.2 * told["convection_w_m2_k"])
+    assert not ready()[0].doubts() and not ready(exchange="iso_6946", convection_error=0.0)[0].doubts()
     with pytest.raises(SceneError, match="exchange=iso_6946 needs wind_m_s"):
         ready(scene(weather(wind_m_s=None)), exchange="iso_6946")

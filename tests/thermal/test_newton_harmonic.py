@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
 from heatsplat.density.ops import Cloud
+from heatsplat.physics.first_look import RELAXES, STAYS
 from heatsplat.physics.relaxation import temperature
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
@@ -475,3 +476,13 @@ def test_the_configuration_holds_the_defaults(request):
 def test_messages_are_warnings(caplog):
     ready(scene_data=scene(ambient_c=None))
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
+
+
+def test_bodies_start_slow_unless_training_views_show_that_they_relax():
+    times_s = torch.linspace(0, SPAN_S, 20, dtype=torch.float64)
+    rates = torch.tensor([0.0, 1.0, 8.0])
+    looks = 0.12 + (0.8 - 0.12) * torch.exp(-rates[:, None].double() * times_s / SPAN_S).float()
+    start = Seeds(torch.zeros(3, 3), looks.median(1, keepdim=True).values, torch.Generator(), looks[..., None], times_s)
+    _, splats = ready(start)
+    assert splats["log_rate"].detach().exp().tolist() == pytest.approx([STAYS, RELAXES, RELAXES])
+    assert torch.equal(splats["initial_state"].detach(), start.values[:, 0])

@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 from contextlib import contextmanager
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -94,6 +95,9 @@ class Probe(ThermalModel):
     def prior(self, splats):
         return {"probed": splats.means[:, 1]}
 
+    def doubts(self):
+        return {"needle": partial(self.without, "needle")}
+
     def rate_of(self, name):
         return {"own": (0.123, 0.456)}[name]
 
@@ -169,8 +173,10 @@ def test_no_hook_of_a_model_is_left_out():
         "needs",
         "narrowest_range_k",
         "inseparable",
+        "stays_here",
     }
     hooks -= own | {"opacity_channels"}  # which follows from others
+    hooks -= {"rows", "per_row"}  # those of one Gaussian for each row: others cannot be wrapped
     assert hooks - made <= vars(Wrapper).keys()
     assert hooks - made <= vars(Probe).keys()
     assert made <= vars(Wrapper({"inner": Static()})).keys()
@@ -194,6 +200,7 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     ids = torch.tensor([4, 1])
     assert torch.equal(model.attributes(splats, Query(ids, CAMERA, 5.0, 1))["probed"], splats.means[ids, 0])
     assert torch.equal(model.prior(splats)["probed"], splats.means[:, 1])
+    assert model.doubts()["needle"].func.__self__ is probe
     assert model.effects()["probing"] == {"how": "deep"}
     assert model.cost >= 10**9
     assert (

@@ -130,7 +130,7 @@ def test_the_selection_of_etgs_is_etgs_to_the_last_bit(scene_says, tmp_path):
 
 
 def test_everything_at_once_trains(scene_says, tmp_path):
-    under_sky = {"solar", "radiation", "convection", "shadows", "sky_view", "albedo", "mirrored_sky"}
+    under_sky = {"solar", "radiation", "convection", "shadows", "sky_view", "albedo", "mirrored_sky", "semi_infinite"}
     off = [f"effects.{name}=off" for name in sorted(under_sky)]
     module, _ = run(tmp_path, *SHORT, "method=auto", "effects=all", "data.scene=heated", *off, "effects.price=false")
     simulated = set(module.thermal.effects()) | set(module.sensor.effects())

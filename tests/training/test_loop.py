@@ -3,7 +3,7 @@
 import pytest
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.loops.optimization.automatic import _AutomaticOptimization
+from pytorch_lightning.loops.training_epoch_loop import _TrainingEpochLoop
 from running import TINY
 from test_runs import state_of
 
@@ -15,10 +15,10 @@ SHORT = (*TINY, "method=etgs", "max_steps=4", "test=false", "logger=none")
 
 
 class Recorder(pl.Callback):
-    """The names of the hooks of each step, and whether gains had a gradient that was written out."""
+    """The names of the hooks of each step, how many Lightning logged, and whether gains had a gradient that was written out."""
 
     def __init__(self) -> None:
-        self.told, self.written = [], []
+        self.told, self.written, self.logged = [], [], []
 
 
 def _recording(name):
@@ -26,6 +26,10 @@ def _recording(name):
         self.told.append((name, trainer.global_step))
         if name == "on_before_optimizer_step":
             self.written.append(module.splats["source_gains"].grad is not None)
+        if name == "on_train_batch_end":
+            module.log("hooks", float(len(self.told)))
+        if name == "on_train_batch_start":
+            self.logged.append(trainer.callback_metrics.get("hooks"))
 
     return hook
 
@@ -41,7 +45,8 @@ def trained(output_dir, *overrides, lean=True, **limits):
     for name, value in limits.items():
         setattr(run.trainer, name, value)
     if not lean:
-        run.trainer.fit_loop.epoch_loop.automatic_optimization = _AutomaticOptimization(run.trainer)
+        loop = run.trainer.fit_loop.epoch_loop
+        run.trainer.fit_loop.epoch_loop = _TrainingEpochLoop(run.trainer, loop.min_steps, loop.max_steps)
     fit(run.module, run.data, run.trainer, test=False)
     return state_of(run.module, run.trainer), recorder
 
@@ -53,6 +58,7 @@ def test_hooks_and_bits_are_lightnings(tmp_path, accumulate):
     expected, theirs = trained(tmp_path / "full", *views, lean=False)
     assert all(torch.equal(found[name], expected[name]) for name in expected)
     assert told.told == theirs.told
+    assert told.logged == theirs.logged and told.logged[-1] > 0
     assert len({name for name, _ in told.told}) == len(STEP_HOOKS)
     assert told.written == ([False] * 4 if accumulate == 1 else [True] * 2)
 

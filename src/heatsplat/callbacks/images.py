@@ -22,6 +22,7 @@ from heatsplat.io.pictures import (
     write_figure,
     write_png,
 )
+from heatsplat.io.quantities import moment
 from heatsplat.metrics import mae_c, psnr
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
@@ -129,7 +130,7 @@ def panels(
     thermal_range = _range_of(scene, modality)
     title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
     if view.frame.time_s is not None:
-        title.append(f"t = {view.frame.time_s:.4g} s")
+        title.append(f"t = {moment(view.frame.time_s)}")
     scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
     if thermal_range is not None and target.shape[-1] == 1:
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))

@@ -49,7 +49,7 @@ class SplatStatistics(pl.Callback):
                 norms = sum(parameter.detach().flatten(0, -2).norm(dim=0).sum() for parameter in group["params"])
                 writer.add_scalar(f"loss/penalty/{group['name']}", group["group_penalty"] * norms.item(), step)
         writer.add_scalar("density/count", len(module.splats), step)
-        if self.histogram_every and step % self.histogram_every == 0:
+        if self.histogram_every and step % self.histogram_every == 0 and len(module.splats):
             self._histograms(module, writer, step)
 
     @torch.no_grad()

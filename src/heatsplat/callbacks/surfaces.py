@@ -17,6 +17,7 @@ from heatsplat.geometry.extremes import Surface, extremes
 from heatsplat.geometry.looks import Look
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, lettering, write_png
+from heatsplat.io.quantities import moment
 from heatsplat.io.tables import write_csv
 from heatsplat.shots import SIGHTING_SIZE, at_time
 
@@ -66,7 +67,7 @@ class ExtremeSurfaces(pl.Callback):
         ]
         if rows:
             write_csv(module.output_dir / SURFACES_FILE, rows)
-            write_png(module.output_dir / SURFACES_PICTURE, picture(looks, hot, cold, scene))
+            write_png(module.output_dir / SURFACES_PICTURE, picture(looks, hot, cold, scene, frames[0].time_s))
 
 
 def middle(scene: SceneData, frame: Frame) -> Frame:
@@ -85,11 +86,19 @@ def look(module: pl.LightningModule, frame: Frame) -> Look:
     return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
 
 
-def picture(looks: list[Look], hot: list[Surface], cold: list[Surface], scene: SceneData) -> np.ndarray:
-    """The view that shows most of the surfaces, with their numbers."""
+def picture(
+    looks: list[Look], hot: list[Surface], cold: list[Surface], scene: SceneData, time_s: float | None
+) -> np.ndarray:
+    """The view that shows most of the surfaces, hot and cold ones where there is such a view, with their numbers."""
     marked = [(f"{kind}{i}", one.centre) for kind, found in (("H", hot), ("C", cold)) for i, one in enumerate(found, 1)]
     shown = [[(name, place) for name, point in marked if (place := _place(one, point)) is not None] for one in looks]
-    best = max(range(len(looks)), key=lambda i: len(shown[i]))
+
+    def both(i: int) -> tuple[int, int]:
+        """How many of the rarer kind a view shows, and how many in all."""
+        warm = sum(name.startswith("H") for name, _ in shown[i])
+        return min(warm, len(shown[i]) - warm), len(shown[i])
+
+    best = max(range(len(looks)), key=both)
     low, high = scene_bounds(scene, "thermal")
     values = looks[best].values
     factor = max(1, round(ENLARGED / max(values.shape)))
@@ -101,7 +110,8 @@ def picture(looks: list[Look], hot: list[Surface], cold: list[Surface], scene: S
         draw.ellipse((x - MARK, y - MARK, x + MARK, y + MARK), outline="white", width=2)
         lettering(draw, (x + MARK + 2, y), name)
     missing = [name for name, _ in marked if name not in dict(shown[best])]
-    title = "H hottest, C coldest" + (f"; not in this view: {', '.join(missing)}" if missing else "")
+    title = "H hottest, C coldest" + ("" if time_s is None else f" after {moment(time_s)}")
+    title += f"; not in this view: {', '.join(missing)}" if missing else ""
     return compose([Panel(np.asarray(page), title, Bar(low, high, "°C"))])
 
 

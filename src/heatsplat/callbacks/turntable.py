@@ -9,6 +9,7 @@ from PIL import Image
 
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible
+from heatsplat.io.quantities import moment
 from heatsplat.shots import shot_frames
 
 TURNTABLE_FILE = "renders/turntable.webp"
@@ -39,7 +40,7 @@ class Turntable(pl.Callback):
         shown = []
         for frame in frames:
             image = module.predict(replace(frame, camera=frame.camera.within(self.size))).cpu()
-            title = "" if frame.time_s is None else f"{frame.time_s:.1f} s"
+            title = "" if frame.time_s is None else moment(frame.time_s)
             if image.shape[-1] == 3:
                 panel = Panel(visible(image), title)
             else:

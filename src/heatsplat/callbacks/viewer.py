@@ -12,8 +12,14 @@ log = logging.getLogger("heatsplat")
 
 
 class ViewerPage(pl.Callback):
-    """Writes viewer.html at the end of the test: the trained scene in one file, to look at in a browser, offline."""
+    """Writes viewer.html at the end of the test: the trained scene in one file, to look at in a browser, offline.
+
+    Of methods without Gaussians that stay as they are (``ThermalModel.stays_here``) it says that there is none.
+    """
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if module.thermal.stays_here:
+            log.info("no %s: %s", FILE, module.thermal.stays_here)
+            return
         path = write_viewer(module, module.output_dir / FILE)
         log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData
 from heatsplat.density.ops import Cloud
+from heatsplat.splats import GAUSSIANS
 
 
 @dataclass(frozen=True)
@@ -28,10 +29,12 @@ class DensityControl:
 
     Attributes:
         absgrad: whether ``observe`` wants absolute per-pixel gradients.
+        rows: what rows of the splats may be that it counts on (``heatsplat.splats``).
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
     """
 
     absgrad: bool = False
+    rows: frozenset[str] = frozenset({GAUSSIANS})
     cap_max: float | None = None
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:

@@ -144,6 +144,8 @@ def affordable(
     """The verdicts without the effects that gain less on held-out observations than so many decibels per millisecond that a
     step of training takes longer; 0 keeps all."""
     found = dict(verdicts)
+    if least_db_per_ms == 0:  # where images cannot tell, what was left out may gain less than nothing
+        return found
     for name in _on(verdicts):
         gain, price = verdicts[name].gain_db, prices.get(name)
         if gain is None or price is None or gain >= least_db_per_ms * price.ms_per_step or not found[name].on:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 # What recorded weather takes the place of, and why: a heat source stands for drivers that nobody recorded.
 INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}
 QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
-
+MEAN_K = 290.0
 
 NEVER = math.inf  # threshold of effects that images do not tell apart yet: they are simulated where they are asked for
 
@@ -50,6 +50,23 @@ def drivers(obs: Observations) -> Tensor | None:
         _, _, axes = torch.linalg.svd(level - level.mean(0), full_matrices=False)
         found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), obs.times_s))
     return torch.cat(found, 1)
+
+
+def bent(obs: Observations) -> bool:
+    """Whether T⁴ departs from a straight line over the span of temperatures by more than the noise of the images shows.
+
+    For a surface at T about a mean M, the excess over the line is (T - M)² · 3 / (2 M) to second order, in kelvin. Only tracks
+    tell it.
+    """
+    span_k = _span(torch.where(obs.tracks.weights > 0, obs.tracks.values, torch.nan)) * obs.unit_k
+    return 1.5 * (0.5 * span_k) ** 2 / MEAN_K > 3.0 * obs.noise * obs.unit_k
+
+
+def _span(values: Tensor) -> float:
+    """Range over time [P, F] (nan where not seen) that a tenth of the points exceed."""
+    low = torch.nan_to_num(values, nan=torch.inf).amin(1)
+    high = torch.nan_to_num(values, nan=-torch.inf).amax(1)
+    return float((high - low)[(high > low)].quantile(0.9)) if bool((high > low).any()) else 0.0
 
 
 def of_the_air(obs: Observations) -> Tensor:

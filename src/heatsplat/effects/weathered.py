@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from heatsplat.contracts import Weather
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of
+from heatsplat.physics.responses import semi_infinite_weights
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
 
@@ -22,8 +24,10 @@ MIN_DB, NOTHING_DB = 0.2, 0.05
 NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
+ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
 RATES_PER_S = [1.0 / (60.0 * minutes) for minutes in (5, 10, 20, 40, 80, 160, 320, 640, 1280)]
 DEEPER = 1.0 / 8.0  # rate of a body's core beside that of its surface
+OCTAVES = 10  # on each side of a body without an end, of rates of which it is a mean; what lies beyond, 2 %, counts at the ends
 # What wind adds to the exchange at its mean, as a share of that without wind: none, and McAdams' order of magnitude.
 WINDS = (0.0, 0.5, 1.5)
 EXCHANGE_W_M2_K = 10.0  # typical; light and long waves are counted in what they add to a temperature at this exchange
@@ -90,8 +94,20 @@ class Weathered:
 
     def gain(self, name: str) -> HeldOut:
         """What one of the parts gains beside the others."""
-        others = tuple(part for part in self.parts if part != name)
-        return compared(self._whole, self.squares(others), self.weights)
+        return compared(self._whole, self.squares(self._others(name)), self.weights)
+
+    @cached_property
+    def endless(self) -> tuple[HeldOut, HeldOut]:
+        """What bodies without an end gain over those of one rate, and what those with a core gain over them."""
+        one = self._others(DEPTH)
+        without_end = self.squares((*one, ENDLESS))
+        return (
+            compared(without_end, self.squares(one), self.weights),
+            compared(self._whole, without_end, self.weights),
+        )
+
+    def _others(self, name: str) -> tuple[str, ...]:
+        return tuple(part for part in self.parts if part != name)
 
     @cached_property
     def _whole(self) -> Tensor:
@@ -176,7 +192,7 @@ class Weathered:
 
     def _responses(self, winds: float, number: int, parts: tuple[str, ...]) -> tuple[Tensor, Tensor, list[str]]:
         """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
-        courses = self._courses[winds, number]
+        courses = (self._endless if ENDLESS in parts else self._courses)[winds, number]
         names = ["start"]
         names += ["beam", "diffuse"] if "solar" in parts else []
         names += ["deep air"] if DEPTH in parts else []
@@ -188,6 +204,33 @@ class Weathered:
     @cached_property
     def _courses(self) -> dict[tuple[float, int], dict[str, Tensor]]:
         """Answers to air, light and sky at the frames' times by wind and rate, each [F] or [P, F]."""
+        courses = {}
+        for winds in WINDS:
+            near, start = self._answers(winds, RATES_PER_S)
+            deep, _ = self._answers(winds, [DEEPER * rate for rate in RATES_PER_S])
+            for number in range(len(RATES_PER_S)):
+                cores = {"deep air": deep[number, :, 0] - near[number, :, 0], "deep light": deep[number, :, 3]}
+                courses[winds, number] = _named(near[number], start[number]) | cores
+        return courses
+
+    @cached_property
+    def _endless(self) -> dict[tuple[float, int], dict[str, Tensor]]:
+        """The same of bodies without an end by wind and a, the number in the place of their rate: means over bodies of one
+        rate (``physics.responses.SemiInfiniteTable``), exact where the wind is steady."""
+        octave = math.log(2.0)  # from one of RATES_PER_S to the next
+        rates = [RATES_PER_S[-1] * 2.0**place for place in range(-OCTAVES, len(RATES_PER_S) + OCTAVES)]
+        courses = {}
+        for winds in WINDS:
+            near, start = self._answers(winds, rates)
+            for number, rate in enumerate(RATES_PER_S):
+                distances = torch.tensor([math.log(other / rate) for other in rates], dtype=torch.float64)
+                counts = semi_infinite_weights(distances, octave)
+                courses[winds, number] = _named(torch.tensordot(counts, near, 1), counts @ start)
+        return courses
+
+    @cached_property
+    def _drivers(self) -> tuple[Tensor, Tensor]:
+        """Air in °C, then sky, diffuse, level light and beams in kelvin [T, d]; and wind over its mean [T]."""
         weather = self.weather
         zero = torch.zeros_like(weather.times_s)
         wind = zero + 1.0 if weather.wind_m_s is None else weather.wind_m_s / weather.wind_m_s.mean().clamp_min(0.1)
@@ -201,33 +244,40 @@ class Weathered:
             beam = weather.direct_w_m2[:, None] * (weather.sun @ self.normals.T).clamp_min(0.0)
             diffuse = zero if weather.diffuse_w_m2 is None else weather.diffuse_w_m2
         power = torch.cat([net[:, None], diffuse[:, None], light[:, None], beam], 1) / EXCHANGE_W_M2_K
-        drivers = torch.cat([weather.air_c[:, None], power], 1)
-        courses = {}
-        for winds in WINDS:
-            exchange = (1.0 + winds * wind) / (1.0 + winds)
-            # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
-            gains = torch.cat([exchange[:, None], torch.ones_like(drivers[:, 1:])], 1)
-            for number, rate in enumerate(RATES_PER_S):
-                near, start = self._answers(drivers, gains, rate * exchange, rate)
-                deep, _ = self._answers(drivers, gains, DEEPER * rate * exchange, DEEPER * rate)
-                courses[winds, number] = {
-                    "air": near[:, 0], "sky": near[:, 1], "diffuse": near[:, 2], "beam": near[:, 4:].T, "start": start,
-                    "deep air": deep[:, 0] - near[:, 0], "deep light": deep[:, 3],
-                }  # fmt: skip
-        return courses
+        return torch.cat([weather.air_c[:, None], power], 1), wind
 
-    def _answers(self, drivers: Tensor, gains: Tensor, rates: Tensor, rate: float) -> tuple[Tensor, Tensor]:
-        """u' = rate · gain · driver - rates · u at the frames' times [F, d], from rest; and the decay [F] from 1."""
-        steps = self.weather.times_s.diff()
-        keep = torch.exp(-0.5 * (rates[1:] + rates[:-1]) * steps)
-        taken = 0.5 * rate * (gains[1:] * drivers[1:] + gains[:-1] * drivers[:-1])
-        over = (1.0 - keep) / (0.5 * (rates[1:] + rates[:-1]))
-        states, start = [gains[0] * drivers[0] * rate / rates[0]], [torch.ones((), dtype=rates.dtype)]
-        for i in range(len(steps)):
-            states.append(keep[i] * states[-1] + over[i] * taken[i])
-            start.append(keep[i] * start[-1])
-        weather, times = self.weather, self.times_s
-        return (
-            weather_record.at(weather, torch.stack(states), times),
-            weather_record.at(weather, torch.stack(start), times),
-        )
+    def _answers(self, winds: float, rates_per_s: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """u' = rate · gain · driver - rate · exchange · u at the frames' times [R, F, d], from rest; and the decay [R, F] from 1.
+
+        Args:
+            rates_per_s: R rates at the mean exchange.
+        """
+        drivers, wind = self._drivers
+        times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
+        exchange = (1.0 + winds * wind) / (1.0 + winds)
+        # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
+        driven = torch.cat([exchange[:, None] * drivers[:, :1], drivers[:, 1:]], 1)
+        driven = torch.cat(
+            [0.5 * (driven[1:] + driven[:-1]), torch.zeros_like(driven[1:, :1])], 1
+        )  # nothing drives the decay
+        given = rate * 0.5 * (exchange[1:] + exchange[:-1])
+        keep = torch.exp(-given * times.diff())
+        over = rate * (1.0 - keep) / given
+        rest = torch.cat([drivers[0, :1], drivers[0, 1:] / exchange[0], torch.ones(1, dtype=torch.float64)])
+        state = rest.expand(len(rate), -1)
+        above = torch.searchsorted(times, self.times_s).clamp(1, len(times) - 1)
+        share = ((self.times_s - times[above - 1]) / (times[above] - times[above - 1])).clamp(0, 1)[:, None]
+        found = state.new_zeros(len(rate), len(self.times_s), len(rest))
+        for i in range(len(times) - 1):
+            after = keep[:, i, None] * state + over[:, i, None] * driven[i]
+            here = (above == i + 1).nonzero()[:, 0]
+            if len(here):
+                found[:, here] = torch.lerp(state[:, None], after[:, None], share[here])
+            state = after
+        return found[..., :-1], found[..., -1]
+
+
+def _named(answers: Tensor, start: Tensor) -> dict[str, Tensor]:
+    """Answers [F, d] to ``Weathered._drivers`` and the decay of the start [F] by name."""
+    air, sky, diffuse, _ = answers[:, :4].unbind(1)
+    return {"air": air, "sky": sky, "diffuse": diffuse, "beam": answers[:, 4:].T, "start": start}

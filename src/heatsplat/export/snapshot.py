@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.contracts import Frame, SceneData, SceneError, evenly_spread
 from heatsplat.export.basis import TimeBasis, constant_basis, time_basis
 from heatsplat.physics.units import kelvin
 from heatsplat.renderers.base import ALPHA_MIN
@@ -18,6 +18,7 @@ from heatsplat.shots import at_time, first_free_id
 TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
 TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
 VIEWS = 6  # training cameras over which what depends on the view is averaged
+JUDGED = 48  # training cameras at most that are compared with that mean
 TIMES = 257  # samples of a quantity over time at most
 FEW_TIMES = 65  # the same of what costs much to ask for: the truth of a scene, and models for which
 WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
@@ -85,8 +86,16 @@ def snapshot(module: Any) -> Snapshot:
     """Takes one of a training module (``training.module.SplatTraining``) with its scene.
 
     What the Gaussians send may depend on where it is seen from. Then it is the mean over training cameras, and
-    ``left_out`` says how far single cameras are from it.
+    ``left_out`` says over which, and how far single cameras are from it, at worst, too.
+
+    Raises:
+        SceneError: the model's Gaussians cannot be told apart from it.
     """
+    if module.thermal.stays_here:
+        raise SceneError(
+            f"what {type(module.thermal).__name__} learned cannot leave it as Gaussians: {module.thermal.stays_here}. Render "
+            "images of it (src/render.py), or train a method whose Gaussians stay as they are, such as method=3dgs"
+        )
     scene: SceneData = module.scene
     span = _span(scene)
     middle = None if span is None else 0.5 * (min(scene.train.times_s) + max(scene.train.times_s))
@@ -115,9 +124,15 @@ def snapshot(module: Any) -> Snapshot:
     tolerance = TOLERANCE_C if unit else TOLERANCE_UNIT
     left_out = []
     if spread.abs().max() > tolerance / 5:
+        mean, worst = looks.mean(0), 0.0
+        for i in evenly_spread(len(scene.train), JUDGED):
+            off = (emitted(seen_at(scene.train.frames[i], middle)) - mean)[:, :channels].mean(1) * to_unit
+            worst = max(worst, float(off.abs().max()))
         left_out.append(
-            f"What a Gaussian sends depends on the view: shown is the mean over {len(cameras)} training cameras, from which "
-            f"single ones differ by {spread.square().mean().sqrt():.2g} {unit} (root mean square)."
+            f"What a Gaussian sends depends on the view: baked, whichever way it is looked at, is the mean of what it sends to "
+            f"{len(cameras)} training cameras ({', '.join(frame.name for frame in cameras)}). Single ones differ from it by "
+            f"{spread.square().mean().sqrt():.2g} {unit} (root mean square), any training camera by {worst:.2g} {unit} at worst; "
+            "from where none looked it may be more. src/render.py shows what each direction gets."
         )
     else:
         cameras = cameras[:1]

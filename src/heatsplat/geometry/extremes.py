@@ -25,7 +25,7 @@ class Surface:
     """A connected surface.
 
     Args:
-        centre: [3] in the world.
+        centre: [3] in the world: of its pieces the one nearest to their centre of mass, which may lie in the air.
         area: in units of the world, squared.
         mean: of its values.
         most: what its hottest (coldest) fiftieth exceeds.
@@ -93,5 +93,7 @@ def _joined(points: Tensor, areas: Tensor, values: Tensor, cell: float, count: i
             weights = areas[mine] / total[label]
             most = sign * float(np.quantile((sign * values[mine]).numpy(), 0.98))
             mean = (weights * values[mine]).sum().item()
-            found.append(Surface((weights[:, None] * points[mine]).sum(0), total[label].item(), mean, most))
+            middle = (weights[:, None] * points[mine]).sum(0)
+            centre = points[mine][(points[mine] - middle).norm(dim=1).argmin()]
+            found.append(Surface(centre, total[label].item(), mean, most))
     return sorted(found, key=lambda one: -sign * one.mean)

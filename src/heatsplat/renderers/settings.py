@@ -9,6 +9,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData
 from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
+from heatsplat.splats import ANCHORS, GAUSSIANS
 
 
 class Renderer:
@@ -24,7 +25,12 @@ class Renderer:
         near, far: visible range of camera z in world units.
         background: what lies behind the splats: "ambient" (the ambient temperature where the scene has one, black where
             not), or an image value in [0, 1].
+
+    Attributes:
+        rows: what rows of the splats may be that it makes images of (``heatsplat.splats``).
     """
+
+    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(
         self,

@@ -82,7 +82,7 @@ def _check_machine(config: Mapping[str, Any]) -> None:
         raise SceneError(
             f"trainer.accelerator={accelerator}: PyTorch sees no CUDA device here; leave it out for the CPU"
         )
-    if config["renderer"]["backend"] == "gsplat":
+    if config["renderer"].get("backend") == "gsplat":
         gsplat.load()
         if not cuda or accelerator == "cpu":
             raise SceneError("renderer=gsplat renders on CUDA only; leave it out for the CPU")

@@ -30,7 +30,7 @@ from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
-from heatsplat.training.loop import LeanOptimization
+from heatsplat.training.loop import lean
 from heatsplat.training.module import SplatTraining
 from heatsplat.training.session import fit, prepare_machine, restore, without_idle_hooks
 
@@ -116,7 +116,7 @@ def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], outpu
     callbacks = build_callbacks(watching["callbacks"], output_dir)
     places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
     built = build(dict(trainer), callbacks=callbacks, logger=logger, **places)
-    built.fit_loop.epoch_loop.automatic_optimization = LeanOptimization(built)
+    lean(built)
     return built
 
 

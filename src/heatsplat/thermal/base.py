@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Camera, SceneData, SceneError
-from heatsplat.splats import Splats
+from heatsplat.splats import GAUSSIANS, Splats
 
 NORMALS = "normals"  # the tensor that ``surface_normals`` declares
 # Tensors that training fills where a model declares them, and new Gaussians inherit: shares [N, D] of the sun from the D
@@ -55,12 +55,17 @@ class Query:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometry of all N Gaussians at a time: means [N, 3], quats [N, 4], scales [N, 3], opacities [M, N]."""
+    """Geometry of all Gaussians at a time: means [n, 3], quats [n, 4], scales [n, 3], opacities [M, n].
+
+    There is one for each row of the splats, or ``ThermalModel.per_row`` for each, one row after the other.
+    ``in_view`` [N] bool says which rows the camera may see where the model found that out: the others have none.
+    """
 
     means: Tensor
     quats: Tensor
     scales: Tensor
     opacities: Tensor
+    in_view: Tensor | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -71,11 +76,22 @@ class Seeds:
         means: [N, 3] positions.
         values: [N, C] median image value at the projections of each point, in [0, 1]; the channels of all modalities.
         generator: for models that start from random numbers.
+        looks: [N, F, C] image values at the projections in F training views, NaN where a point is not seen; None: not known.
+        looks_s: [F] times of those views in seconds; None: not known.
+        log_scales: [N, 3] logarithms of the semi-axes that they start with; None where nobody knows.
     """
 
     means: Tensor
     values: Tensor
     generator: torch.Generator
+    looks: Tensor | None = None
+    looks_s: Tensor | None = None
+    log_scales: Tensor | None = None
+
+    def of(self, first: int, last: int) -> Seeds:
+        """The same Gaussians with the channels from ``first`` up to ``last`` alone."""
+        looks = None if self.looks is None else self.looks[..., first:last]
+        return replace(self, values=self.values[:, first:last], looks=looks)
 
 
 @dataclass(frozen=True)
@@ -181,6 +197,10 @@ class Heat(nn.Module, ABC):
         """What a table says of attributes that training pulls towards it, by name, each [N]; NaN where it says nothing."""
         return {}
 
+    def doubts(self) -> Mapping[str, Callable[[], AbstractContextManager[None]]]:
+        """What it takes for granted, by name: contexts in which that is wrong by one standard deviation."""
+        return {}
+
     def rate_of(self, name: str) -> tuple[float, float]:
         """Learning rate of its own parameter of that name, and the factor on it at the end of the run."""
         return self.lr, self.lr_end
@@ -204,8 +224,16 @@ class ThermalModel(Heat):
         modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
             features.
         shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
+        rows: what a row of the splats is, GAUSSIANS or ANCHORS; or NOTHING for a ``Field``, whose splats have no rows.
+            Parts of a run that touch rows say which they know.
+        per_row: Gaussians that a row becomes in ``geometry``; those of row i begin at i * per_row, and ``Query.ids`` and
+            what ``features`` returns count them.
+        stays_here: one clause that says why no Gaussians can be handed to other programs; empty where they can.
     """
 
+    rows: str = GAUSSIANS
+    per_row: int = 1
+    stays_here: str = ""
     modality: str = "thermal"
     companions: tuple[str, ...] = ()
     modality_channels: tuple[int, ...] = (1,)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any
 
@@ -101,6 +103,8 @@ class EnergyBalance(ThermalModel):
         exchange: "learned" has each Gaussian find radiation's and wind's share of its exchange; "iso_6946" takes them from the
             emissivity and the convention of building physics, 4 W/(m² K) and 4 more for each m/s of wind, which leaves
             images to tell heat from within.
+        convection_error: relative standard deviation of that convention's convection, for intervals of what is learned; 0 takes
+            it for exact.
         indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
@@ -130,6 +134,7 @@ class EnergyBalance(ThermalModel):
         semi_infinite: bool = False,
         inner: bool = False,
         exchange: str = "learned",
+        convection_error: float = 0.2,
         indoor_c: float | None = None,
         normals: str = "seen",
         shadows: bool = False,
@@ -176,12 +181,14 @@ class EnergyBalance(ThermalModel):
             )
         if albedo is not None and not 0 < albedo < 1:
             raise ValueError(f"albedo must lie in (0, 1), or be null for none, got {albedo}")
+        if not 0 <= convection_error < 1:
+            raise ValueError(f"convection_error must lie in [0, 1), got {convection_error}")
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
-        self.exchange = exchange
+        self.exchange, self.convection_error, self._convects = exchange, convection_error, 1.0
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
@@ -310,6 +317,19 @@ class EnergyBalance(ThermalModel):
                     values["u_value_w_m2_k"] = u_value(values["heat_loss_w_m2"], self.indoor_c, mean_c)
         return values
 
+    def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
+        """The convection of a convention, which building physics knows to a fifth."""
+        by_convention = self.exchange != "learned" and self.convection_error > 0
+        return {"convection": self._more_convection} if by_convention else {}
+
+    @contextmanager
+    def _more_convection(self) -> Iterator[None]:
+        self._convects = 1.0 + self.convection_error
+        try:
+            yield
+        finally:
+            self._convects = 1.0
+
     def effects(self) -> dict[str, dict]:
         return self.simulated
 
@@ -386,9 +406,9 @@ class EnergyBalance(ThermalModel):
     def _convention(self) -> tuple[float, float]:
         """Radiation's share of the exchange at mean wind, and the wind's of convection."""
         windy = CONVECTION[1] * self.mean_wind.item()
-        convection = CONVECTION[0] + windy
+        convection = (CONVECTION[0] + windy) * self._convects
         radiation = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
-        return radiation / (radiation + convection), windy / convection
+        return radiation / (radiation + convection), windy / (CONVECTION[0] + windy)
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -409,7 +429,7 @@ class EnergyBalance(ThermalModel):
         if self.nodes == 2:
             effects["relaxation"] = {"nodes": "surface and core"}
         if self.semi_infinite:
-            effects["relaxation"] = {"bodies": "without an end"}
+            effects["semi_infinite"] = {"bodies": "without an end, about their mean"}
         if self.inner:
             effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
         parts: dict[str, Any] = {}

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData, SceneError, check_option
+from heatsplat.physics.first_look import RELAXES, first_rates
 from heatsplat.physics.frequencies import SEPARATION, default_tau_min, frequency_grid
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import relax
@@ -26,7 +27,6 @@ PARAMS = ("rate", "faithful")
 PENALTIES = ("group", "ridge")
 REDUCTIONS = ("sum", "mean_over_gaussians")
 UNITS = ("image", "si")
-INITIAL_RATE = 4.0  # per observed span: a body that settles within the recording (time constant = span / 4)
 SLOWEST = 100.0  # spans: time constants beyond this are shown as this
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
@@ -191,7 +191,7 @@ class NewtonHarmonic(ThermalModel):
         if self._ambient_unknown and len(initial) > 0:
             with torch.no_grad():
                 self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
-        tensors, harmonics = self._bodies(initial), self.omega.numel()
+        tensors, harmonics = self._bodies(initial, self._first_rates(seeds)), self.omega.numel()
         if harmonics > 0:
             gains = initial.new_zeros(len(initial), 2, harmonics)
             weight, unit = self.source_penalty, self._penalty_unit()
@@ -203,9 +203,16 @@ class NewtonHarmonic(ThermalModel):
     def _tensor(self, initial: Tensor, lr: float, l2: float = 0.0, paced: bool = True) -> PerGaussian:
         return PerGaussian(initial, lr, l2, self.over_mean, self.lr_end, paced)
 
-    def _bodies(self, initial: Tensor) -> dict[str, PerGaussian]:
-        """What Gaussians that are first seen at ``initial`` [N] carry beside their gains."""
-        log_rate = torch.full_like(initial, math.log(INITIAL_RATE))
+    def _first_rates(self, seeds: Seeds) -> Tensor:
+        """Rates per span [N] to start with, of what training views show over time."""
+        if seeds.looks is None or seeds.looks_s is None:
+            return seeds.values.new_full((len(seeds.values),), RELAXES)
+        spans = (seeds.looks_s - self.clock.first_s) / self.clock.span_s
+        return first_rates(seeds.looks.mean(2), spans, self.ambient.detach())
+
+    def _bodies(self, initial: Tensor, rate: Tensor) -> dict[str, PerGaussian]:
+        """What Gaussians that are first seen at ``initial`` and start with ``rate``, each [N], carry beside their gains."""
+        log_rate = rate.log()
         tensors = {"initial_state": self._tensor(initial, self.lr_initial)}
         if self.param == "rate":
             return tensors | {"log_rate": self._tensor(log_rate, self.lr_rate)}

@@ -90,7 +90,7 @@ class ReleasedHarmonic(NewtonHarmonic):
                 "range, or choose method=etgs, which works in image values"
             )
 
-    def _bodies(self, initial: Tensor) -> dict[str, PerGaussian]:
+    def _bodies(self, initial: Tensor, rate: Tensor) -> dict[str, PerGaussian]:
         span_s, span_k = self.clock.span_s, self.range.bounds.span_k
         same = torch.ones_like(initial)
         tensors = {

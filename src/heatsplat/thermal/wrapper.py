@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
-from heatsplat.splats import Splats
+from heatsplat.splats import GAUSSIANS, Splats
 from heatsplat.thermal.base import NORMALS, Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
 
 
@@ -41,9 +40,16 @@ class Wrapper(ThermalModel):
             setattr(self, name, member)
         self.own_channels = own_channels
         every, models = self.members.values(), self._models
+        for model in models:
+            if model.rows != GAUSSIANS:
+                raise ValueError(
+                    f"{type(self).__name__} changes what Gaussians emit, and those of {type(model).__name__} are made anew for "
+                    "every view, or there are none: choose another model to put into it, such as static"
+                )
         self.needs = frozenset(needs).union(*(member.needs for member in every))
         self.narrowest_range_k = max(member.narrowest_range_k for member in every)
         self.inseparable = self.inseparable or next(filter(None, (member.inseparable for member in every)), "")
+        self.stays_here = next(filter(None, (model.stays_here for model in models)), "")
         self.shared_opacity = models[0].shared_opacity
         explained = [(name, count) for model in models for name, count in _images_of(model)]
         if own_channels:
@@ -93,7 +99,7 @@ class Wrapper(ThermalModel):
             own = seeds
             if isinstance(member, ThermalModel):
                 last = channel + sum(member.modality_channels)
-                own, channel = replace(seeds, values=seeds.values[:, channel:last]), last
+                own, channel = seeds.of(channel, last), last
             found = member.per_gaussian(own)
             if twice := ", ".join(sorted((tensors.keys() & found.keys()) - {NORMALS})):
                 raise ValueError(
@@ -152,6 +158,9 @@ class Wrapper(ThermalModel):
 
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         return _merged(member.prior(splats) for member in self.members.values())
+
+    def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
+        return _merged(member.doubts() for member in self.members.values())
 
     def rate_of(self, name: str) -> tuple[float, float]:
         """Of the member whose parameter it is, else the wrapper's own."""

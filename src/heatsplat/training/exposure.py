@@ -70,7 +70,12 @@ class Exposure:
 
     @torch.no_grad()
     def look(self, means: Tensor) -> dict[str, Tensor]:
-        """What reaches surfaces with centres [N, 3]: of the sun from each of D directions [N, D], and of the sky [N]."""
+        """What reaches surfaces with centres [N, 3]: of the sun from each of D directions [N, D], and of the sky [N].
+
+        Empty where nothing was asked for.
+        """
+        if not self._shares:
+            return {}
         count = min(NEIGHBOURS, len(self._points))
         far, nearest = cKDTree(self._points.double().numpy()).query(
             means.double().cpu().numpy(), k=[*range(1, count + 1)]

@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, evenly_spread
+from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
-from heatsplat.splats import GEOMETRY, Splats
+from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.rng import generator_for
 
@@ -37,6 +38,8 @@ class Initialisation:
         separate: each modality starts with Gaussians of its own, which the others do not see and never will: their
             opacity there is ``ABSENT``. Needs a thermal model whose images have opacities of their own.
     """
+
+    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(
         self,
@@ -97,6 +100,49 @@ class Initialisation:
         return points
 
 
+class NoSplats:
+    """No rows: how fields start, whose tables and networks the model draws itself."""
+
+    rows = frozenset({NOTHING})
+
+    def __call__(
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
+    ) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats without rows, and what the thermal model declared, which is nothing as a rule."""
+        shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (len(thermal.opacity_channels),)}
+        means, values = torch.zeros(0, 3), torch.zeros(0, sum(thermal.modality_channels))
+        declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+        geometry = {name: torch.zeros(0, *shape) for name, shape in shapes.items()}
+        return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
+
+
+class Voxels(Initialisation):
+    """One row in the middle of each cube that holds a point of the scene: where anchors begin.
+
+    Args:
+        voxel: edge of the cubes in world units; None takes the median distance of the points to the nearest other one.
+        opacity, scale: as for ``Initialisation``.
+
+    Raises:
+        SceneError: the points lie on one another, so that they tell no size of cubes.
+    """
+
+    def __init__(self, voxel: float | None = None, opacity: float = 0.1, scale: float = 1.0) -> None:
+        super().__init__("sfm", None, opacity, scale)
+        self.voxel = voxel
+
+    def _means(self, scene: SceneData, generator: torch.Generator, most: float | None) -> Tensor:
+        size = self.voxel or spacing(scene.points)
+        if size == 0:
+            raise SceneError(
+                f"most points of scene '{scene.name}' lie on another and tell no size of cubes: give init.voxel"
+            )
+        means = middles(torch.unique(cells(scene.points, size), dim=0), size)
+        if most is not None and most < len(means):
+            means = means[torch.randperm(len(means), generator=generator)[: int(most)].sort().values]
+        return means
+
+
 class Pretrained:
     """Splats whose geometry and opacity are those of an earlier run or of a file; heat starts as it does elsewhere.
 
@@ -107,6 +153,8 @@ class Pretrained:
     Raises:
         SceneError: there is no such file, or it holds no splats.
     """
+
+    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(self, path: str | None) -> None:
         if path is None:
@@ -148,9 +196,17 @@ def with_heat(
     """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared."""
     means = geometry["means"]
     modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
-    values = torch.cat([image_values_at(scene, means, name, channels) for name, channels in modalities], dim=1)
-    declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+    looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in modalities], dim=2)
+    generator, log_scales = generator_for(seed, 0, "thermal"), geometry["log_scales"]
+    seeds = Seeds(means, usual_values(scene, looks), generator, looks, _times(scene), log_scales)
+    declared = thermal.per_gaussian(seeds)
     return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
+
+
+def _times(scene: SceneData) -> Tensor | None:
+    """When the views of ``looks_at`` were taken, in seconds."""
+    times = [scene.train.frames[i].time_s for i in evenly_spread(len(scene.train), SAMPLED_VIEWS)]
+    return None if None in times else torch.tensor(times, dtype=torch.float64)
 
 
 def _splats_of_file(path: Path) -> dict[str, Tensor]:
@@ -177,11 +233,9 @@ def neighbour_distances(points: Tensor) -> Tensor:
     return torch.from_numpy(distances[:, 1:]).float()
 
 
-def image_values_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:
-    """Median image value at the projections of points over the training views that see them, [P, channels] in [0, 1].
-
-    Points that no view sees get the median of the others. No test for occlusion: the median over views stands it.
-    """
+def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:
+    """Image values at the projections of points in ``SAMPLED_VIEWS`` training views, [P, F, channels] in [0, 1], NaN where a
+    view does not see one. No test for occlusion."""
     positions = evenly_spread(len(scene.train), SAMPLED_VIEWS)
     samples = torch.full((len(positions), len(points), channels), float("nan"))
     for row, position in enumerate(positions):
@@ -197,11 +251,19 @@ def image_values_at(scene: SceneData, points: Tensor, modality: str, channels: i
             ids, at_line, at_column = ids[valid], at_line[valid], at_column[valid]
         values = image[at_line, at_column]
         samples[row, ids] = values if values.shape[1] == channels else values.mean(1, keepdim=True).expand(-1, channels)
-    medians = samples.nanmedian(dim=0).values
+    return samples.transpose(0, 1)
+
+
+def usual_values(scene: SceneData, looks: Tensor) -> Tensor:
+    """Median [P, channels] of what views see of points, [P, F, channels]: it stands what was hidden in some of them.
+
+    Points that no view sees get the median of the others.
+    """
+    medians = looks.nanmedian(dim=1).values
     unseen = medians.isnan().any(1)
     if unseen.all():
         raise SceneError(
-            f"none of the {len(points)} points of scene '{scene.name}' lies in any training view: points and cameras "
+            f"none of the {len(looks)} points of scene '{scene.name}' lies in any training view: points and cameras "
             "are in different coordinate systems"
         )
     medians[unseen] = medians[~unseen].median(0).values

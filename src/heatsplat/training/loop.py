@@ -1,4 +1,4 @@
-"""A training step as Lightning's automatic optimisation takes it, without what does nothing here."""
+"""A training step as Lightning's loops take it, without what does nothing here."""
 
 from __future__ import annotations
 
@@ -6,10 +6,53 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
+import pytorch_lightning as pl
 import torch
+from pytorch_lightning.loops.fetchers import _DataFetcher, _DataLoaderIterDataFetcher
 from pytorch_lightning.loops.optimization.automatic import _AutomaticOptimization
+from pytorch_lightning.loops.training_epoch_loop import _TrainingEpochLoop
 from pytorch_lightning.profilers import PassThroughProfiler
 from pytorch_lightning.strategies import SingleDeviceStrategy
+
+
+def lean(trainer: pl.Trainer) -> None:
+    """Gives a trainer that has not begun the loops below in place of Lightning's."""
+    known = trainer.fit_loop.epoch_loop
+    trainer.fit_loop.epoch_loop = LeanEpoch(trainer, known.min_steps, known.max_steps)
+    trainer.fit_loop.epoch_loop.automatic_optimization = LeanOptimization(trainer)
+
+
+class LeanEpoch(_TrainingEpochLoop):
+    """Lightning's loop over the views of a run: the same hooks in the same order, and no more.
+
+    Lightning looks at each step how ``training_step`` spells its arguments, who moves a view to the device, which
+    schedules wait for the end of an epoch, and what was logged.
+    """
+
+    def advance(self, data_fetcher: _DataFetcher) -> None:
+        """One step."""
+        trainer, connector = self.trainer, self.trainer._logger_connector
+        if self.restarting or not _alone(trainer) or isinstance(data_fetcher, _DataLoaderIterDataFetcher):
+            super().advance(data_fetcher)
+            return
+        view, *_ = next(data_fetcher)
+        number = self.batch_idx + 1
+        self.batch_progress.is_last_batch = data_fetcher.done
+        view = trainer.lightning_module.transfer_batch_to_device(view, trainer.strategy.root_device, 0)
+        self.batch_progress.increment_ready()
+        connector.on_batch_start(view)
+        _tell(trainer, "on_train_batch_start", view, number)
+        self.batch_progress.increment_started()
+        arguments = OrderedDict(batch=view, batch_idx=number)
+        outputs = self.automatic_optimization.run(trainer.optimizers[0], number, arguments)
+        self.batch_progress.increment_processed()
+        self.update_lr_schedulers("step", update_plateau_schedulers=False)
+        _tell(trainer, "on_train_batch_end", outputs, view, number)
+        if self._results:  # something was logged
+            connector.on_batch_end()
+        self.batch_progress.increment_completed()
+        if self._results:
+            connector.update_train_step_metrics()
 
 
 class LeanOptimization(_AutomaticOptimization):
@@ -22,8 +65,7 @@ class LeanOptimization(_AutomaticOptimization):
     def run(self, optimizer: torch.optim.Optimizer, batch_idx: int, kwargs: OrderedDict) -> dict[str, Any]:
         """The step's outputs, the loss without its graph."""
         trainer, module, progress = self.trainer, self.trainer.lightning_module, self.optim_progress.optimizer
-        alone = type(trainer.strategy) is SingleDeviceStrategy and isinstance(trainer.profiler, PassThroughProfiler)
-        if not alone or trainer.gradient_clip_val or trainer.accumulate_grad_batches != 1:
+        if not _alone(trainer) or trainer.gradient_clip_val or trainer.accumulate_grad_batches != 1:
             return super().run(optimizer, batch_idx, kwargs)
         outputs: dict[str, Any] = {}
 
@@ -31,32 +73,40 @@ class LeanOptimization(_AutomaticOptimization):
             outputs.update(module.training_step(*kwargs.values()))
             loss = outputs["loss"]
             progress.zero_grad.increment_ready()
-            self._tell("on_before_zero_grad", optimizer)
+            _tell(trainer, "on_before_zero_grad", optimizer)
             progress.zero_grad.increment_started()
             module.optimizer_zero_grad(trainer.current_epoch, batch_idx, optimizer)
             progress.zero_grad.increment_completed()
-            self._tell("on_before_backward", loss)
+            _tell(trainer, "on_before_backward", loss)
             module.backward(loss)
-            self._tell("on_after_backward")
+            _tell(trainer, "on_after_backward")
             outputs["loss"] = loss.detach()
             return outputs["loss"]
 
         progress.step.increment_ready()
-        stepping = _Stepping(optimizer, lambda: self._tell("on_before_optimizer_step", optimizer))
+        stepping = _Stepping(optimizer, lambda: _tell(trainer, "on_before_optimizer_step", optimizer))
         module.optimizer_step(trainer.current_epoch, batch_idx, stepping, closure)
         progress.step.increment_completed()
         return outputs
 
-    def _tell(self, name: str, *arguments: Any) -> None:
-        """Calls a hook of the callbacks and of the module, of those that have one (``session.without_idle_hooks``)."""
-        module = self.trainer.lightning_module
-        for callback in self.trainer.callbacks:
-            hook = getattr(callback, name)
-            if hook is not None:
-                hook(self.trainer, module, *arguments)
-        hook = getattr(module, name)
+
+def _alone(trainer: pl.Trainer) -> bool:
+    """Whether there is one device, and nobody takes the time of hooks."""
+    return type(trainer.strategy) is SingleDeviceStrategy and isinstance(trainer.profiler, PassThroughProfiler)
+
+
+def _tell(trainer: pl.Trainer, name: str, *arguments: Any) -> None:
+    """Calls a hook of the callbacks and of the module, of those that have one (``session.without_idle_hooks``)."""
+    module = trainer.lightning_module
+    module._current_fx_name = name  # what is logged in a hook is kept under its name
+    for callback in trainer.callbacks:
+        hook = getattr(callback, name)
         if hook is not None:
-            hook(*arguments)
+            hook(trainer, module, *arguments)
+    hook = getattr(module, name)
+    if hook is not None:
+        hook(*arguments)
+    module._current_fx_name = None
 
 
 class _Stepping:

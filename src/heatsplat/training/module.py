@@ -24,17 +24,16 @@ from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
-from heatsplat.splats import Splats
-from heatsplat.thermal.base import NORMALS, SKY_SEEN, SUN_SEEN, Geometry, PerGaussian, Query, ThermalModel
-from heatsplat.training.exposure import Exposure
+from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
-from heatsplat.training.normals import Normals
 from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
+from heatsplat.training.surroundings import Surroundings
 
 CHECKPOINT_KEY = "heatsplat"
 
@@ -62,8 +61,7 @@ class SplatTraining(pl.LightningModule):
         merging: what is done to Gaussians after training, before the test; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
-        normals: where normals come from, of models that read them; None: as before training, throughout.
-        exposure: what hides sun and sky, of models that ask for that; None: nothing, throughout.
+        surroundings: what Gaussians are told of the scene around them, of models that ask; None: once, before training.
         max_steps: planned length of a run.
         seed: seed of every random draw.
         supersample: how much finer than the training images training renders; the loss compares on their grid.
@@ -90,8 +88,7 @@ class SplatTraining(pl.LightningModule):
         merging: Merging | None = None,
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
-        normals: Normals | None = None,
-        exposure: Exposure | None = None,
+        surroundings: Surroundings | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
         supersample: int = 1,
@@ -108,8 +105,7 @@ class SplatTraining(pl.LightningModule):
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
-        self.normals = normals or Normals()
-        self.exposure = exposure or Exposure()
+        self.surroundings = surroundings or Surroundings()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
         self.modality = thermal.modality
@@ -147,17 +143,14 @@ class SplatTraining(pl.LightningModule):
     def attach(self, scene: SceneData) -> None:
         """Builds all that depends on the scene. Refuses a scene that lacks what the thermal model needs."""
         self.thermal.check(scene)
+        self._check_parts()
         self.scene = scene
         self.thermal.prepare(scene)
         self.sensor.prepare(scene)
         self.composite.prepare(scene, self.modality)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
-        if NORMALS in self.splats:
-            self._face(self.normals.prepare(scene, self.renderer, self.splats.means.detach()))
-        if self._exposed:
-            self.exposure.prepare(scene, self.renderer, self.normals.discs, self._exposed)
-            self._expose()
+        self.surroundings.prepare(scene, self.renderer, self.splats, self.composited)
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -168,6 +161,27 @@ class SplatTraining(pl.LightningModule):
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
             self.double()
         self.merging.check(self)
+
+    def _check_parts(self) -> None:
+        """Raises SceneError where a part counts on rows of the splats that are something else to the thermal model."""
+        rows, model = self.thermal.rows, type(self.thermal).__name__
+        names = {GAUSSIANS: "Gaussians", ANCHORS: "anchors", NOTHING: "fields"}
+        what = "is a field without Gaussians" if rows == NOTHING else f"has {names[rows]}"
+        for name in ("density", "renderer", "init"):
+            part = getattr(self, name)
+            known = getattr(part, "rows", {GAUSSIANS})
+            if rows not in known:
+                raise SceneError(
+                    f"{model} {what}, and {type(part).__name__} is for {' and '.join(names[row] for row in sorted(known))}: "
+                    f"leave {name} to the method"
+                )
+        if not self.resolution.whole and self.sensor.parts:
+            raise SceneError(
+                f"{type(self.resolution).__name__} takes single pixels out of images, which the parts of a sensor take for "
+                f"neighbours ({', '.join(self.sensor.parts)}): give sensor=none, or schedule=off"
+            )
+        if rows != GAUSSIANS and self.smoothing.changes:
+            raise SceneError(f"{model} {what}, which no filter of Gaussians in space knows: give smoothing=none")
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -251,19 +265,26 @@ class SplatTraining(pl.LightningModule):
         ratio: float = 1.0,
         signs: Tensor | None = None,
         values: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time.
 
         Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
-        [N, C] are what they emit in place of what the thermal model makes of them.
+        [N, C] are what rows of the splats emit in place of what the thermal model makes of them.
+        ``generator`` draws where samples along rays lie, of fields.
         """
 
         channels = self.thermal.modality_channels[0]
+        if self.thermal.rows == NOTHING:
+            return self._render_field(frame, channels, generator)
         moved = self.thermal.geometry(self.splats, _query(frame))
 
         def emitted(ids: Tensor) -> Tensor:
             query = _query(frame, ids, moved)
-            told = self.thermal.features(self.splats, query) if values is None else values.index_select(0, ids)
+            if values is None:
+                told = self.thermal.features(self.splats, query)
+            else:
+                told = values.index_select(0, ids // self.thermal.per_row)
             return self.composite.encode(told, channels)
 
         raw = moved is None and not self.smoothing.changes
@@ -280,8 +301,21 @@ class SplatTraining(pl.LightningModule):
             signs=signs,
             raw=raw,
         )
+        if self.thermal.per_row > 1:
+            output.meta["opacities"], output.meta["rows_in_view"] = moved.opacities.detach(), moved.in_view
         image = self.composite.decode(output.features, channels)
         return output if image is output.features else replace(output, features=image)
+
+    def _render_field(self, frame: Frame, channels: int, generator: torch.Generator | None) -> RenderOutput:
+        """As ``render``, of a model without Gaussians."""
+
+        def sent(known: Tensor, directions: Tensor) -> Tensor:
+            return self.composite.encode(self.thermal.values(known, directions, _query(frame)), channels)
+
+        output = self.renderer.of_field(
+            self.thermal.density, sent, self.thermal.span, frame.camera, self.background, generator
+        )
+        return replace(output, features=self.composite.decode(output.features, channels))
 
     def _raw_shapes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, rotations, logarithms of scales and logits of opacities of all Gaussians."""
@@ -289,7 +323,16 @@ class SplatTraining(pl.LightningModule):
         return splats.means, splats.quats, splats["log_scales"], splats["opacity_logits"].T
 
     def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are."""
+        """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are.
+
+        Raises:
+            SceneError: the model has none.
+        """
+        if self.thermal.rows == NOTHING:
+            raise SceneError(
+                f"{type(self.thermal).__name__} has no Gaussians, which this asks for: leave it out, or train a method of splats "
+                "such as method=3dgs"
+            )
         shown = self.splats if moved is None else moved
         return shown.means, shown.quats, *self.smoothing(shown.scales, shown.opacities)
 
@@ -297,15 +340,15 @@ class SplatTraining(pl.LightningModule):
         step = self.global_step
         here, progress = self.schedule.round_step(step), self.schedule.progress(step)
         ratio = self.resolution.ratio(progress)
+        view = self.resolution.chosen(view, step, self.seed)
         camera = rendered(view.camera, self.supersample / ratio)
         view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
         frame = view.frame if camera is view.camera else replace(view.frame, camera=camera)
         self.thermal.on_step(here)
-        signs = self.overlap.signs_at(here, len(self.splats), self.seed)
+        signs = self.overlap.signs_at(here, len(self.splats) * self.thermal.per_row, self.seed)
         maps = self.density.maps_at(here)
-        output = self.render(
-            frame, depth=self.sensor.needs_depth, absgrad=self.density.absgrad, maps=maps, ratio=ratio, signs=signs
-        )
+        drawn = generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None
+        output = self.render(frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn)
         image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
@@ -371,30 +414,11 @@ class SplatTraining(pl.LightningModule):
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
-        if NORMALS in self.splats and step + 1 in self.normals.refresh:
-            self._face(self.splats[NORMALS].detach())
-        if self._exposed and step + 1 in self.exposure.refresh:
-            self._expose()
+        self.surroundings.after_step(step, self.splats, self.composited)
         if change is not None:
             for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
-
-    @torch.no_grad()
-    def _face(self, normals: Tensor) -> None:
-        """Gives the splats their normals anew; ``normals`` [N, 3] is for those that no view shows."""
-        self.splats[NORMALS].copy_(self.normals.look(self.composited, normals))
-
-    @property
-    def _exposed(self) -> list[str]:
-        """Tensors of the splats that tell what reaches them of sun and sky."""
-        return [name for name in (SUN_SEEN, SKY_SEEN) if name in self.splats]
-
-    @torch.no_grad()
-    def _expose(self) -> None:
-        """Looks anew what hides sun and sky from the splats, where a model asks for that."""
-        for name, shares in self.exposure.look(self.splats.means.detach()).items():
-            self.splats[name].copy_(shares)
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
@@ -473,8 +497,10 @@ class SplatTraining(pl.LightningModule):
         return dict(zip(told, maps.unbind(-1), strict=True))
 
     def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
-        """What the camera of ``frame`` sees of values [N, C] of all Gaussians, before black, in the first modality."""
+        """What the camera of ``frame`` sees of values [N, C] of all rows of the splats, before black, in the first modality."""
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+        if self.thermal.per_row > 1:
+            values = values.repeat_interleave(self.thermal.per_row, dim=0)
         return self.renderer(
             *shape, opacities[:1], values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
         )

@@ -31,7 +31,12 @@ class Resolution:
 
     The ratio says how many pixels of full size fit beside one that is rendered. Full size is what training renders at its
     end: the grid of the training images, or a finer one (``module.supersample``).
+
+    Attributes:
+        whole: whether steps see whole images.
     """
+
+    whole = True
 
     def prepare(self, scene: SceneData, modalities: Sequence[str], composite: Composite, supersample: int) -> None:
         """Takes a scene, the modalities that are learned, the model's own first, and how much finer than images full size is."""
@@ -39,6 +44,10 @@ class Resolution:
     def ratio(self, progress: float) -> float:
         """The ratio when this share of the run is done; 1 is full size."""
         return 1.0
+
+    def chosen(self, view: View, step: int, seed: int) -> View:
+        """What a step sees of a view: all of it, or some of its pixels as a view of a camera of their own."""
+        return view
 
     def reduced(self, view: View, ratio: float) -> View:
         """The view on the grid on which it is compared with what is rendered at this ratio."""

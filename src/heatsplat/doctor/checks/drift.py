@@ -10,7 +10,10 @@ from heatsplat.doctor.courses import beside_courses
 from heatsplat.effects.observations import Tracks
 
 MIN_POINTS, MIN_FRAMES = 40, 5
-LEAST = 3.0  # times the noise of a pixel
+LEAST, LEAST_BESIDE = 3.0, 2.0  # times the noise of a pixel: of levels as they are, and beside each point's own course
+# Share of what points differ by between frames that is left without the levels: 0.17 to 0.31 where a sensor drifts (m3t_heath:
+# 0.31), 0.59 and more where surfaces mirror, which half of the points show; beside their courses 0.19 to 0.52, and 0.65.
+LEFT = 0.55
 # Two halves of the points tell of the same level if a sensor drifts: correlation, and range of the ratio of their sizes, of
 # what leaps from frame to frame and of what wanders slowly. Where a scene warms, cools or hazes the ratio is 1.66 and more,
 # and where it is not, the correlation 0.3; where a sensor drifts 1.27 and less, and 0.66 (m3t_heath: 0.95 and 1.16).
@@ -25,29 +28,26 @@ def find(material: Material) -> list[Finding]:
     tracks = material.tracks
     if tracks is None or len(tracks.points) < MIN_POINTS or len(material.images) < MIN_FRAMES:
         return []
-    values, weights = tracks.values, tracks.weights
-    levels = frame_levels(values, weights)
-    if float(levels.std()) < LEAST * material.noise or not _in_common(tracks, levels, material.noise):
-        values, weights = beside_courses(values, weights, material)
+    beside = beside_courses(tracks.values, tracks.weights, material)
+    for (values, weights), drifts in ((beside, _leap_beside), ((tracks.values, tracks.weights), _in_common)):
         levels = frame_levels(values, weights)
-        leaps = float(_leaps(levels).std()) > LEAST * material.noise
-        if not leaps or not all(
-            _same(_leaps(one), _leaps(other), *BESIDE) for one, other in _halves(tracks, values, weights)
-        ):
-            return []
-    before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
+        before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
+        if after < LEFT * before and drifts(material, values, weights, levels):
+            return [_finding(material, levels, before, after)]
+    return []
+
+
+def _finding(material: Material, levels: Tensor, before: float, after: float) -> Finding:
     shutters = [material.name(f) for f in _shutters(levels)]
     resets = f", and is set back at {some(shutters)} (shutter)" if shutters else ""
-    return [
-        Finding(
-            "drift",
-            before / material.contrast,
-            f"The level of all points wanders between frames by {material.size(float(levels.max() - levels.min()))}{resets}: "
-            f"one point differs between frames by {material.size(before)}, by {material.size(after)} without it.",
-            "method=auto simulates it (frame_offset); other methods take sensor=frame_offset.",
-            tuple(shutters),
-        )
-    ]
+    return Finding(
+        "drift",
+        min(1.0, before / material.contrast),
+        f"The level of all points wanders between frames by {material.size(float(levels.max() - levels.min()))}{resets}: "
+        f"one point differs between frames by {material.size(before)}, by {material.size(after)} without it.",
+        "method=auto simulates it (frame_offset); other methods take sensor=frame_offset.",
+        tuple(shutters),
+    )
 
 
 def frame_levels(values: Tensor, weights: Tensor) -> Tensor:
@@ -61,13 +61,28 @@ def frame_levels(values: Tensor, weights: Tensor) -> Tensor:
     return levels
 
 
-def _in_common(tracks: Tracks, levels: Tensor, noise: float) -> bool:
+def _leap_beside(material: Material, values: Tensor, weights: Tensor, levels: Tensor) -> bool:
+    """Whether all halves of the points leap alike beside their own courses."""
+    return float(_leaps(levels).std()) > LEAST_BESIDE * material.noise and all(
+        _same(_leaps(one), _leaps(other), *BESIDE) for one, other in _halves(material.tracks, values, weights)
+    )
+
+
+def _in_common(material: Material, values: Tensor, weights: Tensor, levels: Tensor) -> bool:
     """Whether points that change most and points that change least, warm ones and cold ones tell of the same levels."""
-    halves = _halves(tracks, tracks.values, tracks.weights)
-    leaps = float(_leaps(levels).std()) > LEAST * noise
-    return (leaps and all(_same(_leaps(one), _leaps(other), *LEAPS) for one, other in halves)) or all(
+    if float(levels.std()) < LEAST * material.noise:
+        return False
+    halves = _halves(material.tracks, values, weights)
+    # Frames at uneven times leap along a smooth course, too.
+    rough = float(_leaps(levels).std()) > LEAST * material.noise and _rough(material, levels) > LEAST * material.noise
+    return (rough and all(_same(_leaps(one), _leaps(other), *LEAPS) for one, other in halves)) or all(
         _same(one, other, *WANDERS) for one, other in halves
     )
+
+
+def _rough(material: Material, levels: Tensor) -> float:
+    """Standard deviation of what levels have beside a smooth course over time."""
+    return float(beside_courses(levels[None], torch.ones_like(levels)[None], material)[0].std())
 
 
 def _halves(tracks: Tracks, values: Tensor, weights: Tensor) -> list[list[Tensor]]:

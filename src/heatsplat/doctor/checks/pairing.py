@@ -12,6 +12,7 @@ SHORTER = 64  # pixels of the shorter side at which edges are compared
 MIN_FRAMES = 5
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
+MATCH = 0.3  # correlation of the photo that fits best from which it is one of the same moment
 OFF = 0.025  # of the width: how far photos may lie beside thermal images
 # Seconds, and share of the usual step between frames, by which clocks may differ; EXIF often has whole seconds.
 CLOCK_S, WHOLE_S, CLOCK_STEP = 0.2, 1.0, 0.1
@@ -31,11 +32,8 @@ def find(material: Material) -> list[Finding]:
     fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
-    steps = {
-        k: float(fits.diagonal(k).median() - own[: count - abs(k)].median())
-        for k in (-3, -2, -1, 1, 2, 3)
-        if abs(k) < count - 2
-    }
+    best = float(fits.max(1).values.median())
+    steps = {k: _gain(fits, k, best) for k in (-3, -2, -1, 1, 2, 3) if abs(k) < count - 2}
     step, gain = max(steps.items(), key=lambda item: item[1])
     strangers = float(fits[~torch.eye(count, dtype=torch.bool)].median())
     if gain > BETTER:
@@ -49,7 +47,7 @@ def find(material: Material) -> list[Finding]:
                 "Pair them anew: shift one list, or correct the clock of one camera.",
             )
         )
-    elif float((own < strangers + 0.5 * BETTER).double().mean()) > NEARLY_ALL and float(fits.max()) > 0.3:
+    elif float(own.median()) < strangers + BETTER and best > max(MATCH, float(own.median()) + MATCH / 3):
         found.append(
             Finding(
                 "pairing",
@@ -71,6 +69,15 @@ def find(material: Material) -> list[Finding]:
                 )
             )
     return found
+
+
+def _gain(fits: Tensor, step: int, best: float) -> float:
+    """By how much photos ``step`` frames later fit better than their own; 0 where they are not the ones that fit best."""
+    other, own = fits.diagonal(step), fits.diagonal()
+    own = own[: len(other)] if step > 0 else own[-len(other) :]
+    if float((other > own).double().mean()) < NEARLY_ALL or float(other.median()) < best - BETTER:
+        return 0.0
+    return float(other.median() - own.median())
 
 
 def _clock(material: Material) -> Finding | None:

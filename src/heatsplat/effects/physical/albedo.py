@@ -8,7 +8,7 @@ from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
 EFFECT = Effect(
     name="albedo",
     stage="state",
-    place=8,
+    place=9,
     summary="sunlight that comes back from the ground",
     source="Oke (1987)",
     needs=frozenset({"time", "thermal_range", "weather"}),

@@ -94,7 +94,7 @@ def _kept_apart(before: Tensor, after: Tensor) -> Tensor:
 EFFECT = Effect(
     name="conduction",
     stage="state",
-    place=5,
+    place=6,
     summary="heat that flows between neighbouring parts of a surface",
     source="Fourier's law on the graph of nearest Gaussians",
     needs=frozenset({"time"}),

@@ -19,7 +19,7 @@ def evidence(inspected: Inspection) -> Evidence:
 EFFECT = Effect(
     name="convection",
     stage="state",
-    place=4,
+    place=5,
     summary="air that carries heat away, faster in wind",
     source="ThermoGS, Eq. 6, 7",
     needs=frozenset({"time", "thermal_range", "weather"}),

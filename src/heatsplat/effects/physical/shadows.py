@@ -8,7 +8,7 @@ from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
 EFFECT = Effect(
     name="shadows",
     stage="state",
-    place=6,
+    place=7,
     summary="what stands in the way of the sun casts shadows",
     source="Williams (1978), with the splatted depth of the scene",
     needs=frozenset({"time", "thermal_range", "weather"}),

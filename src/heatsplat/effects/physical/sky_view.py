@@ -8,7 +8,7 @@ from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
 EFFECT = Effect(
     name="sky_view",
     stage="state",
-    place=7,
+    place=8,
     summary="what stands around hides a part of the sky",
     source="sky view factor (Oke 1987), from the splatted depth of the scene",
     needs=frozenset({"time", "thermal_range", "weather"}),

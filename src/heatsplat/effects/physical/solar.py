@@ -19,7 +19,7 @@ def evidence(inspected: Inspection) -> Evidence:
 EFFECT = Effect(
     name="solar",
     stage="state",
-    place=2,
+    place=3,
     summary="sunlight that a surface absorbs",
     source="ThermoGS, Eq. 4",
     needs=frozenset({"time", "thermal_range", "weather"}),

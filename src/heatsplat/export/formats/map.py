@@ -168,11 +168,8 @@ class Map(Format):
             deviation = certainty.deviation(frame)
             bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
             shown = means[..., 0].isfinite().cpu()
-            with torch.no_grad():
-                for name, spread in certainty.of_attributes(frame).items():
-                    seen_of = module.composited(frame, spread[:, None].nan_to_num().to(module.device))
-                    spread = (seen_of.features[..., 0] / seen_of.alpha[0]).cpu()
-                    intervals[f"{name} {DEVIATION}"] = spread.where(shown, torch.nan).numpy()
+            for name, spread in certainty.attribute_deviations(frame).items():
+                intervals[f"{name} {DEVIATION}"] = spread.where(shown, torch.nan).numpy()
         return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)} | intervals
 
 

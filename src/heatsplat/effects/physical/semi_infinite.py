@@ -1,0 +1,52 @@
+"""Massive walls and ground that the record does not heat through."""
+
+from __future__ import annotations
+
+from heatsplat.effects import weather_record
+from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.weathered import CHANCE, MIN_DB, NO_BALANCE, NOTHING_DB, SIGMAS
+
+# Such bodies are solved about their mean, and have no core: what the evidence on radiation would choose beside them.
+SOLVED = {"solution": "linear", "nodes": 1}
+
+
+def evidence(inspected: Inspection) -> Evidence:
+    """Whether bodies without an end explain images better, that they were not fitted to, than bodies of one rate do, with as
+    many numbers; and bodies with a core, which have more, not better still.
+
+    Where T⁴ is bent over the span of temperatures nothing is asked: solving that as it stands is worth more (docs/results.md).
+    """
+    weathered = inspected.weathered
+    if weathered is None:
+        return Evidence(None, inspected.obs.why or NO_BALANCE, SOLVED, told=False)
+    if weather_record.bent(inspected.obs):
+        return Evidence(
+            0.0, "T⁴ is bent over the span of temperatures, and such bodies are solved about their mean", SOLVED
+        )
+    gain, of_a_core = weathered.endless
+    found = f"they gain {gain.db:.2f} dB over bodies of one rate where left out, {gain.sigmas:.1f} standard errors"
+    if of_a_core.sigmas > SIGMAS and of_a_core.db > MIN_DB:
+        return Evidence(0.0, f"{found}, and bodies with a core {of_a_core.db:.2f} dB over them", SOLVED)
+    if gain.sigmas > SIGMAS and gain.db > MIN_DB:
+        return Evidence(gain.sigmas, found, SOLVED, gain_db=gain.db)
+    nothing = gain.sigmas < CHANCE or gain.db < NOTHING_DB
+    found = found if nothing else f"{found}: too few to tell"
+    return Evidence(min(max(gain.sigmas, 0.0), SIGMAS), found, SOLVED, told=nothing, gain_db=gain.db)
+
+
+EFFECT = Effect(
+    name="semi_infinite",
+    stage="state",
+    place=2,
+    summary="massive walls and ground, whose surface answers by the square root of time",
+    source="Carslaw and Jaeger, Conduction of Heat in Solids, 2.7",
+    needs=frozenset({"time", "thermal_range", "weather"}),
+    null="surfaces follow the weather with one time constant, or with that of a core beside it",
+    threshold=SIGMAS,
+    adds="no parameter: effusivity over exchange in the place of a rate; a mean over rates in the tables",
+    evidence=evidence,
+    part=Part("state", "energy_balance", off={"semi_infinite": False}),
+    stands_on="relaxation",
+    displaces=weather_record.INSTEAD,
+)

@@ -1,0 +1,27 @@
+"""The mean squared error of an image, the loss of radiance fields."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from heatsplat.losses.compose import LossInputs
+
+
+class Squared:
+    """The term "squared": the mean of (x - y)² over the channels of the pixels that count; 0 where none does.
+
+    Args:
+        modality: which image: that of a companion, such as "rgb", or None for the model's own.
+    """
+
+    def __init__(self, modality: str | None = None) -> None:
+        self.modality = modality
+
+    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
+        (prediction, target), mask = inputs.pair(self.modality), inputs.mask
+        if mask is None:
+            return {"squared": (prediction - target).square().mean()}
+        inside = mask[..., None]
+        errors = (torch.where(inside, prediction, 0.0) - torch.where(inside, target, 0.0)).square()
+        return {"squared": errors.mean(-1).sum() / mask.sum().clamp(min=1)}
