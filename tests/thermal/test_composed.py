@@ -272,9 +272,10 @@ def test_values_beyond_the_range_may_come_back_on_their_way():
     assert (start.values + 0.8 > 1).any() and seen.max() < 1
 
 
-def test_a_companion_has_an_opacity_of_its_own():
-    color = Static(channels=3, modality="rgb", sh_degree=1)
-    model = Composed(NewtonHarmonic(frequencies=2), companion=color)
+@pytest.mark.parametrize("state", [lambda: NewtonHarmonic(frequencies=2), Static])
+def test_a_companion_has_an_opacity_of_its_own(state):
+    color = Static(channels=3, modality="rgb", sh_degree=1, prefix="companion_")
+    model = Composed(state(), companion=color)
     model.prepare(scene())
     splats = splats_of(model, seeds(channels=4))
     assert model.opacity_channels == (1, 3) and splats.opacities.shape == (2, 40)

@@ -46,6 +46,7 @@ class Composed(Wrapper):
             raise ValueError(f"the state must explain one channel, got {state.modality_channels}")
         present = {name: part for name, part in (parts or {}).items() if part is not None}
         super().__init__({"state": state, "parts": nn.ModuleDict(present), "companion": companion})
+        self.shared_opacity = companion is None  # a state of one image says nothing of whether two share theirs
         self.clip = clip
 
     def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
