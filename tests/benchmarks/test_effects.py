@@ -76,7 +76,14 @@ def test_the_truth_of_its_configuration_is_that_of_the_scenes():
     truth = yaml.safe_load(conf.read_text(encoding="utf-8"))["presets"]
     scenes = ROOMS | OUTDOOR
     assert {name: set(effects) for name, effects in truth.items()} == {n: set(scenes[n].effects) for n in truth}
-    unseen = {"shadows", "sky_view", "albedo", "mirrored_sky", "semi_infinite"}  # asked for; of a wall
+    unseen = {
+        "shadows",
+        "sky_view",
+        "albedo",
+        "mirrored_sky",
+        "semi_infinite",
+        "pixel_area",
+    }  # asked for; of a wall; of data.degrade
     assert set().union(*truth.values()) == set(assembly.NAMES) - unseen  # every other effect is there somewhere
 
 

@@ -13,6 +13,7 @@ NAMES = (
     "relaxation", "harmonic_source", "semi_infinite", "solar", "radiation", "convection", "conduction", "shadows",
     "sky_view", "albedo", "view_dependence", "reflection", "mirrored_sky", "attenuation", "thermal_opacity",
     "point_spread", "thermal_lag", "rolling_readout", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
+    "pixel_area",
 )  # fmt: skip
 
 
@@ -89,7 +90,7 @@ def test_unknown_effects_and_choices_are_refused():
         decide(scene, {"agc": "maybe"})
 
 
-def test_verdicts_are_those_of_the_training_views_alone():
+def test_no_verdict_looks_at_images_that_are_held_out():
     scene = scene_of(noise(8), [10.0 * i for i in range(8)], points=50, thermal_range=ThermalRange(0.0, 10.0))
-    other = replace(scene, test=scene_of(torch.zeros(3, 24, 32)).train, val=scene_of(torch.ones(3, 24, 32)).train)
-    assert decide(scene) == decide(other)
+    dark, bright = scene_of(torch.zeros(3, 24, 32)).train, scene_of(torch.ones(3, 24, 32)).train
+    assert decide(replace(scene, test=dark, val=bright)) == decide(replace(scene, test=bright, val=dark))

@@ -8,7 +8,7 @@ the image and all gradients must be the same. With the effect on, the same compa
 import math
 import zlib
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from heatsplat.composition import build
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, ViewSet
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
+from heatsplat.geometry.resampling import resampled
 from heatsplat.physics import fused
 from heatsplat.physics.energy_balance import power_excess
 from heatsplat.physics.responses import grid_position, interpolate
@@ -43,6 +44,7 @@ from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.reflection import Reflection
 from heatsplat.thermal.static import Static
 from heatsplat.thermal.view_dependence import ViewDependence
+from heatsplat.training.resolution import rendered
 
 COUNT, HEIGHT, WIDTH = 60, 12, 16
 SHOWN = 2  # the training frame that is rendered
@@ -95,15 +97,20 @@ class Built:
         self.channels, self.opacities = self.thermal.modality_channels, self.thermal.opacity_channels
         self.declared = self.thermal.per_gaussian(seeds(sum(self.channels)))
         self.needs_depth = self.sensor.needs_depth
+        self.grid = found.get("grid", {}).get("pixel_area")
         for part in self.sensor.parts.values():
             if part.needs_depth:
                 part.twists *= 1e5  # a camera that takes hours for its way blurs nothing
+
+    def seen_by(self, frame):
+        return replace(frame, camera=rendered(frame.camera, self.grid["factor"])) if self.grid else frame
 
     def features(self, splats, query):
         return self.thermal.features(splats, query)
 
     def recorded(self, image, frame, depth):
-        return self.sensor(image, frame, depth)
+        image = self.sensor(image, frame, depth)
+        return resampled(image, HEIGHT, WIDTH, self.grid["kernel"]) if self.grid else image
 
     def regularisers(self, splats):
         return [*self.thermal.regularisers(splats).values(), *self.sensor.regularisers().values()]
@@ -131,6 +138,9 @@ class ByHand:
         for part in self.parts.values():
             values = part(values, splats, query)
         return clipped(values, "straight_through") if self.parts else values
+
+    def seen_by(self, frame):
+        return frame
 
     def recorded(self, image, frame, depth):
         for part in self.chain.values():
@@ -181,8 +191,8 @@ class Run:
         return sum(math.prod(shape) for shape, _ in self.held().values())
 
     def image(self):
-        frame = scene().train.frames[SHOWN]
         splats, model = self.splats, self.model
+        frame = model.seen_by(scene().train.frames[SHOWN])
 
         def emitted(ids):
             return model.features(splats, Query(ids, frame.camera, frame.time_s, frame.frame_id))
@@ -251,7 +261,6 @@ class Case:
     others: tuple[str, ...]
     by_hand: object
     traces: tuple[str, ...]
-    marks: tuple = field(default=())
 
 
 def air(**on):
@@ -374,6 +383,7 @@ CASES = {
         lambda: ByHand(NewtonHarmonic(frequencies=0)),
         ("rolling_readout.", "twists", "raw_readout"),
     ),
+    "pixel_area": Case(("relaxation",), lambda: ByHand(NewtonHarmonic(frequencies=0)), ()),
 }
 EFFECTS = tuple(CASES)
 
@@ -385,7 +395,10 @@ def templates():
 
 
 def assembled(*on):
-    verdicts = {name: Verdict(name, name in on, None, None, "as the test says") for name in assembly.NAMES}
+    said = {"pixel_area": {"factor": 2}}
+    verdicts = {
+        name: Verdict(name, name in on, None, None, "as the test says", said.get(name, {})) for name in assembly.NAMES
+    }
     return assembly.assemble(verdicts, templates())
 
 
@@ -456,7 +469,9 @@ def test_with_it_on_all_of_that_differs(name):
     off, on = switched_off(name), switched_on(name)
     assert on.operators - off.operators
     shown, without = on.shown, off.shown  # which draws a graph of neighbours, where there is one
-    if CASES[name].traces:  # albedo is one more driver, and bodies without an end other tables: nothing to learn
+    if CASES[
+        name
+    ].traces:  # albedo is one more driver, bodies without an end other tables, pixels an average: nothing to learn
         assert on.held() != off.held()
         assert on.numbers() > off.numbers()
     if name == "thermal_opacity":  # the visible image beside the thermal one, each with opacities of its own

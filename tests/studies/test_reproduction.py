@@ -460,7 +460,7 @@ def test_without_data_nothing_trains_and_dry_runs_tell_only(tmp_path):
     assert "Missing: 7 scenes of TI-NSD" in output and "Traceback" not in output
     root = put(tmp_path / "TI-NSD", "images", "chair")
     output = command("experiment=table_ti3dgs_ii", f"data.root={root}", "table.dry=true", folder)
-    assert "6 runs (6 rows x 1 of 7 scenes)" in output and not (tmp_path / "sweep" / "table.md").exists()
+    assert "7 runs (7 rows x 1 of 7 scenes)" in output and not (tmp_path / "sweep" / "table.md").exists()
     output = command("experiment=table_ti3dgs_ii", f"data.root={root}", "method=etgs", folder, code=1)
     assert "choose among them with table.methods" in output and "Traceback" not in output
 

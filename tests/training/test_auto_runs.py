@@ -131,10 +131,19 @@ def test_the_selection_of_etgs_is_etgs_to_the_last_bit(scene_says, tmp_path):
 
 def test_everything_at_once_trains(scene_says, tmp_path):
     under_sky = {"solar", "radiation", "convection", "shadows", "sky_view", "albedo", "mirrored_sky", "semi_infinite"}
-    off = [f"effects.{name}=off" for name in sorted(under_sky)]
-    module, _ = run(tmp_path, *SHORT, "method=auto", "effects=all", "data.scene=heated", *off, "effects.price=false")
+    off = [f"effects.{name}=off" for name in sorted(under_sky)] + ["effects.grid.pixel_area.factor=2"]
+    module, _ = run(
+        tmp_path,
+        *SHORT,
+        "method=auto",
+        "effects=all",
+        "data.scene=heated",
+        "data.degrade=area2",
+        *off,
+        "effects.price=false",
+    )
     simulated = set(module.thermal.effects()) | set(module.sensor.effects())
-    assert simulated == set(assembly.NAMES) - under_sky
+    assert simulated == set(assembly.NAMES) - under_sky - {"pixel_area"} and module.supersample == 2
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert found["test"]["psnr"] > 5 and found["test"]["rgb_psnr"] > 5
     assert found["run"]["parameters"] == sum(parameter.numel() for parameter in module.parameters())

@@ -157,7 +157,8 @@ def affordable(
 
 
 def assemble(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """ "thermal", "sensor" and further terms of the "loss" as plain containers, of the effects that are on.
+    """ "thermal", "sensor" and further terms of the "loss" as plain containers, of the effects that are on; and "grid", on which
+    images are compared, where they are rendered finer than they were recorded.
 
     Args:
         verdicts: reconciled.
@@ -183,7 +184,8 @@ def assemble(verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> d
         "clip": templates["clip"],
     }
     sensor = {"_target_": templates["sensor"]["_target_"], "parts": parts["camera"]}
-    return {"thermal": thermal, "sensor": sensor, "loss": templates["companion_loss"] if companion else {}}
+    loss = templates["companion_loss"] if companion else {}
+    return {"thermal": thermal, "sensor": sensor, "loss": loss, **({"grid": grid} if (grid := parts["grid"]) else {})}
 
 
 def _effect(name: str) -> Effect:
@@ -253,18 +255,22 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
 
     Args:
         config: as composed.
-        parts: of ``assemble``, or the configuration of an earlier run.
+        parts: of ``assemble``.
         verdicts: as ``verdicts_as_dicts`` puts them.
     """
     thermal, sensor = deepcopy(parts["thermal"]), deepcopy(parts["sensor"])
-    terms = parts["loss"].get("terms", parts["loss"])  # an earlier run has all of its loss
-    loss = {**deepcopy(config["loss"]), "terms": {**config["loss"]["terms"], **deepcopy(terms)}}
+    terms, finer = {**config["loss"]["terms"], **deepcopy(parts["loss"])}, {}
+    for grid in parts.get("grid", {}).values():
+        around = dict(grid)
+        finer["supersample"] = around.pop("factor")
+        terms = {name: term and around | {"term": term} for name, term in terms.items()}
+    loss = {**deepcopy(config["loss"]), "terms": terms}
     effects = {"select": config["effects"]["select"]} | {name: verdicts[name]["on"] for name in NAMES}
     changed = {"thermal": thermal, "sensor": sensor, "loss": loss}
     return {
         **config,
         **changed,
-        "module": {**config["module"], **changed},
+        "module": {**config["module"], **changed, **finer},
         "effects": effects,
         "verdicts": dict(verdicts),
         "asked": asked(config),

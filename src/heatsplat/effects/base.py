@@ -26,6 +26,7 @@ SLOTS = {
     "path": ("parts",),  # after the state, one after the other
     "companion": (),
     "camera": ("sensor", "parts"),  # one after the other
+    "grid": ("grid",),  # around every term of the loss
 }
 
 

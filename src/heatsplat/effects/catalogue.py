@@ -31,7 +31,7 @@ def decide(scene: SceneData, choices: Mapping[str, str] = {}) -> dict[str, Verdi
     """A verdict on every effect of the catalogue, in its order.
 
     Args:
-        scene: looked at through its training views only.
+        scene: looked at through its training views only; of the others count the sizes.
         choices: "on", "off" or "auto" by name of effect; auto where nothing is said. An effect for which the scene lacks
             metadata is off, whatever is chosen, and its reason names what is missing.
 

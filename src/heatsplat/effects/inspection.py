@@ -23,7 +23,7 @@ class Inspection:
     """A scene, for the evidence of effects.
 
     Args:
-        scene: seen through its training views only.
+        scene: seen through its training views only; of the others count the sizes.
         effects: those that the joint fit may take in.
     """
 
