@@ -1,5 +1,7 @@
 """Comparing on the target's grid, the curriculum of weights, the cosine ramp, and preparing terms."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -30,6 +32,17 @@ def test_a_fine_prediction_is_compared_after_it_shrank(kernel):
     assert {name: value.item() for name, value in got.items()} == {name: v.item() for name, v in expected.items()}
     sum(got.values()).backward()
     assert fine.grad.isfinite().all() and fine.grad.abs().max() > 0
+
+
+def test_a_companion_shrinks_to_its_own_target():
+    fine, coarse, sharp = (
+        noise(height, width, 3).expand(-1, -1, 3) for height, width in ((48, 64), (12, 16), (48, 64))
+    )
+    for target in (coarse, sharp):
+        given = replace(inputs(noise(48, 64), noise(12, 16, 1)), companions={"rgb": (fine, target)})
+        got = OnTargetGrid(Photometric(0.0, modality="rgb"), "area")(given)
+        expected = (resampled(fine, *target.shape[:2], "area") - target).abs().mean()
+        torch.testing.assert_close(got["l1"], expected)
 
 
 def test_an_image_that_would_be_recorded_so_costs_nothing():

@@ -15,9 +15,9 @@ from heatsplat.losses.photometric import Photometric
 
 
 class OnTargetGrid:
-    """A term of the prediction reduced to the grid of the target: consistency with what was recorded.
+    """A term of the predictions reduced to the grids of their targets: consistency with what was recorded.
 
-    A prediction that has the target's size already is passed on as it is.
+    A prediction that has its target's size already is passed on as it is.
 
     Args:
         term: what compares.
@@ -39,8 +39,12 @@ class OnTargetGrid:
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
         fineness(inputs)
-        height, width = inputs.target.shape[:2]
-        return self.term(replace(inputs, prediction=resampled(inputs.prediction, height, width, self.kernel)))
+        companions = {name: (self._reduced(*pair), pair[1]) for name, pair in inputs.companions.items()}
+        prediction = self._reduced(inputs.prediction, inputs.target)
+        return self.term(replace(inputs, prediction=prediction, companions=companions))
+
+    def _reduced(self, prediction: Tensor, target: Tensor) -> Tensor:
+        return resampled(prediction, *target.shape[:2], self.kernel)
 
 
 class Curriculum:
