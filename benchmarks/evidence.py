@@ -46,7 +46,7 @@ of bodies of one rate, with a core, and without an end. Shadows are cast by the 
 gain 0.13 dB (3.2 standard errors) on `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, where there are none. Hidden sky, light
 from the ground and mirrored sky are asked in the same way, but what balances miss is taken for them: they gain up to 0.47 dB
 where there is none, and 0.08 dB and less on `outdoor_true`, where all three are. So they are simulated where they gain 0.5 dB,
-which no scene here does, or where they are switched on. Sky that is hidden takes a constant share of what a point absorbs and
+or where they are switched on. Sky that is hidden takes a constant share of what a point absorbs and
 emits, which its own numbers take as well; that of sparse points is too rough beside it.
 
 What fails, what would take its place, and what the record has too few frames for **cannot be told**, and its reason says what
@@ -308,7 +308,7 @@ def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
         groups = []
         for there in (True, False):
             these = [outcome for outcome in outcomes if (effect.name in outcome.present) == there]
-            on = sum(effect.name in outcome.found for outcome in these)
+            on = sum(effect.name in outcome.found - outcome.untold for outcome in these)
             unsure = sum(effect.name in outcome.untold for outcome in these)
             groups.append((on, len(these) - on - unsure, unsure))
         rows.append((effect.name, *groups[0], groups[1][1], groups[1][0], groups[1][2]))
