@@ -77,7 +77,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 130  # modules; lower it when some go
+LONGEST = 129  # modules; lower it when some go
 
 
 def modules() -> list[str]:
