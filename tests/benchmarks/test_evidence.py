@@ -4,11 +4,12 @@ from functools import partial
 
 import pytest
 
-from benchmarks.evidence import outcome_of, run, written
+from benchmarks.evidence import Outcome, outcome_of, run, written
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 
 SCENES = ("static", "cooling", "drifting")
@@ -71,6 +72,13 @@ def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path):
     (tmp_path / "verdicts" / "drawn_5_tiny_5.json").unlink()
     assert run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1).split("took")[0] == text.split("took")[0]
     assert asked[3:] == ["drawn_5"]
+
+
+def test_what_cannot_be_told_counts_once_though_it_is_simulated():
+    verdicts = {effect.name: Verdict(effect.name, False, None, None, "") for effect in CATALOGUE}
+    verdicts["agc"] = Verdict("agc", True, 3.0, 1.0, "", told=False)
+    text = written([Outcome("static", "tiny", 0, frozenset({"agc"}), verdicts, 0.1)])
+    assert "| agc | 0 | 0 | 1 | 0 | 0 | 0 |" in text
 
 
 def test_scenes_without_a_known_truth_are_refused(tmp_path):

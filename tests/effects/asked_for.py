@@ -1,4 +1,4 @@
-"""What holds of every effect that images do not tell yet: on where it is asked for, and refused without directed light."""
+"""What holds of every effect of the scene's own geometry: on where it is asked for, and refused without directed light."""
 
 from types import SimpleNamespace
 
@@ -22,10 +22,14 @@ def brings_the_sun(effect: Effect, on: object, off: object) -> None:
 
 
 def needs_directed_light(effect: Effect) -> None:
-    """Weather that does not say from where light comes is named, and no image tells the effect."""
+    """Weather that does not say from where light comes is named, and then no image tells the effect."""
     series = torch.ones(2)
     weather = SimpleNamespace(sun=series, direct_w_m2=series, diffuse_w_m2=series)
     assert effect.missing(SimpleNamespace(weather=weather)) is None
     weather.sun = None
     assert "lacks sun" in effect.missing(SimpleNamespace(weather=weather))
-    assert effect.evidence(None).told is False
+    nowhere = SimpleNamespace(beside=lambda name: None, parts=("solar",))
+    evidence = effect.evidence(SimpleNamespace(weathered=nowhere))
+    assert not evidence.told and "from where light comes" in evidence.reason
+    night = SimpleNamespace(parts=("radiation",))
+    assert "does not shine" in effect.evidence(SimpleNamespace(weathered=night)).reason

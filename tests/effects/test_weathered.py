@@ -1,18 +1,37 @@
 """Balances of heat with and without sun, sky and wind, on points whose heat is known."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from weathered import HOUR_S, make_weather
 
-from heatsplat.effects.weathered import EXCHANGE_W_M2_K, PARTS, Weathered, judged
+from heatsplat.effects.weathered import (
+    ALBEDO,
+    EXCHANGE_W_M2_K,
+    MIN_DB,
+    MIRRORED,
+    PARTS,
+    SHADOWS,
+    SIGMAS,
+    SKY_VIEW,
+    Weathered,
+    around,
+    judged,
+)
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
 POINTS, FRAMES, STEP_S = 60, 48, 120.0
 
 
-def recorded(without="", depth=0.0):
-    """Points under a weather, integrated in small steps; noise of 0.1 K."""
+def recorded(without="", depth=0.0, lit=None, **seen):
+    """Points under a weather, integrated in small steps; noise of 0.1 K.
+
+    Args:
+        lit: (the sun's direction) -> whether each point is lit by its beams; None: they are level, and irradiance is all light.
+        seen: what ``Weathered`` knows beside temperatures.
+    """
     weather = make_weather()
     generator = torch.Generator().manual_seed(3)
     rate = torch.exp(torch.rand(POINTS, generator=generator, dtype=torch.float64) * 2.0) / (4 * HOUR_S)
@@ -29,7 +48,12 @@ def recorded(without="", depth=0.0):
             net = STEFAN_BOLTZMANN * float(sky_temperature_k(air_k, moist, "brutsaert") ** 4 - air_k**4)
             wind = 1.0 if without == "convection" else (1 + 1.5 * here.wind_m_s / float(weather.wind_m_s.mean())) / 2.5
             driven = wind * (here.air_c - temperature)
-            driven = driven + (without != "solar") * takes * here.irradiance_w_m2 / EXCHANGE_W_M2_K
+            light = here.irradiance_w_m2
+            if lit is not None:
+                at = int((weather.times_s - now).abs().argmin())
+                beam = float(weather.direct_w_m2[at] * weather.sun[at, 2].clamp_min(0))
+                light = beam * lit(weather.sun[at]) + float(weather.diffuse_w_m2[at])
+            driven = driven + (without != "solar") * takes * light / EXCHANGE_W_M2_K
             driven = driven + (without != "radiation") * emits * net / EXCHANGE_W_M2_K
             temperature, core = (
                 temperature + STEP_S * rate * (driven + depth * (core - temperature)),
@@ -39,7 +63,7 @@ def recorded(without="", depth=0.0):
         values.append(temperature)
     values = torch.stack(values, 1) + 0.1 * torch.randn(POINTS, FRAMES, generator=generator, dtype=torch.float64)
     ones = torch.ones_like(values)
-    return Weathered(weather, times, values, 0.1 * ones, ones, None)
+    return Weathered(weather, times, values, 0.1 * ones, ones, **{"normals": None, **seen})
 
 
 def test_what_drives_a_scene_is_told():
@@ -62,3 +86,40 @@ def test_a_body_with_a_core_has_two_nodes():
 def test_without_a_record_nothing_is_told():
     evidence = judged(None, "solar", "there is no record")
     assert not evidence.told and evidence.reason == "there is no record"
+
+
+def by_a_wall():
+    """Level ground on both sides of a wall from south to north, 2 m high, of points; and what lights it."""
+    generator = torch.Generator().manual_seed(4)
+    ground = torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) * torch.tensor([4.0, 4.0, 0.0])
+    ground[:, 0] -= 2.0
+    along = torch.arange(0.0, 4.0, 0.1, dtype=torch.float64)
+    wall = torch.stack(torch.meshgrid(torch.zeros(1, dtype=torch.float64), along, along[:20], indexing="ij"), 3)
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(POINTS, -1)
+    tracks = SimpleNamespace(points=ground, directions=up[:, None].expand(-1, FRAMES, -1))
+
+    def lit(sun):
+        across = ground[:, 0] * sun[0] < 0
+        return (~(across & (ground[:, 0].abs() * sun[2] < 2.0 * sun[0].abs()))).double()
+
+    more = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * torch.tensor([4.0, 4.0, 0.0])
+    around = torch.cat([more - torch.tensor([2.0, 0.0, 0.0]), wall.flatten(0, 2), ground])
+    return lit, {"normals": up, "tracks": tracks, "around": around}
+
+
+def test_shadows_are_told_where_they_fall_and_not_where_they_do_not():
+    lit, seen = by_a_wall()
+    shaded, bare = recorded(lit=lit, **seen), recorded(lit=lambda sun: torch.ones(POINTS), **seen)
+    found, none = (around(SimpleNamespace(weathered=one), SHADOWS) for one in (shaded, bare))
+    assert found.told and found.statistic > SIGMAS, found
+    assert none.told and none.statistic < SIGMAS, none
+    for name in (ALBEDO, MIRRORED, SKY_VIEW):
+        evidence = around(SimpleNamespace(weathered=bare), name)
+        assert not (evidence.told and evidence.statistic > SIGMAS), (name, evidence)
+
+
+def test_points_that_follow_the_weather_are_no_levels_and_need_no_neighbours():
+    _, seen = by_a_wall()
+    weathered = recorded(lit=lambda sun: torch.ones(POINTS), **seen)
+    assert weathered.follows.sigmas > SIGMAS and weathered.follows.db > 1.0
+    assert weathered.flow.db < MIN_DB and recorded().flow is None

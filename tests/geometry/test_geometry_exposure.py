@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
+from heatsplat.geometry.exposure import lit_beside, open_share, sky_directions, sun_directions
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -29,3 +29,17 @@ def test_directions_of_the_sun_stand_for_all_of_its_way():
     assert apart.max() <= math.radians(1.2501)
     assert 70 < len(ways) < 160  # once for all days
     assert len(sun_directions(-UP.expand(3, 3), UP)) == 0
+
+
+def test_a_roof_keeps_the_light_from_above_and_not_from_the_side():
+    at = torch.arange(20, dtype=torch.float64) * 0.1
+    level = torch.stack(torch.meshgrid(at, at, indexing="ij"), 2).flatten(0, 1)
+    ground = torch.cat([level, torch.zeros(len(level), 1)], 1)
+    roof = torch.cat([level[level[:, 0] < 1.0], torch.full((200, 1), 1.0)], 1)
+    around = torch.cat([ground, roof])
+    lit = lit_beside(ground, around, torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6]], dtype=torch.float64))
+    covered = ground[:, 0] < 0.95
+    assert (lit[covered, 0] == 0).all() and (lit[ground[:, 0] > 1.15, 0] == 1).all()
+    # Light that comes in from the open side at 37 degrees reaches the floor beside the edge.
+    assert (lit[(ground[:, 0] > 0.0) & (ground[:, 0] > 0.99), 1] == 1).all() and lit[:, 1].mean() > lit[:, 0].mean()
+    assert lit_beside(ground, around, torch.zeros(0, 3, dtype=torch.float64)).shape == (400, 0)

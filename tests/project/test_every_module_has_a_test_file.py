@@ -38,8 +38,7 @@ ELSEWHERE = {
         "effects/physical/frame_offset effects/physical/tone effects/physical/view_dependence effects/physical/vignetting"
     ),
     "effects/test_masked_evidence": (
-        "effects/inspection effects/observations effects/physical/conduction effects/physical/point_spread "
-        "effects/physical/thermal_opacity"
+        "effects/inspection effects/observations effects/physical/conduction effects/physical/point_spread"
     ),
     "effects/test_off_is_absent": "effects/physical/convection effects/physical/radiation effects/physical/solar",
     "io/test_tiff_and_pictures": "io/pictures io/tiff io/video",
@@ -78,7 +77,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 130  # modules; lower it when some go
+LONGEST = 129  # modules; lower it when some go
 
 
 def modules() -> list[str]:

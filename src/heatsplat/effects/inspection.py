@@ -69,6 +69,8 @@ class Inspection:
             bounds.span_k * fit.errors,
             fit.weights,
             fit.data.normals,
+            fit.data.tracks,
+            self.scene.points.double(),
         )
 
     @cached_property

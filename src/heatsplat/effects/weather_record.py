@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, Weather
-from heatsplat.effects.base import Evidence
 from heatsplat.effects.observations import Observations
 
 if TYPE_CHECKING:
-    from heatsplat.effects.inspection import Inspection
+    pass
 
 # What recorded weather takes the place of, and why: a heat source stands for drivers that nobody recorded.
 INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}
 QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
 MEAN_K = 290.0
-
-NEVER = math.inf  # threshold of effects that images do not tell apart yet: they are simulated where they are asked for
-
-
-def only_if_asked(inspected: Inspection) -> Evidence:
-    """Nothing: no test of images tells this effect from the others of a surface under the sky yet."""
-    return Evidence(None, "no test of images tells it yet: it is simulated where it is asked for", told=False)
 
 
 def directed(scene: SceneData) -> str | None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,17 +15,30 @@ from heatsplat.contracts import Weather
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of
+from heatsplat.effects.observations import Tracks
+from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
 from heatsplat.physics.responses import semi_infinite_weights
-from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.sky import emissivity_towards, optical_depth, sky_temperature_k
 from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
+
+if TYPE_CHECKING:
+    from heatsplat.effects.inspection import Inspection
 
 # Standard errors from which a gain on held-out observations is no chance, and below which it is; decibels that are none.
 SIGMAS, CHANCE = 3.0, 0.5
-MIN_DB, NOTHING_DB = 0.2, 0.05
+MIN_DB, NOTHING_DB, MUCH_DB = 0.2, 0.05, 0.5
 NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
+NO_SUN = "the record has no irradiance, or the sun does not shine in it"
+NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
 ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
+# What the scene's own geometry does, which is asked for beside all of these: shadows, light that comes back from the ground, sky
+# that is mirrored; and hidden sky, which shows where beams and diffuse light are taken in one measure (ONE_LIGHT).
+SHADOWS, ALBEDO, MIRRORED, SKY_VIEW, ONE_LIGHT = "shadows", "albedo", "mirrored_sky", "sky_view", "one light"
+SKY_PARTS = 64  # of the sky that are asked whether they are open
+NEIGHBOURS = 6  # of a point, of whose temperature it takes a share where heat flows between them
+FLOW = 0.5  # that share, as expected
 RATES_PER_S = [1.0 / (60.0 * minutes) for minutes in (5, 10, 20, 40, 80, 160, 320, 640, 1280)]
 DEEPER = 1.0 / 8.0  # rate of a body's core beside that of its surface
 OCTAVES = 10  # on each side of a body without an end, of rates of which it is a mean; what lies beyond, 2 %, counts at the ends
@@ -33,7 +47,9 @@ WINDS = (0.0, 0.5, 1.5)
 EXCHANGE_W_M2_K = 10.0  # typical; light and long waves are counted in what they add to a temperature at this exchange
 # What a body's own numbers are expected to be: its start in kelvin, and shares. Without expectations few frames would give
 # numbers that are none.
-EXPECTED = {"start": 10.0, "deep air": 0.5, "beam": 0.7, "diffuse": 0.7, "deep light": 0.5, "sky": 0.7}
+EXPECTED = {
+    "start": 10.0, "deep air": 0.5, "beam": 0.7, "diffuse": 0.7, "deep light": 0.5, "sky": 0.7, "ground": 0.2, "mirror": 0.1,
+}  # fmt: skip
 SHARE_OF = {"beam": 0, "diffuse": 0, "deep light": 0, "sky": 1}  # column of the shares that a number adds to
 # Least shares that are an effect: absorptivity or emissivity over exchange in units of 10 W/m²K. A dull surface in a strong wind
 # has 0.1 and more, bare metal 0.04 of long waves.
@@ -52,18 +68,57 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         return Evidence(None, why, told=False)
     gain = weathered.gain(name)
     found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
-    sure, large = gain.sigmas > SIGMAS and gain.db > MIN_DB, True
+    large = True
     if name in LEAST:
         share = weathered.shares[name]
         found, large = f"{found}; bodies take a share of {share:.2f}", share > LEAST[name]
-    if sure and large:
+    if name == "radiation" and not weathered.dark:
+        return weighed(gain, found, large, False, "more of them in the dark")
+    return weighed(gain, found, large)
+
+
+def around(inspected: Inspection, name: str) -> Evidence:
+    """Whether what one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW does explains observations better that balances of heat without
+    it were fitted to."""
+    weathered = inspected.weathered
+    if weathered is None:
+        return Evidence(None, inspected.obs.why or NO_BALANCE, told=False)
+    if name != MIRRORED and "solar" not in weathered.parts:
+        return Evidence(None, NO_SUN)
+    gain = weathered.beside(name)
+    if gain is None:
+        return Evidence(None, NO_LIGHT, told=False)
+    found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
+    if name == SHADOWS:  # which add no number to a balance: where there are none, they make it worse
+        return weighed(gain, found, least_db=NOTHING_DB)
+    # What balances miss is taken for these, which have numbers of their own: up to 0.5 dB where none of them is there.
+    return weighed(gain, found, least_db=MUCH_DB, nothing_db=MIN_DB)
+
+
+def weighed(
+    gain: HeldOut,
+    found: str,
+    large: bool = True,
+    can_be_none: bool = True,
+    needed: str = "",
+    least_db: float = MIN_DB,
+    nothing_db: float = NOTHING_DB,
+) -> Evidence:
+    """The evidence of what a balance gains on observations that were left out.
+
+    Args:
+        found: says that.
+        large: whether the effect is large enough to be one.
+        can_be_none: whether no gain says that there is none.
+        needed: frames that would tell; else their number, from how the gain scatters.
+        least_db, nothing_db: decibels that are a gain, and that are none.
+    """
+    if gain.sigmas > SIGMAS and gain.db > least_db and large:
         return Evidence(gain.sigmas, found, gain_db=gain.db)
-    nothing = gain.sigmas < CHANCE or gain.db < NOTHING_DB
-    if nothing and (name != "radiation" or weathered.dark):
+    if (gain.sigmas < CHANCE or gain.db < nothing_db) and can_be_none:
         return Evidence(min(gain.sigmas, CHANCE), found, gain_db=gain.db)
-    needed = math.ceil(gain.images * (SIGMAS / max(gain.sigmas, CHANCE)) ** 2)
-    what = "more of them in the dark" if name == "radiation" and not weathered.dark else f"about {needed}"
-    why = f"cannot be told from {gain.images} frames, {what} would tell"
+    needed = needed or f"about {math.ceil(gain.images * (SIGMAS / max(gain.sigmas, CHANCE)) ** 2)}"
+    why = f"cannot be told from {gain.images} frames, {needed} would tell"
     return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 
 
@@ -77,6 +132,8 @@ class Weathered:
         values: [P, F] temperatures in °C, without what the camera adds.
         errors, weights: [P, F] that are to be expected in kelvin, and 0 where a point is not seen.
         normals: [P, 3] of the surface, or None.
+        tracks: where the points are, and from where they are seen; None: what asks for that is not told.
+        around: [Q, 3] points of the scene, which stand in the way of light.
     """
 
     weather: Weather
@@ -85,6 +142,8 @@ class Weathered:
     errors: Tensor
     weights: Tensor
     normals: Tensor | None
+    tracks: Tracks | None = None
+    around: Tensor | None = None
 
     @property
     def nodes(self) -> int:
@@ -95,6 +154,45 @@ class Weathered:
     def gain(self, name: str) -> HeldOut:
         """What one of the parts gains beside the others."""
         return compared(self._whole, self.squares(self._others(name)), self.weights)
+
+    def beside(self, name: str) -> HeldOut | None:
+        """What one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW gains; None where nobody knows from where light comes, or how
+        surfaces face it."""
+        weather = self.weather
+        known = (self.normals, self.tracks, self.around, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
+        if any(one is None for one in known):
+            return None
+        less = (*self.parts, ONE_LIGHT) if name == SKY_VIEW else self.parts
+        return compared(self.squares((*less, name), True), self.squares(less, True), self.weights)
+
+    @cached_property
+    def follows(self) -> HeldOut:
+        """What balances gain over points that keep their level."""
+        fold, levels = fold_of(*self.values.shape), torch.zeros_like(self.values)
+        for k in range(FOLDS):
+            used = (self.weights > 0) * (fold != k) / self._variance
+            mean = (used * self.values).sum(1, keepdim=True) / used.sum(1, keepdim=True).clamp_min(1e-12)
+            levels = torch.where(fold == k, mean, levels)
+        return compared(self._whole, ((self.values - levels) ** 2 / self._variance).clamp(max=WORST), self.weights)
+
+    @cached_property
+    def flow(self) -> HeldOut | None:
+        """What points gain by a share of what they lack to the mean of their neighbours; None without neighbours."""
+        if self.tracks is None or len(self.values) <= NEIGHBOURS:
+            return None
+        points, fold = self.tracks.points, fold_of(*self.values.shape)
+        near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
+        apart, joined = torch.zeros_like(self.values), torch.zeros_like(self.values)
+        for k in range(FOLDS):
+            used = (self.weights > 0) * (fold != k)
+            left = self._best(self.parts, used, (self.wind,))[0]
+            lacking = (self.values - left)[near].mean(1) - (self.values - left)
+            over = used / self._variance
+            share = (over * lacking * left).sum(1) / ((over * lacking**2).sum(1) + 1.0 / FLOW**2)
+            apart = torch.where(fold == k, left, apart)
+            joined = torch.where(fold == k, left - share[:, None] * lacking, joined)
+        squares = [(left**2 / self._variance).clamp(max=WORST) for left in (joined, apart)]
+        return compared(*squares, self.weights)
 
     @cached_property
     def endless(self) -> tuple[HeldOut, HeldOut]:
@@ -124,21 +222,39 @@ class Weathered:
         }
         return (*(name for name in PARTS if known[name]), DEPTH)
 
-    def squares(self, parts: tuple[str, ...]) -> Tensor:
+    @property
+    def _variance(self) -> Tensor:
+        return self.errors**2 + MODEL_K**2
+
+    def squares(self, parts: tuple[str, ...], same_wind: bool = False) -> Tensor:
         """Squared errors [P, F], in squares of the expected ones, at observations that the balance with these parts was not
-        fitted to."""
+        fitted to.
+
+        Args:
+            same_wind: wind counts as it does in the balance of all observations.
+        """
         fold = fold_of(*self.values.shape)
-        found = torch.zeros_like(self.values)
+        left = torch.zeros_like(self.values)
         for k in range(FOLDS):
-            found = torch.where(fold == k, self._best(parts, self.weights * (fold != k))[0], found)
-        return found
+            winds = (self.wind,) if same_wind else WINDS
+            left = torch.where(fold == k, self._best(parts, self.weights * (fold != k), winds)[0], left)
+        return (left**2 / self._variance).clamp(max=WORST)
 
     @cached_property
     def shares(self) -> dict[str, float]:
         """What bodies take of light and of long waves, where they exchange 10 W/m²K with the air; medians over the points."""
         seen = self.weights.sum(1) > 0
-        light, waves = self._best(self.parts, self.weights)[1][seen].median(0).values.tolist()
+        light, waves = self._all[1][seen].median(0).values.tolist()
         return {"solar": light, "radiation": waves}
+
+    @property
+    def wind(self) -> float:
+        """What wind adds to the exchange, of WINDS, as all observations say."""
+        return self._all[2]
+
+    @cached_property
+    def _all(self) -> tuple[Tensor, Tensor, float]:
+        return self._best(self.parts, self.weights)
 
     @cached_property
     def dark(self) -> bool:
@@ -148,36 +264,38 @@ class Weathered:
         light = weather_record.at(self.weather, self.weather.irradiance_w_m2, self.times_s)
         return float((light < DARK_W_M2).double().mean()) >= DARK_FRAMES
 
-    def _best(self, parts: tuple[str, ...], weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared errors [P, F] and shares [P, 2] of the likeliest balance; each point has its own rate, all the same wind."""
+    def _best(
+        self, parts: tuple[str, ...], weights: Tensor, among: tuple[float, ...] = WINDS
+    ) -> tuple[Tensor, Tensor, float]:
+        """What the likeliest balance leaves in kelvin [P, F], shares [P, 2] and wind; each point has its own rate, all the same
+        wind."""
         found, least = None, math.inf
-        for winds in WINDS if "convection" in parts else WINDS[:1]:
-            squares, shares = torch.zeros_like(self.values), torch.zeros_like(self.values[:, :2])
+        for winds in among if "convection" in parts else WINDS[:1]:
+            left, shares = torch.zeros_like(self.values), torch.zeros_like(self.values[:, :2])
             costs = torch.full_like(self.values[:, 0], torch.inf)
             for number in range(len(RATES_PER_S)):
-                left, taken, cost = self._fitted(winds, number, parts, weights)
+                leaves, taken, cost = self._fitted(winds, number, parts, weights)
                 better = (cost < costs)[:, None]
-                squares, shares = torch.where(better, left, squares), torch.where(better, taken, shares)
+                left, shares = torch.where(better, leaves, left), torch.where(better, taken, shares)
                 costs = torch.minimum(cost, costs)
             if found is None or float(costs.sum()) < least:
-                found, least = (squares, shares), float(costs.sum())
+                found, least = (left, shares, winds), float(costs.sum())
         return found
 
     def _fitted(
         self, winds: float, number: int, parts: tuple[str, ...], weights: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Squared errors [P, F] of the likeliest numbers, shares of light and of long waves [P, 2] that these are, and how
-        unlikely they and the observations that count are [P].
+        """What the likeliest numbers leave [P, F], shares of light and of long waves [P, 2] that these are, and how unlikely
+        they and the observations that count are [P].
 
         No sky warms and no sun cools: what would need that is fitted without.
         """
         base, basis, names = self._responses(winds, number, parts)
-        variance = self.errors**2 + MODEL_K**2
-        values, used = self.values - base, (weights > 0) / variance
+        values, used = self.values - base, (weights > 0) / self._variance
         inner = torch.einsum("pf,pfi,pfj->pij", used, basis, basis) + torch.eye(basis.shape[2], dtype=basis.dtype)
         numbers = torch.linalg.solve(inner, torch.einsum("pf,pfi,pf->pi", used, basis, values))
-        squares = ((values - (basis @ numbers[..., None])[..., 0]) ** 2 / variance).clamp(max=WORST)
-        cost = (squares * (weights > 0)).sum(1) + (numbers**2).sum(1)
+        left = values - (basis @ numbers[..., None])[..., 0]
+        cost = ((left**2 / self._variance).clamp(max=WORST) * (weights > 0)).sum(1) + (numbers**2).sum(1)
         shares = torch.zeros_like(values[:, :2])
         for column, name in enumerate(names):
             if name in SHARE_OF:
@@ -186,19 +304,24 @@ class Weathered:
             if part in parts and bool((shares[:, place] < 0).any()):
                 less = self._fitted(winds, number, tuple(one for one in parts if one != part), weights)
                 possible = shares[:, place] >= 0
-                squares, cost = torch.where(possible[:, None], squares, less[0]), torch.where(possible, cost, less[2])
+                left, cost = torch.where(possible[:, None], left, less[0]), torch.where(possible, cost, less[2])
                 shares = torch.where(possible[:, None], shares, less[1])
-        return squares, shares, cost
+        return left, shares, cost
 
     def _responses(self, winds: float, number: int, parts: tuple[str, ...]) -> tuple[Tensor, Tensor, list[str]]:
         """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
-        courses = (self._endless if ENDLESS in parts else self._courses)[winds, number]
+        courses = self._endless if ENDLESS in parts else self._courses
+        light = next((name for name in (SHADOWS, SKY_VIEW, ONE_LIGHT) if name in parts), None)
+        courses = (courses if light is None else self._lit(light))[winds, number]
         names = ["start"]
-        names += ["beam", "diffuse"] if "solar" in parts else []
+        names += ["beam"] if "solar" in parts else []
+        names += ["diffuse"] if "solar" in parts and ONE_LIGHT not in parts else []
+        names += ["ground"] if "solar" in parts and ALBEDO in parts else []
         names += ["deep air"] if DEPTH in parts else []
         names += ["deep light"] if DEPTH in parts and "solar" in parts else []
         names += ["sky"] if "radiation" in parts else []
         basis = [(EXPECTED[name] * courses[name]).expand(len(self.values), -1) for name in names]
+        basis += [EXPECTED["mirror"] * self._mirrored] if MIRRORED in parts else []
         return courses["air"], torch.stack(basis, 2), names
 
     @cached_property
@@ -206,12 +329,59 @@ class Weathered:
         """Answers to air, light and sky at the frames' times by wind and rate, each [F] or [P, F]."""
         courses = {}
         for winds in WINDS:
-            near, start = self._answers(winds, RATES_PER_S)
-            deep, _ = self._answers(winds, [DEEPER * rate for rate in RATES_PER_S])
+            near, start = self._answers(self._drivers, winds, RATES_PER_S)
+            deep, _ = self._answers(self._drivers, winds, [DEEPER * rate for rate in RATES_PER_S])
             for number in range(len(RATES_PER_S)):
                 cores = {"deep air": deep[number, :, 0] - near[number, :, 0], "deep light": deep[number, :, 3]}
                 courses[winds, number] = _named(near[number], start[number]) | cores
+                if self._towards_ground is not None:
+                    courses[winds, number]["ground"] = self._towards_ground[:, None] * near[number, :, 3]
         return courses
+
+    @cached_property
+    def _towards_ground(self) -> Tensor | None:
+        """Share [P] of what surfaces face that lies below the horizon."""
+        return None if self.normals is None else 0.5 * (1.0 - self.normals @ self.weather.up)
+
+    def _lit(self, light: str) -> dict[tuple[float, int], dict[str, Tensor]]:
+        """``_courses``, for the wind that there is, where SHADOWS are cast, or where beams and diffuse light are taken in one
+        measure: ONE_LIGHT, or SKY_VIEW, where what stands around hides sky."""
+        if light not in self._variants:
+            weather = self.weather
+            beams = self._drivers[0][:, 4:]
+            if light == SHADOWS:
+                ways = sun_directions(weather.sun, weather.up)
+                lit = lit_beside(self.tracks.points, self.around, ways)
+                beams = beams * lit[:, (weather.sun @ ways.T).argmax(1)].T
+            else:
+                ways = sky_directions(SKY_PARTS, weather.up)
+                facing = (self.normals @ ways.T).clamp_min(0.0)
+                if light == SKY_VIEW:
+                    facing = facing * lit_beside(self.tracks.points, self.around, ways)
+                # Of an even sky a level surface takes all, a wall a half.
+                beams = beams + self._drivers[0][:, 2:3] * facing.mean(1) / (weather.up @ ways.T).mean()
+            drivers = torch.cat([self._drivers[0][:, :4], beams], 1)
+            near, _ = self._answers((drivers, self._drivers[1]), self.wind, RATES_PER_S)
+            self._variants[light] = {
+                (self.wind, number): self._courses[self.wind, number] | {"beam": near[number, :, 4:].T}
+                for number in range(len(RATES_PER_S))
+            }
+        return self._variants[light]
+
+    @cached_property
+    def _variants(self) -> dict[str, dict[tuple[float, int], dict[str, Tensor]]]:
+        return {}
+
+    @cached_property
+    def _mirrored(self) -> Tensor:
+        """By how much colder than the air what the points mirror looks [P, F], in kelvin."""
+        weather, normals = self.weather, self.normals[:, None]
+        air_k = kelvin(weather_record.at(weather, weather.air_c, self.times_s))
+        sky_k = weather_record.at(weather, self._sky_k, self.times_s)
+        out = self.tracks.directions
+        sine = (2.0 * (out * normals).sum(2, keepdim=True) * normals - out) @ weather.up
+        emissivity = emissivity_towards(optical_depth((sky_k / air_k) ** 4), sine)
+        return air_k * (emissivity**0.25 - 1.0)
 
     @cached_property
     def _endless(self) -> dict[tuple[float, int], dict[str, Tensor]]:
@@ -221,7 +391,7 @@ class Weathered:
         rates = [RATES_PER_S[-1] * 2.0**place for place in range(-OCTAVES, len(RATES_PER_S) + OCTAVES)]
         courses = {}
         for winds in WINDS:
-            near, start = self._answers(winds, rates)
+            near, start = self._answers(self._drivers, winds, rates)
             for number, rate in enumerate(RATES_PER_S):
                 distances = torch.tensor([math.log(other / rate) for other in rates], dtype=torch.float64)
                 counts = semi_infinite_weights(distances, octave)
@@ -235,10 +405,7 @@ class Weathered:
         zero = torch.zeros_like(weather.times_s)
         wind = zero + 1.0 if weather.wind_m_s is None else weather.wind_m_s / weather.wind_m_s.mean().clamp_min(0.1)
         light = zero if weather.irradiance_w_m2 is None else weather.irradiance_w_m2
-        air_k = kelvin(weather.air_c)
-        law = "swinbank" if weather.humidity_percent is None else "brutsaert"
-        sky_k = sky_temperature_k(air_k, weather.humidity_percent, law)
-        net = STEFAN_BOLTZMANN * (sky_k**4 - air_k**4)
+        net = STEFAN_BOLTZMANN * (self._sky_k**4 - kelvin(weather.air_c) ** 4)
         beam, diffuse = light[:, None], zero
         if self.normals is not None and weather.direct_w_m2 is not None and weather.sun is not None:
             beam = weather.direct_w_m2[:, None] * (weather.sun @ self.normals.T).clamp_min(0.0)
@@ -246,13 +413,21 @@ class Weathered:
         power = torch.cat([net[:, None], diffuse[:, None], light[:, None], beam], 1) / EXCHANGE_W_M2_K
         return torch.cat([weather.air_c[:, None], power], 1), wind
 
-    def _answers(self, winds: float, rates_per_s: Sequence[float]) -> tuple[Tensor, Tensor]:
+    @cached_property
+    def _sky_k(self) -> Tensor:
+        humidity = self.weather.humidity_percent
+        return sky_temperature_k(kelvin(self.weather.air_c), humidity, "swinbank" if humidity is None else "brutsaert")
+
+    def _answers(
+        self, drivers: tuple[Tensor, Tensor], winds: float, rates_per_s: Sequence[float]
+    ) -> tuple[Tensor, Tensor]:
         """u' = rate · gain · driver - rate · exchange · u at the frames' times [R, F, d], from rest; and the decay [R, F] from 1.
 
         Args:
+            drivers: as ``_drivers``.
             rates_per_s: R rates at the mean exchange.
         """
-        drivers, wind = self._drivers
+        drivers, wind = drivers
         times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
         exchange = (1.0 + winds * wind) / (1.0 + winds)
         # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.

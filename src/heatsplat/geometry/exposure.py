@@ -10,6 +10,7 @@ import math
 import torch
 from torch import Tensor
 
+CELL, BEHIND = 1.5, 4.0  # side of a cell and least distance of what hides a point, in distances between points
 APART = math.radians(1.25)  # of directions of the sun: five minutes of its way
 
 
@@ -38,3 +39,22 @@ def open_share(normals: Tensor, directions: Tensor, seen: Tensor) -> Tensor:
     """
     weights = (normals @ directions.T.to(normals)).clamp(min=0.0)
     return (weights * seen).sum(1) / weights.sum(1).clamp(min=1e-6)
+
+
+def lit_beside(points: Tensor, others: Tensor, directions: Tensor) -> Tensor:
+    """Which points [P, 3] are lit from directions [D, 3] where others [Q, 3] stand in the way: [P, D] of 1 and 0.
+
+    Others count as squares across the light, 1.5 times as wide as they are apart in the median; a surface does not shade itself:
+    what lies within four such distances hides nothing. The scene's splatted depth (``training.exposure``) is finer.
+    """
+    apart = torch.cdist(points, others).topk(2, largest=False).values[:, 1].median().clamp(min=1e-9)
+    found = []
+    for direction in directions:
+        aside = torch.linalg.svd(direction[None]).Vh[1:].T
+        places = torch.cat([others @ aside, points @ aside]) / (CELL * apart)
+        cells = (places - places.amin(0)).long()
+        cells = cells[:, 0] * (int(cells[:, 1].max()) + 1) + cells[:, 1]
+        nearest = torch.full((int(cells.max()) + 1,), -math.inf, dtype=points.dtype)
+        nearest.scatter_reduce_(0, cells[: len(others)], others @ direction, "amax")
+        found.append((nearest[cells[len(others) :]] - points @ direction <= BEHIND * apart).to(points))
+    return torch.stack(found, 1) if found else points.new_zeros(len(points), 0)

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from heatsplat.contracts import check_option
 from heatsplat.physics.units import celsius
 
+DIFFUSIVITY = 1.66  # slants of the whole hemisphere count as this one (Elsasser 1942)
+LOWEST_SINE = 0.02  # of the height above the horizon; below, air is seen as far as it goes
 LAWS = ("brutsaert", "berdahl_martin", "brunt", "swinbank")
 
 
@@ -52,3 +55,14 @@ def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str) 
         dew = dew_point_c(vapour)
         emissivity = 0.711 + 0.0056 * dew + 0.000073 * dew * dew
     return air_k * emissivity.clamp(max=1.0) ** 0.25
+
+
+def optical_depth(emissivity: Tensor) -> Tensor:
+    """Of air to the zenith, where the whole sky has this emissivity."""
+    return -(1.0 - emissivity).clamp(min=1e-6).log() / DIFFUSIVITY
+
+
+def emissivity_towards(depth: Tensor, sine: Tensor) -> Tensor:
+    """Emissivity of air of an optical depth to the zenith towards heights of these sines above the horizon; at and below it 1."""
+    away = -torch.expm1(-depth / sine.clamp(min=LOWEST_SINE))
+    return torch.where(sine > 0, away, 1.0)

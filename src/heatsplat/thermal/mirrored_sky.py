@@ -17,9 +17,6 @@ from heatsplat.thermal.base import SKY_SEEN, PerGaussian, Query, Seeds, surface_
 from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.part import HeatPart
 
-DIFFUSIVITY = 1.66  # slants of the whole hemisphere count as this one (Elsasser 1942)
-LOWEST_SINE = 0.02  # of the height above the horizon; below, air is seen as far as it goes
-
 
 class MirroredSky(HeatPart):
     """T⁴ becomes (1 - ρ) T⁴ + ρ L: Kirchhoff's law for an opaque body under the sky of the weather record.
@@ -78,21 +75,20 @@ class MirroredSky(HeatPart):
         mirrored = sight - 2 * (sight * normals).sum(1, keepdim=True) * normals
         sine = mirrored @ self._weather.up.to(mirrored)
         air_k, depth = self._air(query.time_s)
-        away = -torch.expm1(-depth / sine.clamp(min=LOWEST_SINE))
-        seen = (sine > 0).to(away)
+        emissivity = sky.emissivity_towards(depth, sine)
         if SKY_SEEN in splats:
-            seen = seen * query.rows(splats[SKY_SEEN].detach())
-        return (air_k / 100.0) ** 4 * (1 - seen * (1 - away))
+            emissivity = 1 - query.rows(splats[SKY_SEEN].detach()) * (1 - emissivity)
+        return (air_k / 100.0) ** 4 * emissivity
 
-    def _air(self, time_s: float) -> tuple[float, float]:
+    def _air(self, time_s: float) -> tuple[float, Tensor]:
         """Temperature of the air in kelvin and its optical depth to the zenith."""
         now = self._weather.at(time_s)
         humid = now.humidity_percent is not None
         law = ("brutsaert" if humid else "swinbank") if self.law == "auto" else self.law
         air_k = torch.tensor(kelvin(now.air_c), dtype=torch.float64)
         humidity = torch.tensor(now.humidity_percent, dtype=torch.float64) if humid else None
-        emissivity = float((sky.sky_temperature_k(air_k, humidity, law) / air_k) ** 4)
-        return float(air_k), -math.log(max(1.0 - emissivity, 1e-6)) / DIFFUSIVITY
+        emissivity = (sky.sky_temperature_k(air_k, humidity, law) / air_k) ** 4
+        return float(air_k), sky.optical_depth(emissivity)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         return {"sky_reflectance": query.rows(splats["sky_reflectance_logit"]).sigmoid()}

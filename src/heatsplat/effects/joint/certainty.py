@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
+from heatsplat.effects.joint.courses import ANY, common_courses
+from heatsplat.effects.joint.data import MIN_FREE
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.held_out import HeldOut, compared, shuffled, squares_of
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
-from heatsplat.effects.joint.selection import grown, worthwhile
+from heatsplat.effects.joint.selection import candidates, grown, worthwhile
+from heatsplat.effects.joint.terms import Own
 from heatsplat.training.rng import generator_for
 
 # What an effect must bring on held-out observations: less is no loss, and within the scatter of the images it is chance.
 MIN_DB, MIN_SIGMAS = 0.3, 3.5
+NOTHING_DB, NOTHING_SIGMAS = 0.1, 1.0  # below either of which there is nothing
 SHUFFLES, NO_CHANCE = 8, 30.0  # gains from which it is not asked whether chance makes as much
 # Nine tenths of the points in the most even third are explained to within so many times the expected error: nothing is left
 # for another effect. At edges poses err.
 EXPLAINED, OF_POINTS, EVEN = 1.6, 0.9, 0.33
+
+ROUGH = "heat that goes another way than the weather record says may do it; more frames would tell"
+LIKE_HEAT = 0.9  # share of the variance of a course over time that heat explains from which it may be heat
+COURSES = 2  # that points share stand for any change of a scene
+
+
+@dataclass(frozen=True)
+class AnyChange:
+    """In the joint fit in the place of an effect: courses over time of which each point has its own measure."""
+
+    term: Own
+    stands_on: None = None
 
 
 @dataclass(frozen=True)
@@ -36,6 +54,11 @@ class Worth:
     doubt: str = ""
 
 
+def shows(gain: HeldOut) -> bool:
+    """Whether what is gained on held-out observations may be more than nothing."""
+    return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
+
+
 class Certainty:
     """What can be told from a joint fit.
 
@@ -44,7 +67,11 @@ class Certainty:
     """
 
     def __init__(self, fit: Fit, model: Model) -> None:
-        self.fit, self.model = fit, model
+        change = AnyChange(
+            Own(basis=lambda at, count: common_courses(at, Model(), count), kinds=lambda at: (), in_time=True)
+        )
+        self.fit = replace(fit, data=replace(fit.data, effects={**fit.data.effects, ANY: change}))
+        self.model = model
         self._squares: dict[Model, Tensor] = {}
         self._worths: dict[tuple[Model, Model], Worth] = {}
 
@@ -53,32 +80,54 @@ class Certainty:
         """Why nobody can tell whether an effect is there, by name: of those taken in, and of those that may be there instead."""
         found = {name: self.worth(name).doubt for name in sorted(self.model.names)}
         found = {name: doubt for name, doubt in found.items() if doubt}
+        sure = self.model.minus(found)  # of which each has to be clear without those that are not
+        for name in sorted(sure.names) if found else ():
+            in_time = self.fit.data.effects[name].term.in_time
+            if not in_time and not self._beside_changes(name, sure, self.fit.without(sure, name)):
+                found[name] = self.unseen_changes or ROUGH
         for name in sorted(self.model.names):
             for rivals in self.fit.data.effects[name].term.rivals:
-                if self._outdoes(name, rivals):
+                if not self._counts(name) or self._outdoes(name, rivals):
                     continue
                 found[name] = f"{' and '.join(rivals)} would explain the images as well; more frames would tell"
                 for rival in set(rivals) - self.model.names:
                     found.setdefault(rival, f"it would explain the images as well as {name}")
-        if not found:
-            return found
-        names = " and ".join(name for name in found if name in self.model.names)
-        for name in self._instead_of(found):
+        doubted = sorted(found.keys() & self.model.names)
+        names = " and ".join(doubted)
+        for name in self._instead_of(doubted):
             found.setdefault(name, f"it goes or comes with {names}, which nobody can tell from these images")
         return found
+
+    def idle(self, name: str, more: Model, less: Model) -> bool:
+        """Whether nothing is lost without an effect: it gains nothing on held-out observations, nor does any course over time in
+        its place; or it is a camera's change of single images that gains little and fails what such a change has to meet."""
+        worth, term = self.worth(name, more, less), self.fit.data.effects[name].term
+        if term.in_time:
+            return not shows(worth.held_out) and not any(self._shows(one, less) for one in self._changing(less))
+        return not shows(worth.held_out) or term.single_images and bool(worth.doubt) and worth.held_out.db < MIN_DB
+
+    def _counts(self, name: str) -> bool:
+        """Whether a selected effect gains so much on held-out observations that something would have to take its place."""
+        return self._compared(self.model, self.fit.without(self.model, name)).db > MIN_DB
 
     def worth(self, name: str, more: Model | None = None, less: Model | None = None) -> Worth:
         """What is known of an effect; ``more`` and ``less`` are the models with and without it, those of the selection."""
         more = self.model if more is None else more
         less = self.fit.without(more, name) if less is None else less
         if (more, less) not in self._worths:
-            held_out = compared(self._squares_of(more), self._squares_of(less), self.fit.weights)
+            held_out = self._compared(more, less)
             self._worths[more, less] = Worth(held_out, self._doubt(name, more, less, held_out))
         return self._worths[more, less]
 
     def undecided(self, more: Model, name: str) -> bool:
         """Whether an effect that was left out is worth what it costs, though not by enough to be taken in."""
         return self.fit.gain(more, self.model) > 1.0 and worthwhile(self.fit, more, self.model, name)
+
+    def clear(self, more: Model, name: str) -> bool:
+        """Whether an effect that was left out for its size is clear on held-out observations, and no small thing but beside what
+        the scene does by itself."""
+        large = self.fit.effect_size(more, self.model) >= self.fit.data.effects[name].term.smallest
+        return large and self._is_clear(more, self.model) and self._beside_changes(name, more, self.model)
 
     @cached_property
     def explained(self) -> bool:
@@ -95,8 +144,14 @@ class Certainty:
         return bool(left[slopes <= slopes.quantile(EVEN)].quantile(OF_POINTS) < EXPLAINED)
 
     def few(self, name: str) -> str:
-        """That the record has too few frames to tell an effect, and how many are needed; empty where it has enough."""
-        return "" if self.explained else self._lacking(name)
+        """That the record has too few frames to tell an effect that was left out, and how many are needed; empty where it has
+        enough, and where nothing is left that it could explain."""
+        if self.explained or not (lacking := self._lacking(name)):
+            return ""
+        if self.fit.data.effects[name].term.in_time:
+            return lacking if self._changes else ""
+        tried = [more for other, more in candidates(self.fit, self.model) if other == name]
+        return lacking if not tried or any(self._shows(more, self.model) for more in tried) else ""
 
     @cached_property
     def unseen_changes(self) -> str:
@@ -104,7 +159,9 @@ class Certainty:
         effects = self.fit.data.effects.items()
         changing = [name for name, one in effects if one.term.in_time and name not in self.model.names]
         why = [(name, lacking) for name in changing if (lacking := self._lacking(name))]
-        return f"it may as well be {' or '.join(name for name, _ in why)}: {why[-1][1]}" if why else ""
+        if not why or self.explained or not self._changes:
+            return ""
+        return f"it may as well be {' or '.join(name for name, _ in why)}: {why[-1][1]}"
 
     def _lacking(self, name: str) -> str:
         data = self.fit.data
@@ -113,12 +170,55 @@ class Certainty:
             return ""
         return f"of {data.frames} frames {data.usual_length:.0f} see a point, and {needed} are needed"
 
+    @cached_property
+    def _changes(self) -> bool:
+        """Whether courses over time explain what was left out beside the model, or cannot be asked for."""
+        changing = self._changing(self.model)
+        return not changing or any(self._shows(one, self.model) for one in changing)
+
+    def beside_weather(self, model: Model) -> Model:
+        """The model in a scene that changes in any way, where a weather record says roughly in which."""
+        return [model, *(self._changing(model) if self.fit.data.drivers is not None else ())][-1]
+
+    def _changing(self, model: Model) -> list[Model]:
+        """The model in a scene that changes in any way, with one common course and with more; none where points are seen in too
+        few frames to ask that."""
+        free = int(self.fit.data.usual_length) - self.fit.own_basis(model).shape[2] - MIN_FREE
+        return [model.plus(ANY, count) for count in range(1, min(free, COURSES) + 1)]
+
+    def _is_clear(self, more: Model, less: Model) -> bool:
+        """Whether one model explains what was left out clearly better than another."""
+        gain = self._compared(more, less)
+        return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
+
+    def _shows(self, more: Model, less: Model) -> bool:
+        return shows(self._compared(more, less))
+
+    def _compared(self, more: Model, less: Model) -> HeldOut:
+        return compared(self._squares_of(more), self._squares_of(less), self.fit.weights)
+
+    def _beside_changes(self, name: str, more: Model, less: Model) -> bool:
+        """Whether an effect is clear however the scene may change, where its changes are not known well: a camera's change of
+        single images explains them as well as any course over time of which each point has its own measure would, and other
+        effects gain beside that."""
+        if ANY in less.names or self.fit.data.drivers is None and not self.unseen_changes:
+            return True
+        changing = self._changing(less)
+        if self.fit.data.effects[name].term.single_images:
+            if self.unseen_changes and self.fit.data.drivers is not None:
+                return False  # surfaces under the sky change alike
+            return bool(changing) and all(self._compared(more, one).db > 0 for one in changing)
+        return bool(changing) and all(self._is_clear(more.plus(ANY, one.kind(ANY)), one) for one in changing)
+
     def _doubt(self, name: str, more: Model, less: Model, held_out: HeldOut) -> str:
         fit, term = self.fit, self.fit.data.effects[name].term
-        if self.unseen_changes and not term.in_time and not self.explained:
-            return self.unseen_changes
-        if not all(rule(fit, more, less) for rule in term.told_by):
-            return "what images have in common is not common to all points; more frames would tell heat from the camera"
+        if not term.in_time and not self._beside_changes(name, more, less):
+            return self.unseen_changes or ROUGH
+        if self._like_heat(name):
+            return "it goes over time as a scene may that cools or warms; frames that come back to a place later would tell"
+        for rule, why in term.told_by:
+            if not rule(fit, more, less):
+                return why
         if held_out.sigmas < MIN_SIGMAS and held_out.db > 0:
             needed = math.ceil(held_out.images * (MIN_SIGMAS / max(held_out.sigmas, 0.5)) ** 2)
             return f"what it gains scatters over the images as much as chance would; about {needed} frames would tell"
@@ -132,11 +232,33 @@ class Certainty:
                 return "images that are shuffled gain as much; more frames, or less noise, would tell"
         return ""
 
+    def _like_heat(self, name: str) -> bool:
+        """Whether what single images have in common goes a way over time that a scene by itself may go, and none does."""
+        data, model = self.fit.data, self.model
+        if not data.effects[name].term.single_images or data.span_s <= 0:
+            return False
+        known = [
+            one for one, e in data.effects.items() if e.term.in_time and one != ANY and not e.term.numbers(data, 1)
+        ]
+        if not known or set(known) & model.names:
+            return False
+        ones = torch.ones(data.frames, 1, dtype=torch.float64)
+        basis = torch.cat([ones, *(self.fit.basis(one, 1) for one in known)], 1)
+        added = self.fit.contributions(model)[name] * (self.fit.weights > 0)
+        course = torch.linalg.svd(added, full_matrices=False).Vh[0]
+        left = course - basis @ torch.linalg.lstsq(basis, course).solution
+        free = data.frames - basis.shape[1]
+        share = float((left**2).sum()) / max(free, 1) / float(course.var())
+        return free <= 0 or share < 1.0 - LIKE_HEAT
+
     def _outdoes(self, name: str, rivals: tuple[str, ...]) -> bool:
         """Whether a selected effect is clearly better than others in its place; so it is where those cannot be had."""
         other = self.fit.without(self.model, name)
         if set(rivals) <= other.names:
             return True
+        in_time = any(one in rivals and effect.term.in_time for one, effect in self.fit.data.effects.items())
+        if in_time and not all(self._is_clear(self.model, one) for one in self._changing(other)):
+            return False
         fit = self.fit.linearised(other)
         for rival in (one for one in rivals if one not in other.names):
             kinds = fit.data.effects[rival].term.kinds(fit) if rival in fit.data.effects else ()
@@ -144,20 +266,29 @@ class Certainty:
                 return True
             other = other.plus(rival, kinds[-1])
             fit = fit.linearised(other)
-        gain = compared(self._squares_of(self.model), self._squares_of(other), self.fit.weights)
-        return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
+        return self._is_clear(self.model, other)
 
-    def _instead_of(self, doubts: dict[str, str]) -> set[str]:
-        """Effects that come or go when those that are doubted go: heat and cameras change images alike."""
+    def _instead_of(self, doubts: Collection[str]) -> set[str]:
+        """Effects that come or go when those that are doubted go, and explain about as much: heat and cameras change images
+        alike."""
         effects, less = self.fit.data.effects, self.model
         for name in doubts:
             less = self.fit.without(less, name)
-        _, other = grown(self.fit.accepted(less), less, [name for name in effects if name not in doubts])
-        found = set(other.names ^ self.model.names)
-        if any(effects[name].term.single_images for name in doubts):
-            found |= {name for name, one in effects.items() if one.term.in_time}
-        if any(effects[name].term.in_time for name in doubts):
-            found |= {name for name, one in effects.items() if one.term.single_images}
+        found = set()
+        counts = any(self._counts(name) for name in doubts)
+        if counts:
+            start = self.fit.accepted(less)
+            _, other = grown(start, less, [name for name in effects if name not in doubts])
+            found = set() if self._is_clear(self.model, other) else set(other.names ^ self.model.names)
+            for name, more in candidates(start, less):
+                asked = name not in self.model.names | found
+                if asked and start.gain(more, less) > 1.0 and worthwhile(start, more, less, name):
+                    found |= set() if self._is_clear(self.model, more) else {name}
+        there = self._shows if counts else self._is_clear
+        changing = self._changing(less) if doubts else []
+        heat = bool(doubts) and not changing or any(self._like_heat(name) for name in doubts)
+        if heat or any(there(one, less) and not self._is_clear(self.model, one) for one in changing):
+            found |= {name for name, one in effects.items() if one.term.in_time} - {ANY, *self.model.names}
         return found
 
     def _squares_of(self, model: Model) -> Tensor:

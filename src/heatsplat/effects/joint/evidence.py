@@ -33,6 +33,9 @@ def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
     if gain > 1.0 and certainty.unseen_changes and not certainty.explained:
         return Evidence(gain, f"{sentence} {beside(size)}: cannot be told, {certainty.unseen_changes}", told=False)
     if gain > 1.0 and not worthwhile(fit, best, model, name):
+        if certainty.clear(best, name):
+            why = "it may be how the model of the scene's changes errs; more frames would tell"
+            return Evidence(gain, f"{sentence} {beside(size)}: cannot be told, {why}", told=False)
         return Evidence(0.0, f"{sentence} {beside(size)}, too little beside the noise or the changes of the scene")
     if earns(fit, best, model, name):
         return Evidence(0.0, f"{sentence} {beside(size)}, which the effects that are on explain as well")
@@ -43,11 +46,13 @@ def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
 
 def judged(inspected: Inspection, name: str, sentence: str, more: Model, less: Model) -> Evidence:
     """What an effect gains that was taken in, and whether that can be told from chance."""
-    fit, model = inspected.joint
+    fit = inspected.certainty.fit
     gain, size = fit.gain(more, less), fit.effect_size(more, less)
     worth = inspected.certainty.worth(name, more, less)
     doubt = worth.doubt or inspected.certainty.doubts.get(name, "")
     found = f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost, {worth.held_out.db:.1f} dB where left out"
+    if inspected.certainty.idle(name, more, less):
+        return Evidence(0.0, f"{found}: nothing is lost without it", gain_db=worth.held_out.db)
     return Evidence(
         gain, f"{found}: cannot be told, {doubt}" if doubt else found, told=not doubt, gain_db=worth.held_out.db
     )

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from heatsplat.effects.joint.courses import ANY
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 
@@ -100,5 +101,6 @@ def worthwhile(fit: Fit, more: Model, less: Model, name: str) -> bool:
     if size < term.smallest or not all(rule(fit, more, less) for rule in term.rules):
         return False
     at_rest = fit.at_rest(less)
-    share = term.beside_changes if fit.data.drivers is None else BESIDE_WEATHER
+    rough = fit.data.drivers is not None and ANY not in less.names
+    share = BESIDE_WEATHER if rough else term.beside_changes
     return at_rest == less or size > share * fit.effect_size(less, at_rest)

@@ -53,7 +53,8 @@ class Term:
         single_images: whether its numbers belong to single images.
         rivals: effects by name, one or several together, that look so much like it that it has to outdo them on held-out
             observations to be told.
-        told_by: rules that it has to meet to be told, beside those by which it is taken in.
+        told_by: rules that it has to meet to be told, beside those by which it is taken in, and what it is that does not meet
+            them.
         sensor_first: whether one way of the selection tries it before the other effects.
         smallest: its size in expected errors below which it is left out.
         beside_changes: in a scene that changes, the share of its changes that its size must exceed.
@@ -69,7 +70,7 @@ class Term:
     in_time: bool = False
     single_images: bool = False
     rivals: Sequence[tuple[str, ...]] = ()
-    told_by: Sequence[Callable[[Fit, Model, Model], bool]] = ()
+    told_by: Sequence[tuple[Callable[[Fit, Model, Model], bool], str]] = ()
     sensor_first: bool = False
     smallest: float = SMALLEST
     beside_changes: float = 0.0

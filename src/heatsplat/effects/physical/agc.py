@@ -12,7 +12,7 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
-from heatsplat.effects.physical.frame_offset import common_to_all, in_common
+from heatsplat.effects.physical.frame_offset import NOT_COMMON, common_to_all, in_common
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -50,8 +50,8 @@ EFFECT = Effect(
         kinds=lambda fit: (1,),
         numbers=lambda data, kind: data.frames - 1,
         single_images=True,
-        rivals=(("frame_offset", "tone"), ("attenuation",)),
-        told_by=(common_to_all,),
+        rivals=(("frame_offset", "tone"), ("attenuation",), ("frame_offset", "attenuation")),
+        told_by=((common_to_all, NOT_COMMON),),
         rich=lambda data: 1,
         beside_changes=0.1,
         rules=(in_common,),

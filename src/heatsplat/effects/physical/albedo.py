@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from heatsplat.effects.base import Effect, Part
-from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
+from heatsplat.effects.weather_record import directed
+from heatsplat.effects.weathered import ALBEDO, SIGMAS, around
 
 EFFECT = Effect(
     name="albedo",
@@ -13,9 +16,9 @@ EFFECT = Effect(
     source="Oke (1987)",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="what the ground sends back does not show",
-    threshold=NEVER,
+    threshold=SIGMAS,
     adds="one driver",
-    evidence=only_if_asked,
+    evidence=partial(around, name=ALBEDO),
     part=Part("state", "energy_balance", off={"albedo": None}),
     stands_on="solar",
     missing=directed,

@@ -13,8 +13,10 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
 
+EVEN = "even"  # a share that each image loses from near and far alike
 MAX_DEPTH = 3.0  # optical depth at the typical distance
 
 
@@ -50,16 +52,26 @@ def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
     logs = torch.where(clear, excess.abs(), torch.ones_like(excess)).log()
     typical = float((tracks.distances * tracks.weights).sum() / tracks.weights.sum())
     columns = (tracks.distances / typical)[..., None]
-    if kind == "varying":
+    if kind == EVEN:
+        columns = torch.ones_like(columns)
+    if kind in ("varying", EVEN):
         columns = columns * torch.eye(fit.data.frames, dtype=excess.dtype)
     products = fit.gram(basis, torch.cat([logs[..., None], columns], 2), weights * excess**2 * clear)
     ridge = 1e-8 * products.diagonal()[1:].mean().clamp_min(1e-300) * torch.eye(columns.shape[2], dtype=products.dtype)
     depths = -torch.linalg.solve(products[1:, 1:] + ridge, products[1:, 0])
+    if kind == EVEN:
+        depths = depths - depths.min()  # what all images lose, points lack themselves
     return torch.exp(-(columns @ depths.clamp(0.0, MAX_DEPTH)))  # air only takes away
 
 
 def numbers(data: Data, kind: object) -> int:
-    return data.frames if kind == "varying" else 1
+    return 1 if kind == "constant" else data.frames
+
+
+def with_distance(fit: Fit, more: Model, less: Model) -> bool:
+    """Whether a share that goes with distance explains more than one that each image loses from near and far alike, as where a
+    lamp heats all."""
+    return fit.quality(more).bic < fit.quality(more.plus("attenuation", EVEN)).bic
 
 
 def kinds(fit: Fit) -> Sequence[object]:
@@ -84,6 +96,9 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=numbers,
         rivals=(("relaxation", "harmonic_source"),),
+        told_by=(
+            (with_distance, "near and far points lose alike, as where a lamp heats all; other distances would tell"),
+        ),
         smallest=0.2,  # misplaced points go with distance a little
     ),
 )

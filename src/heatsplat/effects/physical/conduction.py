@@ -10,11 +10,13 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
+from heatsplat.effects.weathered import CHANCE, MIN_DB, NO_BALANCE
 
 NEIGHBOURS = 6
 MIN_POINTS, MIN_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
 # How much faster than levels contrasts must fade: bodies of one level but two rates look a little like it.
 FASTER = 1.35
+UNSURE = (0.5, 2.0)  # statistics between which sheets of two rates and weak flows are alike
 LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 
 
@@ -28,8 +30,7 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(None, obs.why or "no point can be followed over time")
     fit, model = inspected.joint
     if fit.data.drivers is not None:
-        why = "levels follow the weather, so that nobody knows how fast they would fade by themselves"
-        return Evidence(None, f"cannot be told: {why}", told=False)
+        return _in_weather(inspected)
     if "relaxation" not in model.names or "harmonic_source" in model.names:
         if "harmonic_source" in model.names:
             return Evidence(None, "cannot be told: a source hides how contrasts fade", told=False)
@@ -53,10 +54,23 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(None, f"cannot be told: {why}", told=False)
     still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
     rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
-    return Evidence(
-        (rate - 1.0) / (FASTER - 1.0),
-        f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}",
-    )
+    statistic = (rate - 1.0) / (FASTER - 1.0)
+    found = f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}"
+    if UNSURE[0] < statistic < UNSURE[1]:
+        return Evidence(statistic, f"{found}: cannot be told, bodies of two rates would do that as well", told=False)
+    return Evidence(statistic, found)
+
+
+def _in_weather(inspected: Inspection) -> Evidence:
+    """Whether points lean to their neighbours. Levels follow the weather, so that nobody knows how fast they would fade by
+    themselves; what is common to neighbours may be what a balance misses of both."""
+    gain = None if inspected.weathered is None else inspected.weathered.flow
+    if gain is None:
+        return Evidence(None, inspected.obs.why or NO_BALANCE, told=False)
+    found = f"a share of what points lack to their neighbours gains {gain.db:.2f} dB where left out"
+    if gain.sigmas < CHANCE or gain.db < MIN_DB:
+        return Evidence(0.0, found)
+    return Evidence(None, f"{found}: cannot be told, a balance may err alike for neighbours", told=False)
 
 
 def early_and_late(fit: Fit, model: Model) -> tuple[Tensor, Tensor, Tensor]:

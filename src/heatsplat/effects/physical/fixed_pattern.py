@@ -29,10 +29,10 @@ def evidence(inspected: Inspection) -> Evidence:
     part is left to vignetting."""
     if inspected.joint is None:
         return Evidence(None, inspected.obs.why)
-    fit, model = inspected.joint
+    fit, model = inspected.certainty.fit, inspected.joint[1]
     if not fit.data.moves:
         return Evidence(None, STILL)
-    none = model.minus({"fixed_pattern", "vignetting"})
+    none = inspected.certainty.beside_weather(model.minus({"fixed_pattern", "vignetting"}))
     share, gain = vignetting.falloff(fit, none)
     fades = share < vignetting.MIN_FALLOFF and gain > vignetting.EFFECT.threshold
     less = none.plus("vignetting") if fades else none

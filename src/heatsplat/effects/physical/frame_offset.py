@@ -16,6 +16,7 @@ from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
 
+NOT_COMMON = "what images have in common is not common to all points; more frames would tell heat from the camera"
 IN_COMMON = 0.15  # share of what half of the points leave that the other half has to explain
 
 
@@ -84,7 +85,7 @@ EFFECT = Effect(
         kinds=lambda fit: (1,),
         numbers=lambda data, kind: data.frames - 1,
         single_images=True,
-        told_by=(common_to_all,),
+        told_by=((common_to_all, NOT_COMMON),),
         rich=lambda data: 1,
         starts=starts,
         sensor_first=True,

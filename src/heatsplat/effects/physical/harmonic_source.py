@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.courses import common_courses
 from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
-from heatsplat.effects.joint.least_squares import RIDGE, own_part, own_weights
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
 from heatsplat.effects.physical import relaxation
@@ -22,13 +21,14 @@ from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
 # Courses over time that points share: one source and bodies that follow it more or less slowly need a few.
 COURSES = (1, 2, 3)
-SWEEPS = 4  # of alternating least squares for them
 HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether something drives the scene, and how many harmonics say how."""
     beside = "any relaxation" if inspected.scene.weather is None else "what the weather does"
+    if inspected.scene.weather is not None and not selected_kind(inspected, "harmonic_source"):
+        return Evidence(0.0, "the recorded weather stands for what drives the scene")
     found = gained(inspected, "harmonic_source", f"points depart from {beside} by")
     count = selected_kind(inspected, "harmonic_source")
     return found if count is None else replace(found, settings={"frequencies": harmonics(inspected, count)})
@@ -47,29 +47,6 @@ def allowed(data: Data) -> list[int]:
 
 def rich(data: Data) -> int | None:
     return COURSES[0] if relaxation.rich(data) and COURSES[0] in allowed(data) else None
-
-
-def courses(fit: Fit, count: int) -> Tensor:
-    """Courses over time [F, count] by which points depart from relaxation, each in its own measure.
-
-    Whatever drives the scene: the leading directions of what relaxation leaves, by alternating least squares.
-    """
-    values = fit.data.tracks.values - sum(fit.known.values())
-    decaying = fit.own_basis(Model.of(relaxation=1))
-    left = (values - own_part(decaying, values, fit.weights)) * (fit.weights > 0)
-    weights = fit.weights / fit.trust[:, None]
-    scale = weights.sum(1).clamp_min(1e-300)[:, None]
-    _, found = torch.linalg.eigh((left * weights / scale).T @ left)
-    found = found[:, -count:]
-    for _ in range(SWEEPS):
-        basis = torch.cat([decaying, found.expand(len(values), -1, -1)], 2)
-        own = own_weights(basis, values, fit.weights)
-        amplitudes, rest = own[:, -count:], values - (decaying @ own[:, :-count, None])[..., 0]
-        inner = torch.einsum("pf,pi,pj->fij", weights, amplitudes, amplitudes)
-        inner = inner + RIDGE * inner.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-300) * torch.eye(count)
-        found = torch.linalg.solve(inner, torch.einsum("pf,pi,pf->fi", weights, amplitudes, rest))
-        found = torch.linalg.qr(found).Q
-    return found
 
 
 def harmonics(inspected: Inspection, count: int) -> int:
@@ -117,7 +94,9 @@ EFFECT = Effect(
     evidence=evidence,
     part=Part("state", "newton_harmonic", off={"frequencies": 0}),
     term=Own(
-        basis=courses,
+        basis=lambda fit, count: common_courses(
+            fit, Model.of(relaxation=1), count
+        ),  # by which they depart from relaxation
         in_time=True,
         kinds=kinds,
         numbers=lambda data, count: count * data.frames,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from heatsplat.effects.base import Effect, Part
-from heatsplat.effects.weather_record import NEVER, only_if_asked
+from heatsplat.effects.weathered import MIRRORED, SIGMAS, around
 
 EFFECT = Effect(
     name="mirrored_sky",
@@ -13,8 +15,8 @@ EFFECT = Effect(
     source="Kirchhoff's law under a sky of one optical depth (Elsasser 1942)",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="what a surface does not emit does not show",
-    threshold=NEVER,
+    threshold=SIGMAS,
     adds="a reflectance for each Gaussian, the sky in one direction",
-    evidence=only_if_asked,
+    evidence=partial(around, name=MIRRORED),
     part=Part("path", "mirrored_sky"),
 )

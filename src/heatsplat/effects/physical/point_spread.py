@@ -16,6 +16,7 @@ CLEAR = 20.0  # an edge is strong when it is this many times the noise high
 MIN_EDGES, MANY_EDGES = 30, 300  # of fewer than many, all may be gradients of the scene
 # The width of a step that is no wider than the pixel that collects it, and one of which the reconstruction should know.
 PIXEL_PX, WIDE_PX = 0.45, 0.75
+UNSURE = (0.97, 1.1)  # shares of WIDE_PX between which nothing was seen
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -39,6 +40,8 @@ def evidence(inspected: Inspection) -> Evidence:
     )
     if len(widths) < MANY_EDGES and spread > 0.5 * WIDE_PX:
         return Evidence(spread / WIDE_PX, f"{found}: cannot be told, {MANY_EDGES} edges would tell", told=False)
+    if UNSURE[0] < spread / WIDE_PX < UNSURE[1]:
+        return Evidence(spread / WIDE_PX, f"{found}: cannot be told, finer images would tell", told=False)
     return Evidence(spread / WIDE_PX, found)
 
 

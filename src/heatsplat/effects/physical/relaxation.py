@@ -14,6 +14,7 @@ from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
+from heatsplat.effects.weathered import MIN_DB, SIGMAS
 
 # Mixtures of these decays, as rates times the record's length, stand for any course that relaxes: the surface of a deep
 # body does not follow one exponential. Within 0.5 % of the excess for slabs of Biot number 0 to 3.
@@ -24,8 +25,16 @@ BESIDE_DRIFT = 0.25  # share of a common offset that other changes must exceed b
 
 
 def evidence(inspected: Inspection) -> Evidence:
-    """Whether points tend to another temperature as time goes by."""
-    return gained(inspected, "relaxation", "points change over time by")
+    """Whether points tend to another temperature as time goes by; what follows sun, sky or wind does."""
+    found = gained(inspected, "relaxation", "points change over time by")
+    on = found.told and found.statistic is not None and found.statistic > EFFECT.threshold
+    if on or inspected.weathered is None:
+        return found
+    gain = inspected.weathered.follows
+    if gain.sigmas > SIGMAS and gain.db > MIN_DB:
+        said = f"balances of heat gain {gain.db:.2f} dB over levels where left out, {gain.sigmas:.1f} standard errors"
+        return Evidence(gain.sigmas, said, gain_db=gain.db)
+    return found
 
 
 def rates(data: Data) -> tuple[float, ...]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from heatsplat.effects.base import Effect, Part
-from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
+from heatsplat.effects.weather_record import directed
+from heatsplat.effects.weathered import SHADOWS, SIGMAS, around
 
 EFFECT = Effect(
     name="shadows",
@@ -13,9 +16,9 @@ EFFECT = Effect(
     source="Williams (1978), with the splatted depth of the scene",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="what hides the sun does not show",
-    threshold=NEVER,
+    threshold=SIGMAS,
     adds="a share for each Gaussian and direction of the sun",
-    evidence=only_if_asked,
+    evidence=partial(around, name=SHADOWS),
     part=Part("state", "energy_balance", off={"shadows": False}),
     stands_on="solar",
     missing=directed,

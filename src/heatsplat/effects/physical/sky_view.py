@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from heatsplat.effects.base import Effect, Part
-from heatsplat.effects.weather_record import NEVER, directed, only_if_asked
+from heatsplat.effects.weather_record import directed
+from heatsplat.effects.weathered import SIGMAS, SKY_VIEW, around
 
 EFFECT = Effect(
     name="sky_view",
@@ -13,9 +16,9 @@ EFFECT = Effect(
     source="sky view factor (Oke 1987), from the splatted depth of the scene",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="what hides the sky does not show",
-    threshold=NEVER,
+    threshold=SIGMAS,
     adds="a share for each Gaussian",
-    evidence=only_if_asked,
+    evidence=partial(around, name=SKY_VIEW),
     part=Part("state", "energy_balance", off={"sky_view": False}),
     stands_on="solar",
     missing=directed,

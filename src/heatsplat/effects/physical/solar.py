@@ -5,14 +5,14 @@ from __future__ import annotations
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, SIGMAS, judged
 
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether balances of heat with the sunlight of the record explain images better that they were not fitted to."""
     weather = inspected.scene.weather
     if weather.irradiance_w_m2 is None or float(weather.irradiance_w_m2.max()) <= 0:
-        return Evidence(None, "the record has no irradiance, or the sun does not shine in it")
+        return Evidence(None, NO_SUN)
     return judged(inspected.weathered, "solar", inspected.obs.why or NO_BALANCE)
 
 

@@ -19,6 +19,7 @@ BESIDE_PX = 2.0  # points that fall into one square of this size are on one line
 SURE = 4.0  # a vote counts where one variance is this many times the other
 STRAY = 0.05  # share of votes that differ at the edges of opaque things
 MIN_VOTES = 12
+PRESENT, UNLIKELY = 0.8, 0.05  # share of votes that differ where it is there, and a chance that so few of them do
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -41,7 +42,9 @@ def evidence(inspected: Inspection) -> Evidence:
     n, apart = int(sure.sum()), int((thermal[sure] != visible[sure]).sum())
     if n < MIN_VOTES:
         why = f"{n} points lie behind others so that both modalities could tell them apart"
-        told = apart == 0
+        told = (
+            n == 0 or sum(math.comb(n, k) * PRESENT**k * (1 - PRESENT) ** (n - k) for k in range(apart + 1)) < UNLIKELY
+        )
         return Evidence(0.0, why if told else f"cannot be told: {why}, {MIN_VOTES} are needed", told=told)
     usual = STRAY * n
     return Evidence(

@@ -23,12 +23,21 @@ def evidence(inspected: Inspection) -> Evidence:
     A curve that never changes over a scene that never changes only renames its levels: nothing shows it, and nothing is
     lost without it. It shows where an offset moves all levels along it.
     """
-    absent = inspected.joint is not None and "tone" not in inspected.joint[1].names
-    if absent and not frame_offset.evidence(inspected).told:
-        return Evidence(
-            None, "cannot be told: nobody can tell whether offsets move the levels along a curve", told=False
-        )
-    return gained(inspected, "tone", "offsets act on dark and bright parts differently by")
+    found = gained(inspected, "tone", "offsets act on dark and bright parts differently by")
+    on = found.statistic is not None and found.statistic > EFFECT.threshold
+    if on or not found.told or inspected.joint is None or frame_offset.evidence(inspected).told:
+        return found
+    if _may_bend(*inspected.joint):
+        why = "nobody can tell whether offsets move the levels along a curve"
+        return Evidence(None, f"cannot be told: {why}", told=False)
+    return found
+
+
+def _may_bend(fit: Fit, model: Model) -> bool:
+    """Whether a curve explains anything if offsets move the levels along it."""
+    drifting = model.plus("frame_offset")
+    at = fit.linearised(drifting)
+    return at.gain(drifting.plus("tone"), drifting) > 1.0
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:

@@ -20,6 +20,7 @@ from heatsplat.effects.joint.selection import worthwhile
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, where_moving
 
 MIN_FALLOFF = -0.04  # in the corners; blur at the border of an image passes for half of that
+WILD = 0.1  # share that errors of a weather's record make, as those that no lens adds
 FINE_NODES = 9  # where the pattern is a random field, which more nodes than it needs do no harm
 UNSURE = (0.5, 3.0)  # gains between which random patterns have their own falloffs, and true ones may stay
 STRENGTHS = 12  # iterations for the strength of that field
@@ -29,16 +30,18 @@ def evidence(inspected: Inspection) -> Evidence:
     """Whether the image fades towards its corners."""
     if inspected.joint is None:
         return Evidence(None, inspected.obs.why)
-    fit, model = inspected.joint
+    fit, model = inspected.certainty.fit, inspected.joint[1]
     if not fit.data.moves:
         return Evidence(None, STILL)
-    none = model.minus({"fixed_pattern", "vignetting"})
+    none = inspected.certainty.beside_weather(model.minus({"fixed_pattern", "vignetting"}))
     radial = none.plus("vignetting")
     share, gain = falloff(fit, none)
     size = fit.effect_size(radial, none)
     why = (
         f"distance from the middle of the image changes values by {beside(size)} ({100 * share:+.0f} % in the corners)"
     )
+    if fit.data.drivers is not None and (share > WILD or share < -WILD and gain < UNSURE[0]):
+        return Evidence(gain, f"{why}: cannot be told, heat may pass for it; more frames would tell", told=False)
     if share >= MIN_FALLOFF:
         return Evidence(0.0, f"{why}, which is no falloff")
     if not worthwhile(fit, radial, none, "vignetting"):
