@@ -61,10 +61,13 @@ def check(
 
 def section(folder: Path, reading: Reading | None = None) -> Section:
     """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
-    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material_in(folder, 1.0, reading))]
+    material = material_in(folder, 1.0, reading)
+    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material)]
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
+    if material.cameras is None:
+        lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
 
 

@@ -230,7 +230,8 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
         "![temperatures over time](report/over_time.png)",
         "",
         f"The median runs from {middle.min():.2f} to {middle.max():.2f} {unit}; from one frame to the next it moves by up to "
-        f"{jump:.2f} {unit}. Steps and slopes that all pixels share are the camera's drift and its shutter, not the scene.",
+        f"{jump:.2f} {unit}. Steps and slopes that all pixels share are drift and shutter of the camera, unless it saw another "
+        "part of the scene.",
     ]
     return Section("Pictures", lines, {"median_span": float(np.ptp(middle)), "largest_step": float(jump)})
 
