@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from heatsplat.contracts import Camera, SceneData, SceneError, View
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.geometry.sight_lines import cosines, distances
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
@@ -43,11 +45,14 @@ from heatsplat.physics.radiometry import (
 )
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
+from heatsplat.preparation.writer import write_world
 from heatsplat.runs.run import load
 
 log = logging.getLogger(__name__)
 
+PLACED = [field.name for kind in (Position, Attitude) for field in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
 
@@ -120,8 +125,9 @@ def correct(
 ) -> Path:
     """Corrects the images of a trained scene pixel by pixel and returns the path of a report on what that changed.
 
-    The folder then has images/ (float32 TIFF in °C), the cameras in sparse/0, temperature_bounds.json and frames.csv: it trains
-    with ``data=colmap``. What the scene's own preparation corrected for is taken back first.
+    The folder then has images/ (float32 TIFF in °C), the cameras in sparse/0, temperature_bounds.json, world.json and
+    frames.csv (with dates, places and attitudes where the preparation's has them): it trains with ``data=colmap``. What the
+    scene's own preparation corrected for is taken back first.
 
     Args:
         ckpt: checkpoint of a run on the scene.
@@ -175,7 +181,7 @@ def correct_scene(
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
     changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
-    rows, cameras, shown = [], {}, None
+    rows, cameras, shown, known_of = [], {}, None, _told(folders)
     low, high = np.inf, -np.inf
     for number, view in enumerate(track(views, "correcting")):
         own, done = preparation_of(view.frame.name, folders)
@@ -195,7 +201,8 @@ def correct_scene(
         write_temperature(target / "images" / name, image)
         if np.isfinite(image).any():
             low, high = min(low, float(np.nanmin(image))), max(high, float(np.nanmax(image)))
-        rows.append({"file": name} | ({"time_s": view.frame.time_s} if view.frame.time_s is not None else {}))
+        timed = {} if view.frame.time_s is None else {"time_s": view.frame.time_s}
+        rows.append({"file": name, **timed, **known_of.get(stem_of(name), {})})
         cameras[name] = view.camera
         shown = found if number == len(views) // 2 else shown
     if not low < high:
@@ -204,12 +211,25 @@ def correct_scene(
         )
     _write_cameras(target, scene, cameras)
     write_csv(target / FRAMES_FILE, rows)
+    write_world(target, metres_per_unit)
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
     write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
     write_png(target / "report" / "correction.png", _picture(shown))
     page = write_report(target, [_section(changes, far, wanted, index, len(views))])
     log.info("%s", page)
     return page
+
+
+def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
+    """By name of a frame, what its preparation's table tells beside its temperatures: date, place, attitude."""
+    path = next((p for f in folders if (p := f / FRAMES_FILE).is_file()), None)
+    if path is None:
+        return {}
+    table = read_table(path)
+    kept = [(i, c) for i, c in enumerate(table.columns) if c in {"time", *PLACED}]
+    return {
+        stem_of(cells[table.columns.index("file")]): {column: cells[i] for i, column in kept} for _, cells in table.rows
+    }
 
 
 def _known(values: Tensor) -> np.ndarray:

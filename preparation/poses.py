@@ -23,6 +23,7 @@ from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
+from heatsplat.preparation.writer import write_world
 
 log = logging.getLogger(__name__)
 
@@ -223,6 +224,7 @@ class Search:
         written = thermal_only(model, self.name_of)
         folder = self.target / "sparse" / "0"
         write_whole(written, folder, self.work)
+        write_world(self.target, None if self.origin is None else 1.0)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(model, kept)
         camera = next(iter(kept.values())).camera

@@ -117,6 +117,11 @@ def test_without_times_a_scene_is_static_and_says_so(tmp_path):
 def test_options_that_are_metadata(tmp_path):
     scene = loaded(write_colmap(tmp_path, names(9)), ambient_c=21.5, metres_per_unit=2.0)
     assert scene.ambient_c == 21.5 and scene.metres_per_unit == 2.0
+    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5}')
+    assert loaded(tmp_path).metres_per_unit == 0.5 and loaded(tmp_path, metres_per_unit=2.0).metres_per_unit == 2.0
+    (tmp_path / "world.json").write_text('{"metres_per_unit": "far"}')
+    with pytest.raises(SceneError, match="world.json: 'metres_per_unit'"):
+        loaded(tmp_path)
 
 
 def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):

@@ -1,5 +1,6 @@
 """Correction pixel by pixel against a scene whose temperature, distances and angles are known."""
 
+import csv
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -93,6 +94,26 @@ def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
     frames = [*module.scene.train.frames, *module.scene.test.frames]
     assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
     torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
+    assert module.scene.metres_per_unit == METRES
+
+
+def test_places_of_the_preparation_stay(tmp_path):
+    (tmp_path / "frames.csv").write_text(
+        "file,time_s,latitude_deg,longitude_deg,median\n0.tiff,9,50.5,7.5,20\n1.tiff,9,50.6,,21\n"
+    )
+    correct_scene(
+        scene(),
+        lambda frame: DEPTH,
+        [tmp_path / "none", tmp_path],
+        tmp_path / "new",
+        Given(),
+        BandResponse(),
+        None,
+        METRES,
+    )
+    rows = list(csv.DictReader((tmp_path / "new" / "frames.csv").open()))
+    assert [row["latitude_deg"] for row in rows] == ["50.5", "50.6", ""] and rows[0]["longitude_deg"] == "7.5"
+    assert set(rows[0]) == {"file", "time_s", "latitude_deg", "longitude_deg"}
 
 
 def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
