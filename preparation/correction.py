@@ -55,6 +55,9 @@ log = logging.getLogger(__name__)
 PLACED = [field.name for kind in (Position, Attitude) for field in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
+APART = (
+    0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
+)
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,8 @@ def correct_scene(
         raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
+    if doubt := _doubt(views, depth_of, scene.points):
+        log.warning("%s", doubt)
     changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
     rows, cameras, shown, known_of = [], {}, None, _told(folders)
     low, high = np.inf, -np.inf
@@ -215,9 +220,31 @@ def correct_scene(
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
     write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
     write_png(target / "report" / "correction.png", _picture(shown))
-    page = write_report(target, [_section(changes, far, wanted, index, len(views))])
-    log.info("%s", page)
+    section = _section(changes, far, wanted, index, len(views), doubt)
+    page = write_report(target, [section], f"corrected pixel by pixel by the trained scene {scene.name}")
+    log.info("%s", page.with_suffix(".html"))
     return page
+
+
+def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
+    """What to say where the splats lie elsewhere than the points that the reconstruction measured; empty where they do not."""
+    found = []
+    for view in _few(views):
+        camera, depth = view.camera, depth_of(view.frame)
+        local = points.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+        local = local[local[:, 2] > 0]
+        x, y = ((local @ camera.K.double().T)[:, :2] / local[:, 2:]).floor().long().unbind(1)
+        within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        found.append(depth[y[within], x[within]] / local[within, 2])
+    ratios = torch.cat(found)
+    ratios = ratios[ratios.isfinite()]
+    off = float(ratios.median()) - 1.0 if len(ratios) else 0.0
+    if abs(off) <= APART:
+        return ""
+    return (
+        f"The trained surfaces lie {100 * abs(off):.0f} % {'farther' if off > 0 else 'nearer'} than the points that the "
+        "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)"
+    )
 
 
 def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
@@ -238,12 +265,15 @@ def _known(values: Tensor) -> np.ndarray:
 
 def typical_distance(views: Sequence[View], depth_of: Any) -> float:
     """Median distance in world units over a few views; what one would give for all pixels. Raises SceneError without surfaces."""
-    few = views[:: max(1, len(views) // 8)]
-    found = [distances(view.camera, depth_of(view.frame)) for view in few]
+    found = [distances(view.camera, depth_of(view.frame)) for view in _few(views)]
     known = torch.cat([d[d.isfinite()] for d in found])
     if not len(known):
         raise SceneError("the trained scene shows no surface to any of its cameras; train it longer")
     return float(known.median())
+
+
+def _few(views: Sequence[View]) -> Sequence[View]:
+    return views[:: max(1, len(views) // 8)]
 
 
 def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None, Conditions]:
@@ -298,7 +328,7 @@ def _picture(found: Corrected) -> np.ndarray:
 
 
 def _section(
-    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int
+    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int, doubt: str
 ) -> Section:
     """What a distance and an angle for each pixel changed, in °C."""
     names = {"distance": "distance of each pixel", "angle": "angle of each pixel", "both": "both"}
@@ -313,6 +343,7 @@ def _section(
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [
+        *([f"**{doubt}.**", ""] if doubt else []),
         f"{count} images, against one distance of {float(c.distance_m):.1f} m for all pixels (the scene's median is {far:.1f} m) "
         f"and an emissivity of {float(c.emissivity):g} at every angle. Air {float(c.air_k) - KELVIN_AT_0_C:.1f} °C, "
         f"{100 * float(c.humidity):.0f} %, reflected {float(c.reflected_k) - KELVIN_AT_0_C:.1f} °C, "

@@ -57,9 +57,9 @@ class Section:
     values: dict[str, object] = field(default_factory=dict)
 
 
-def write_report(target: Path, sections: Sequence[Section]) -> Path:
+def write_report(target: Path, sections: Sequence[Section], made: str = "prepared from a camera's files") -> Path:
     """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
-    lines = [f"# {target.name}, prepared from a camera's files", ""]
+    lines = [f"# {target.name}, {made}", ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
     text = "\n".join(lines)

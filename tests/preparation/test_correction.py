@@ -122,6 +122,19 @@ def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_p
     assert f"against one distance of {far:.1f} m" in page.read_text()
 
 
+@pytest.mark.parametrize("share", [1.0, 0.8])
+def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
+    there = DEPTH.isfinite()
+    y, x = there.nonzero().unbind(1)
+    points = (
+        torch.stack([(x + 0.5 - 20.0) / 38.0, (y + 0.5 - 16.0) / 38.0, torch.ones(len(x))], 1) * DEPTH[there][:, None]
+    )
+    shown = scene()
+    shown.points = (points * share).float()
+    page = correct_scene(shown, lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
+    assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
