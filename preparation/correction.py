@@ -330,8 +330,10 @@ def _picture(found: Corrected) -> np.ndarray:
 def _section(
     changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int, doubt: str
 ) -> Section:
-    """What a distance and an angle for each pixel changed, in °C."""
-    names = {"distance": "distance of each pixel", "angle": "angle of each pixel", "both": "both"}
+    """What a distance (and an angle, where it counts) for each pixel changed, in °C."""
+    names = {"distance": "distance of each pixel"}
+    if index is not None:
+        names |= {"angle": "angle of each pixel", "both": "both"}
     table, values = [], {}
     for key, name in names.items():
         found = np.concatenate(changes[key]) if changes[key] else np.zeros(0)
@@ -353,4 +355,5 @@ def _section(
         "",
         "![distance, angle, temperature and change](report/correction.png)",
     ]
-    return Section("What a distance and an angle for each pixel change", lines, values)
+    angle = "" if index is None else " and an angle"
+    return Section(f"What a distance{angle} for each pixel changes", lines, values)

@@ -119,7 +119,8 @@ def test_places_of_the_preparation_stay(tmp_path):
 def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
     page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
     far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())
-    assert f"against one distance of {far:.1f} m" in page.read_text()
+    text = page.read_text()
+    assert f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text  # nobody asked for angles
 
 
 @pytest.mark.parametrize("share", [1.0, 0.8])
