@@ -16,7 +16,7 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
-from heatsplat.datamodules.side_files import finite, json_object
+from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
@@ -193,7 +193,8 @@ class Colmap(SceneDataModule):
         if self.time_regex:
             times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
             return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
-        if (path := folder / FRAMES_FILE).is_file():
+        path = folder / FRAMES_FILE  # without times where a frame had none
+        if path.is_file() and "time_s" in read_table(path).columns:
             table = times_from_csv(path, "file", "time_s")
             if all(stem_of(name) in table for name in names):
                 return {name: table[stem_of(name)] for name in names}, path.name

@@ -120,7 +120,9 @@ def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_p
     page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
     far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())
     text = page.read_text()
-    assert f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text  # nobody asked for angles
+    assert (
+        f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text
+    )  # nobody asked for angles
 
 
 @pytest.mark.parametrize("share", [1.0, 0.8])
