@@ -219,7 +219,8 @@ class Search:
     def finish(self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> Section:
         """Writes the model of the thermal frames and says what became of every frame."""
         kept = {image.name: image for image in model.images.values() if image.has_pose and image.name in self.name_of}
-        if len(kept) < 3:
+        # Of a camera that stands still noise places a few frames somewhere.
+        if len(kept) < 3 or len(kept) < len(self.frames) / 2 and self._stands_still():
             raise SceneError(self._nothing())
         written = thermal_only(model, self.name_of)
         folder = self.target / "sparse" / "0"

@@ -3,7 +3,9 @@
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -59,6 +61,19 @@ def test_two_frames_and_photos_that_are_missing_are_refused(tmp_path):
     (tmp_path / "b").mkdir()
     with pytest.raises(SceneError, match="no photo"):
         search_of(tmp_path / "b", 4, by="rgb")
+
+
+def test_a_few_frames_of_a_camera_that_stands_still_are_no_cameras(tmp_path):
+    search = search_of(tmp_path, 9)
+    picture = np.random.default_rng(0).integers(0, 255, (32, 40)).astype(np.uint8)
+    for copy in search.copy_of.values():
+        path = search.work / "images" / copy
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), picture)
+    placed = [SimpleNamespace(name=copy, has_pose=True) for copy in list(search.copy_of.values())[:4]]
+    with pytest.raises(SceneError, match="the image does not move"):
+        search.finish(SimpleNamespace(images=dict(enumerate(placed))), [])
+    assert not (tmp_path / "sparse").exists()
 
 
 @pytest.mark.slow
