@@ -16,9 +16,11 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
+from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
+WORLD_FILE = "world.json"  # of a prepared folder: metres_per_unit of the sparse model, where GPS has told it
 META_FILE = "meta.csv"  # of a published flight: file, latitude and more of each frame
 
 
@@ -30,6 +32,13 @@ def _positions(folder: Path) -> Path | None:
                 if "lat" in file.readline().lower():
                     return path
     return None
+
+
+def _scale(folder: Path) -> float | None:
+    """Metres of one unit of a prepared folder's world; None where that is not known."""
+    path = folder / WORLD_FILE
+    value = json_object(path).get("metres_per_unit") if path.is_file() else None
+    return None if value is None else finite(value, f"{path}: 'metres_per_unit'")
 
 
 class Colmap(SceneDataModule):
@@ -51,7 +60,7 @@ class Colmap(SceneDataModule):
         time_csv: table of times, relative to the scene or the working directory, or None.
         time_csv_name, time_csv_time: its columns of image names and of times (seconds or ISO date-times).
         ambient_c: temperature of the surroundings in °C, or None.
-        metres_per_unit: scale of the sparse model, or None when unknown.
+        metres_per_unit: scale of the sparse model; None takes the world.json of a prepared folder, where there is one.
         shared: options of every loader (``SceneDataModule``).
     """
 
@@ -138,7 +147,7 @@ class Colmap(SceneDataModule):
             thermal_range=bounds,
             counts=counts,
             ambient_c=self.ambient_c,
-            metres_per_unit=self.metres_per_unit,
+            metres_per_unit=_scale(folder) if self.metres_per_unit is None else self.metres_per_unit,
             notes=notes,
         )
         return replace(scene, positions=_positions(folder))
@@ -184,7 +193,8 @@ class Colmap(SceneDataModule):
         if self.time_regex:
             times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
             return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
-        if (path := folder / FRAMES_FILE).is_file():
+        path = folder / FRAMES_FILE  # without times where a frame had none
+        if path.is_file() and "time_s" in read_table(path).columns:
             table = times_from_csv(path, "file", "time_s")
             if all(stem_of(name) in table for name in names):
                 return {name: table[stem_of(name)] for name in names}, path.name

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from heatsplat.contracts import Camera, SceneData, SceneError, View
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.geometry.sight_lines import cosines, distances
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
@@ -43,13 +45,19 @@ from heatsplat.physics.radiometry import (
 )
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
+from heatsplat.preparation.writer import write_world
 from heatsplat.runs.run import load
 
 log = logging.getLogger(__name__)
 
+PLACED = [field.name for kind in (Position, Attitude) for field in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
+APART = (
+    0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
+)
 
 
 @dataclass(frozen=True)
@@ -120,8 +128,9 @@ def correct(
 ) -> Path:
     """Corrects the images of a trained scene pixel by pixel and returns the path of a report on what that changed.
 
-    The folder then has images/ (float32 TIFF in °C), the cameras in sparse/0, temperature_bounds.json and frames.csv: it trains
-    with ``data=colmap``. What the scene's own preparation corrected for is taken back first.
+    The folder then has images/ (float32 TIFF in °C), the cameras in sparse/0, temperature_bounds.json, world.json and
+    frames.csv (with dates, places and attitudes where the preparation's has them): it trains with ``data=colmap``. What the
+    scene's own preparation corrected for is taken back first.
 
     Args:
         ckpt: checkpoint of a run on the scene.
@@ -174,8 +183,10 @@ def correct_scene(
         raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
+    if doubt := _doubt(views, depth_of, scene.points):
+        log.warning("%s", doubt)
     changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
-    rows, cameras, shown = [], {}, None
+    rows, cameras, shown, known_of = [], {}, None, _told(folders)
     low, high = np.inf, -np.inf
     for number, view in enumerate(track(views, "correcting")):
         own, done = preparation_of(view.frame.name, folders)
@@ -195,7 +206,8 @@ def correct_scene(
         write_temperature(target / "images" / name, image)
         if np.isfinite(image).any():
             low, high = min(low, float(np.nanmin(image))), max(high, float(np.nanmax(image)))
-        rows.append({"file": name} | ({"time_s": view.frame.time_s} if view.frame.time_s is not None else {}))
+        timed = {} if view.frame.time_s is None else {"time_s": view.frame.time_s}
+        rows.append({"file": name, **timed, **known_of.get(stem_of(name), {})})
         cameras[name] = view.camera
         shown = found if number == len(views) // 2 else shown
     if not low < high:
@@ -204,12 +216,47 @@ def correct_scene(
         )
     _write_cameras(target, scene, cameras)
     write_csv(target / FRAMES_FILE, rows)
+    write_world(target, metres_per_unit)
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
     write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
     write_png(target / "report" / "correction.png", _picture(shown))
-    page = write_report(target, [_section(changes, far, wanted, index, len(views))])
-    log.info("%s", page)
+    section = _section(changes, far, wanted, index, len(views), doubt)
+    page = write_report(target, [section], f"corrected pixel by pixel by the trained scene {scene.name}")
+    log.info("%s", page.with_suffix(".html"))
     return page
+
+
+def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
+    """What to say where the splats lie elsewhere than the points that the reconstruction measured; empty where they do not."""
+    found = []
+    for view in _few(views):
+        camera, depth = view.camera, depth_of(view.frame)
+        local = points.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+        local = local[local[:, 2] > 0]
+        x, y = ((local @ camera.K.double().T)[:, :2] / local[:, 2:]).floor().long().unbind(1)
+        within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        found.append(depth[y[within], x[within]] / local[within, 2])
+    ratios = torch.cat(found)
+    ratios = ratios[ratios.isfinite()]
+    off = float(ratios.median()) - 1.0 if len(ratios) else 0.0
+    if abs(off) <= APART:
+        return ""
+    return (
+        f"The trained surfaces lie {100 * abs(off):.0f} % {'farther' if off > 0 else 'nearer'} than the points that the "
+        "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)"
+    )
+
+
+def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
+    """By name of a frame, what its preparation's table tells beside its temperatures: date, place, attitude."""
+    path = next((p for f in folders if (p := f / FRAMES_FILE).is_file()), None)
+    if path is None:
+        return {}
+    table = read_table(path)
+    kept = [(i, c) for i, c in enumerate(table.columns) if c in {"time", *PLACED}]
+    return {
+        stem_of(cells[table.columns.index("file")]): {column: cells[i] for i, column in kept} for _, cells in table.rows
+    }
 
 
 def _known(values: Tensor) -> np.ndarray:
@@ -218,12 +265,15 @@ def _known(values: Tensor) -> np.ndarray:
 
 def typical_distance(views: Sequence[View], depth_of: Any) -> float:
     """Median distance in world units over a few views; what one would give for all pixels. Raises SceneError without surfaces."""
-    few = views[:: max(1, len(views) // 8)]
-    found = [distances(view.camera, depth_of(view.frame)) for view in few]
+    found = [distances(view.camera, depth_of(view.frame)) for view in _few(views)]
     known = torch.cat([d[d.isfinite()] for d in found])
     if not len(known):
         raise SceneError("the trained scene shows no surface to any of its cameras; train it longer")
     return float(known.median())
+
+
+def _few(views: Sequence[View]) -> Sequence[View]:
+    return views[:: max(1, len(views) // 8)]
 
 
 def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None, Conditions]:
@@ -278,10 +328,12 @@ def _picture(found: Corrected) -> np.ndarray:
 
 
 def _section(
-    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int
+    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int, doubt: str
 ) -> Section:
-    """What a distance and an angle for each pixel changed, in °C."""
-    names = {"distance": "distance of each pixel", "angle": "angle of each pixel", "both": "both"}
+    """What a distance (and an angle, where it counts) for each pixel changed, in °C."""
+    names = {"distance": "distance of each pixel"}
+    if index is not None:
+        names |= {"angle": "angle of each pixel", "both": "both"}
     table, values = [], {}
     for key, name in names.items():
         found = np.concatenate(changes[key]) if changes[key] else np.zeros(0)
@@ -293,6 +345,7 @@ def _section(
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [
+        *([f"**{doubt}.**", ""] if doubt else []),
         f"{count} images, against one distance of {float(c.distance_m):.1f} m for all pixels (the scene's median is {far:.1f} m) "
         f"and an emissivity of {float(c.emissivity):g} at every angle. Air {float(c.air_k) - KELVIN_AT_0_C:.1f} °C, "
         f"{100 * float(c.humidity):.0f} %, reflected {float(c.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
@@ -302,4 +355,5 @@ def _section(
         "",
         "![distance, angle, temperature and change](report/correction.png)",
     ]
-    return Section("What a distance and an angle for each pixel change", lines, values)
+    angle = "" if index is None else " and an angle"
+    return Section(f"What a distance{angle} for each pixel changes", lines, values)

@@ -33,6 +33,9 @@ def check(
     downscale: float = 1.0,
     counts: Mapping[str, Any] | None = None,
     bounds_c: Sequence[float] | None = None,
+    zone: str | None = None,
+    table: str | None = None,
+    table_columns: Mapping[str, str] | None = None,
 ) -> list[Finding]:
     """Looks for what is wrong with a folder, prints a table of it, and writes it to doctor.json.
 
@@ -41,11 +44,13 @@ def check(
         target: where doctor.json is written; None: in the working directory.
         downscale: factor by which images of a scene shrink before they are looked at.
         counts, bounds_c: of ``Meaning``, for a camera's files.
+        zone, table, table_columns: of ``Reading``, for a camera's files.
 
     Raises:
         SceneError: the folder holds neither.
     """
-    reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c))
+    rows = Path(table).expanduser() if table else None
+    reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
     found = examine(material_in(Path(folder).expanduser(), downscale, reading))
     show(found, str(folder))
     path = (target or Path()) / FINDINGS_FILE
@@ -56,10 +61,13 @@ def check(
 
 def section(folder: Path, reading: Reading | None = None) -> Section:
     """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
-    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material_in(folder, 1.0, reading))]
+    material = material_in(folder, 1.0, reading)
+    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material)]
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
+    if material.cameras is None:
+        lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
 
 

@@ -106,7 +106,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     notes: list[str] = []
     frames = list(_frames_of(kind, thermal, folder, reading, notes))
     frames = _paired(frames, [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])])
-    frames = [_zoned(frame, reading.zone) for frame in _with_table(frames, reading)]
+    frames = [_zoned(frame, reading.zone) for frame in _with_table(frames, reading, notes)]
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
         frames.sort(key=lambda f: (_instant(f.time), f.name))
@@ -324,8 +324,12 @@ def zone_of(name: str) -> tzinfo:
         raise SceneError(f"zone={name} is no time zone; give UTC, +02:00 or a name such as Europe/Berlin") from error
 
 
-def _with_table(frames: list[Frame], reading: Reading) -> list[Frame]:
-    """Frames with what a table says of them, which goes before what their files say."""
+def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list[Frame]:
+    """Frames with what a table says of them, which goes before what their files say.
+
+    Raises:
+        SceneError: the table has no row for any frame or no column that is known, or a cell cannot be read.
+    """
     if reading.table is None:
         return frames
     table = read_table(reading.table)
@@ -335,7 +339,21 @@ def _with_table(frames: list[Frame], reading: Reading) -> list[Frame]:
             f"table={reading.table} has no column {reading.columns.get('name')!r} with the names of files; it has "
             f"{', '.join(table.columns)}: set table_columns.name"
         )
+    if not at.keys() - {"name"}:
+        raise SceneError(
+            f"table={reading.table} has none of the columns {', '.join(c for k, c in reading.columns.items() if k != 'name')}; "
+            f"it has {', '.join(table.columns)}: say which is which, as in table_columns.time={table.columns[-1]}"
+        )
     rows = {stem_of(cells[at["name"]]): (line, cells) for line, cells in table.rows}
+    matched = sum(frame.path.stem in rows for frame in frames)
+    if not matched:
+        raise SceneError(
+            f"table={reading.table} has no row for any of the {len(frames)} frames, such as {frames[0].path.name}; "
+            f"its column {reading.columns['name']} begins with {next(iter(rows), 'nothing')}"
+        )
+    notes.append(
+        f"{reading.table.name} tells {', '.join(sorted(at.keys() - {'name'}))} of {matched} of {len(frames)} frames"
+    )
 
     def of(frame: Frame) -> Frame:
         if frame.path.stem not in rows:

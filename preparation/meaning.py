@@ -10,6 +10,7 @@ import numpy as np
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
+from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
@@ -78,9 +79,13 @@ class Meaning:
                 f"counts taken for kelvin x 100, for {path.name} then has {low:.1f} .. {high:.1f} °C; "
                 "counts.scale and counts.offset_c say otherwise",
             )
+        middle = float(np.median(sample))
+        drone = middle / PER_KELVIN - KELVIN_AT_0_C
+        hint = f" As DJI's 1/64 K they would be {drone:.1f} °C (counts.scale={1 / PER_KELVIN})."
         raise SceneError(
-            f"{path} holds 16-bit counts around {np.median(sample):.0f}, which are no kelvin x 100. Say what they mean: "
-            "counts.scale and counts.offset_c (°C = scale * count + offset), or counts.planck=[R1,B,F,O,R2] of the camera"
+            f"{path} holds 16-bit counts around {middle:.0f}, which are no kelvin x 100. Say what they mean: "
+            "counts.scale and counts.offset_c (°C = scale * count + offset), or counts.planck=[R1,B,F,O,R2] of the camera."
+            + (hint if MEDIAN_C[0] < drone < MEDIAN_C[1] else "")
         )
 
     def of_floats(self, sample: np.ndarray, path: Path) -> tuple[Calibration, str]:

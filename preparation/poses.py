@@ -23,6 +23,7 @@ from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
+from heatsplat.preparation.writer import write_world
 
 log = logging.getLogger(__name__)
 
@@ -218,11 +219,13 @@ class Search:
     def finish(self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> Section:
         """Writes the model of the thermal frames and says what became of every frame."""
         kept = {image.name: image for image in model.images.values() if image.has_pose and image.name in self.name_of}
-        if len(kept) < 3:
+        # Of a camera that stands still noise places a few frames somewhere.
+        if len(kept) < 3 or len(kept) < len(self.frames) / 2 and self._stands_still():
             raise SceneError(self._nothing())
         written = thermal_only(model, self.name_of)
         folder = self.target / "sparse" / "0"
         write_whole(written, folder, self.work)
+        write_world(self.target, None if self.origin is None else 1.0)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(model, kept)
         camera = next(iter(kept.values())).camera

@@ -57,9 +57,9 @@ class Section:
     values: dict[str, object] = field(default_factory=dict)
 
 
-def write_report(target: Path, sections: Sequence[Section]) -> Path:
+def write_report(target: Path, sections: Sequence[Section], made: str = "prepared from a camera's files") -> Path:
     """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
-    lines = [f"# {target.name}, prepared from a camera's files", ""]
+    lines = [f"# {target.name}, {made}", ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
     text = "\n".join(lines)
@@ -230,7 +230,8 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
         "![temperatures over time](report/over_time.png)",
         "",
         f"The median runs from {middle.min():.2f} to {middle.max():.2f} {unit}; from one frame to the next it moves by up to "
-        f"{jump:.2f} {unit}. Steps and slopes that all pixels share are the camera's drift and its shutter, not the scene.",
+        f"{jump:.2f} {unit}. Steps and slopes that all pixels share are drift and shutter of the camera, unless it saw another "
+        "part of the scene.",
     ]
     return Section("Pictures", lines, {"median_span": float(np.ptp(middle)), "largest_step": float(jump)})
 

@@ -21,7 +21,7 @@ import torch
 
 from heatsplat.contracts import SceneError, evenly_spread
 from heatsplat.datamodules.bounds import BOUNDS_FILE
-from heatsplat.datamodules.colmap import FRAMES_FILE
+from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.io.results import write_atomically
@@ -166,6 +166,15 @@ class Writer:
             low, high = min(q[0] for q in found), max(q[-1] for q in found)
             bounds = {"absolute_min_temperature": low, "absolute_max_temperature": max(high, low + 1e-3)}
             write_atomically(self.target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+
+
+def write_world(target: Path, metres_per_unit: float | None) -> None:
+    """Says in a prepared folder what one unit of its world is, or takes away what an earlier search said."""
+    path = target / WORLD_FILE
+    if metres_per_unit is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_atomically(path, json.dumps({"metres_per_unit": metres_per_unit}) + "\n")
 
 
 def uncertainty_at(

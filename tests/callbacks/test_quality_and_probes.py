@@ -8,7 +8,7 @@ import torch
 from fake_run import SECONDS, FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
-from heatsplat.callbacks.images import ImagePanels, file_stem
+from heatsplat.callbacks.images import ImagePanels, file_stem, panels
 from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves, find_probes, recorded, seen_by
 from heatsplat.callbacks.progress import Progress
@@ -117,6 +117,16 @@ def test_panels_without_logger_and_bounds(tmp_path):
     none = tmp_path / "none"
     scored(wall(), none, ImagePanels(test_views=0))
     assert not (none / "renders").exists()
+
+
+def test_a_clean_image_is_compared_with_what_it_is_compared_with():
+    scene = wall()
+    view, image = scene.test[0], scene.test[0].thermal
+    shown = [panels(one, "clean", image, scene)[0] for one in (view, replace(view, clean=image))]
+    assert [[panel.title for panel in three] for three in shown] == [
+        ["recorded", "render", "render − recorded"],
+        ["ground truth", "render", "render − ground truth"],
+    ]
 
 
 def test_names_are_unique():

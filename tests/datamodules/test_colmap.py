@@ -114,9 +114,21 @@ def test_without_times_a_scene_is_static_and_says_so(tmp_path):
     assert scene.thermal_range is None and "no temperatures" in scene.notes["thermal_range_c"]
 
 
+def test_a_prepared_folder_whose_frames_had_no_times_has_none(tmp_path):
+    files = names(9)
+    write_colmap(tmp_path, files)
+    (tmp_path / "frames.csv").write_text("file,time,median\n" + "".join(f"{file},,20\n" for file in files))
+    assert loaded(tmp_path).notes["time_source"].startswith("none")
+
+
 def test_options_that_are_metadata(tmp_path):
     scene = loaded(write_colmap(tmp_path, names(9)), ambient_c=21.5, metres_per_unit=2.0)
     assert scene.ambient_c == 21.5 and scene.metres_per_unit == 2.0
+    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5}')
+    assert loaded(tmp_path).metres_per_unit == 0.5 and loaded(tmp_path, metres_per_unit=2.0).metres_per_unit == 2.0
+    (tmp_path / "world.json").write_text('{"metres_per_unit": "far"}')
+    with pytest.raises(SceneError, match="world.json: 'metres_per_unit'"):
+        loaded(tmp_path)
 
 
 def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):

@@ -1,8 +1,14 @@
 """Drift of the level is found, and heat that changes is not taken for it."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from materials import changed, checks, clean
 
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.doctor.base import material_of
+from heatsplat.doctor.checks import drift
 from heatsplat.doctor.examination import examine
 
 
@@ -17,3 +23,12 @@ def test_drift_is_found_with_its_shutter_and_cooling_is_not_taken_for_it():
 def test_a_sensor_that_drifts_is_found_before_a_scene_that_cools_and_a_lamp_is_not_taken_for_it():
     assert "drift" in checks(clean("drifting_cooling"))
     assert "drift" not in checks(clean("heated"))
+
+
+@pytest.mark.parametrize("scene", ["facade", "stone"])
+def test_walls_that_follow_one_weather_do_not_drift_and_a_sensor_before_them_does(scene):
+    found = material_of(Synthetic(scene=scene, size="tiny", frames=48).scene)
+    assert not drift.find(found)
+    assert drift.find(replace(found, answers=None))  # their levels wander in common, by more than a shutter sets back
+    saw = 0.01 * (torch.arange(len(found.images), dtype=torch.float64) % 9)
+    assert drift.find(replace(found, images=found.images + saw[:, None, None]))

@@ -62,6 +62,16 @@ def test_thin_slabs_are_not_taken_for_such(monkeypatch):
     assert found.statistic <= EFFECT.threshold, found
 
 
+def test_walls_that_a_core_explains_as_well_are_not_taken_for_such():
+    scene = Synthetic(scene="facade", size="tiny", frames=FRAMES).scene
+    relaxation = next(effect for effect in catalogue.CATALOGUE if effect.name == "relaxation")
+    inspected = Inspection(scene, [relaxation])
+    gain, of_a_core = inspected.weathered.endless
+    found = EFFECT.evidence(inspected)
+    assert gain.sigmas > 3.0 and abs(of_a_core.sigmas) < 1.0  # its insulation and brick are no lump, and have an end
+    assert not found.told and found.statistic <= EFFECT.threshold and "a core do as well" in found.reason
+
+
 def test_where_the_fourth_power_is_bent_it_is_left_out(monkeypatch):
     found = verdict(followed(), monkeypatch, bent=True)
     assert found.statistic == 0.0 and "bent" in found.reason

@@ -1,5 +1,6 @@
 """Correction pixel by pixel against a scene whose temperature, distances and angles are known."""
 
+import csv
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -93,12 +94,48 @@ def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
     frames = [*module.scene.train.frames, *module.scene.test.frames]
     assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
     torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
+    assert module.scene.metres_per_unit == METRES
+
+
+def test_places_of_the_preparation_stay(tmp_path):
+    (tmp_path / "frames.csv").write_text(
+        "file,time_s,latitude_deg,longitude_deg,median\n0.tiff,9,50.5,7.5,20\n1.tiff,9,50.6,,21\n"
+    )
+    correct_scene(
+        scene(),
+        lambda frame: DEPTH,
+        [tmp_path / "none", tmp_path],
+        tmp_path / "new",
+        Given(),
+        BandResponse(),
+        None,
+        METRES,
+    )
+    rows = list(csv.DictReader((tmp_path / "new" / "frames.csv").open()))
+    assert [row["latitude_deg"] for row in rows] == ["50.5", "50.6", ""] and rows[0]["longitude_deg"] == "7.5"
+    assert set(rows[0]) == {"file", "time_s", "latitude_deg", "longitude_deg"}
 
 
 def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
     page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
     far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())
-    assert f"against one distance of {far:.1f} m" in page.read_text()
+    text = page.read_text()
+    assert (
+        f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text
+    )  # nobody asked for angles
+
+
+@pytest.mark.parametrize("share", [1.0, 0.8])
+def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
+    there = DEPTH.isfinite()
+    y, x = there.nonzero().unbind(1)
+    points = (
+        torch.stack([(x + 0.5 - 20.0) / 38.0, (y + 0.5 - 16.0) / 38.0, torch.ones(len(x))], 1) * DEPTH[there][:, None]
+    )
+    shown = scene()
+    shown.points = (points * share).float()
+    page = correct_scene(shown, lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
+    assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,26 @@ def test_a_table_goes_before_the_files(tmp_path):
         read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
 
 
+def test_a_table_that_tells_nothing_is_refused_and_what_it_tells_is_said(tmp_path):
+    write_images(tmp_path / "frames", {"a.tiff": FLOATS, "b.tiff": FLOATS})
+    table = tmp_path / "table.csv"
+    table.write_text("file,when\na,2024-07-01T10:00:05Z\n")
+    with pytest.raises(
+        SceneError, match="has none of the columns time; it has file, when: say .* table_columns.time=when"
+    ):
+        read_frames(tmp_path / "frames", Reading(table=table, columns={"name": "file", "time": "time"}))
+    columns = {"name": "file", "time": "when"}
+    assert (
+        "table.csv tells time of 1 of 2 frames"
+        in read_recording(tmp_path / "frames", Reading(table=table, columns=columns)).notes
+    )
+    table.write_text("file,when\nother,2024-07-01T10:00:05Z\n")
+    with pytest.raises(
+        SceneError, match="no row for any of the 2 frames, such as a.tiff; its column file begins with other"
+    ):
+        read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
+
+
 def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     with pytest.raises(SceneError, match="nothing is no folder"):
         read_frames(tmp_path / "nothing")

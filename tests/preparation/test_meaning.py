@@ -22,6 +22,8 @@ def test_kelvin_times_100_is_recognised_and_nothing_else_is_guessed():
     for other in (room // 4, np.linspace(0, 65535, 100).astype(np.uint16), room * 0 + 19000):
         with pytest.raises(SceneError, match="image.png holds 16-bit counts .*counts.scale"):
             Meaning().of_counts(other, HERE)
+    with pytest.raises(SceneError, match=r"As DJI's 1/64 K they would be 29.5 °C \(counts.scale=0.015625\)"):
+        Meaning().of_counts(room * 0 + 19371, HERE)
 
 
 def test_what_is_said_goes_before_what_is_guessed():

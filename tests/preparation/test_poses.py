@@ -1,8 +1,11 @@
 """Cameras that are found from thermal frames alone, against those that filmed them."""
 
+import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -60,6 +63,19 @@ def test_two_frames_and_photos_that_are_missing_are_refused(tmp_path):
         search_of(tmp_path / "b", 4, by="rgb")
 
 
+def test_a_few_frames_of_a_camera_that_stands_still_are_no_cameras(tmp_path):
+    search = search_of(tmp_path, 9)
+    picture = np.random.default_rng(0).integers(0, 255, (32, 40)).astype(np.uint8)
+    for copy in search.copy_of.values():
+        path = search.work / "images" / copy
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), picture)
+    placed = [SimpleNamespace(name=copy, has_pose=True) for copy in list(search.copy_of.values())[:4]]
+    with pytest.raises(SceneError, match="the image does not move"):
+        search.finish(SimpleNamespace(images=dict(enumerate(placed))), [])
+    assert not (tmp_path / "sparse").exists()
+
+
 @pytest.mark.slow
 def test_cameras_are_found_from_thermal_frames_with_drift_dead_pixels_and_gps_noise(tmp_path):
     recording = flight(Size(320, 256, 24, 200), duration_s=120.0)
@@ -72,6 +88,7 @@ def test_cameras_are_found_from_thermal_frames_with_drift_dead_pixels_and_gps_no
             (target / "images" / f"{frame.name}.tiff").symlink_to(frame.path)
         said = FindPoses(Sift(most=1500), gps_sd_m=(0.5, 0.5))(frames, target)
         models.append(read_model(target))
+        assert json.loads((target / "world.json").read_text()) == {"metres_per_unit": 1.0}
     assert said.values["registered"] == 24 and said.values["metres_per_unit"] == 1.0
     errors = pose_errors(torch.from_numpy(np.stack(models[0].viewmats)), torch.from_numpy(recording.viewmats))
     assert errors.degrees.median() < 0.5 and errors.percent.median() < 1.0

@@ -135,7 +135,11 @@ def panels(
     if thermal_range is not None and target.shape[-1] == 1:
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
     title += [text.format(value) for value, text in scores if value is not None]
-    return comparison_panels(target, prediction, thermal_range, mask, bounds, error_limit), "   ·   ".join(title)
+    # Nobody knows what a real camera without its drift and blur would have recorded.
+    against = "recorded" if modality == "clean" and view.clean is None else "ground truth"
+    return comparison_panels(target, prediction, thermal_range, mask, bounds, error_limit, against), "   ·   ".join(
+        title
+    )
 
 
 def magnitudes(view: View, modality: str, prediction: Tensor, scene: SceneData) -> np.ndarray:

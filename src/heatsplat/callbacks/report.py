@@ -334,7 +334,7 @@ def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
     units = COST_UNITS | {name: definition.unit for name, definition in DEFINITIONS.items()}
     cells = []
     for name, value in content[section].items():
-        unit = units.get(name, units.get(name.rpartition("_")[2], ""))  # rgb_psnr has the unit of psnr
+        unit = units.get(name, units.get(name.partition("_")[2], ""))  # clean_mae_c has the unit of mae_c
         cells.append((name, "–" if value is None else f"{_number(value)} {unit}".rstrip()))
     return cells
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, SceneData, View, evenly_spread
 from heatsplat.effects.observations import Tracks, tracks_of
+from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
 
 # Frames that are looked at: enough to find what is common, and cheap beside a training.
@@ -55,6 +56,7 @@ class Material:
         bounds_c: temperatures of image values 0 and 1, or None.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         views: the views of ``images``, for tracks; empty without cameras.
+        answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
     """
 
     names: Sequence[str]
@@ -70,6 +72,7 @@ class Material:
     bounds_c: tuple[float, float] | None = None
     clipped: float | None = None
     views: Sequence[View] = ()
+    answers: Tensor | None = None
 
     @cached_property
     def noise(self) -> float:
@@ -136,10 +139,12 @@ def material_of(scene: SceneData) -> Material:
         everywhere = torch.ones(shape, dtype=torch.bool)
         masks = torch.stack([everywhere if view.mask is None else view.mask for view in views])
     times = [frame.time_s for frame in frames]
+    timed = all(time is not None for time in times)
+    seen_s = torch.tensor([times[i] for i, _ in kept], dtype=torch.float64) if timed else None
     bounds = scene.thermal_range
     return Material(
         names=[frame.name for frame in frames],
-        times_s=None if any(time is None for time in times) else times,
+        times_s=times if timed else None,
         chosen=[i for i, _ in kept],
         images=torch.stack([view.thermal.mean(2) for view in views]).double() if views else torch.zeros(0, 1, 1),
         unit_k=None if bounds is None else bounds.span_k,
@@ -150,6 +155,7 @@ def material_of(scene: SceneData) -> Material:
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
         clipped=scene.notes.get("clipped_fraction"),
         views=views,
+        answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
     )
 
 

@@ -1,4 +1,5 @@
-"""What is left of points' values over time beside their own smooth courses: what surfaces do that warm or cool by themselves."""
+"""What is left of points' values over time beside their own smooth courses: what surfaces do that warm or cool by themselves
+or with the weather."""
 
 from __future__ import annotations
 
@@ -15,13 +16,16 @@ RIDGE = 1e-9
 def beside_courses(values: Tensor, weights: Tensor, material: Material) -> tuple[Tensor, Tensor]:
     """Values [P, F] without each point's level and course, and weights that leave out points that are seen too seldom.
 
-    Without times a point has a level only.
+    A course is a sum of exponentials, and of answers to recorded weather where there is a record. Without times a point has a
+    level only.
     """
     columns = [torch.ones(values.shape[1], dtype=values.dtype)]
     if material.times_s is not None:
         times = torch.tensor(material.times_s, dtype=values.dtype)[list(material.chosen)]
         share = (times - times.min()) / (times.max() - times.min()).clamp_min(1e-9)
         columns += [torch.exp(-rate * share) for rate in RATES]
+    if material.answers is not None:
+        columns += [answer for answer in material.answers.to(values.dtype).T if bool(answer.any())]
     basis = torch.linalg.qr(torch.stack(columns, 1))[0]
     weights = weights * ((weights > 0).sum(1) >= ENOUGH * basis.shape[1])[:, None]
     inner = torch.einsum("pf,fi,fj->pij", weights, basis, basis)

@@ -43,7 +43,7 @@ class Inspection:
         if obs.tracks is None:
             return None
         terms = {effect.name: effect for effect in self.effects if effect.term is not None}
-        drivers = weather_record.drivers(obs)
+        drivers = weather_record.drivers(self.scene.weather, obs.times_s)
         tracks = obs.tracks if self.delays is None else self.delays.undone(obs)
         fit = fit_of(Data(terms, tracks, obs.times_s, obs.ambient, obs.noise, normals(obs), drivers))
         return selected(fit) if fit.observations > 0 else None

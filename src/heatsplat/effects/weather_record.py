@@ -27,19 +27,20 @@ def directed(scene: SceneData) -> str | None:
     return f"the weather lacks {', '.join(lacks)}, which it needs" if lacks else None
 
 
-def drivers(obs: Observations) -> Tensor | None:
-    """Answers [F, k] to air and sun at the frames' times, of unit size; None without a record."""
-    weather = obs.scene.weather
-    if weather is None or obs.times_s is None:
+def drivers(weather: Weather | None, times_s: Tensor | None, air: tuple[float, ...] = (SLOW_PER_S,)) -> Tensor | None:
+    """Answers [F, k] to air (of bodies of these rates) and sun at the frames' times, of unit size; None without a record."""
+    if weather is None or times_s is None:
         return None
-    found = [of_the_air(obs)]
+    found = [torch.zeros(len(times_s), 0, dtype=torch.float64)]
+    if weather.air_c is not None:
+        found.append(_answers(weather, weather.air_c, air, times_s))
     if weather.irradiance_w_m2 is not None:
-        found.append(_answers(weather, weather.irradiance_w_m2, (QUICK_PER_S, SLOW_PER_S), obs.times_s))
+        found.append(_answers(weather, weather.irradiance_w_m2, (QUICK_PER_S, SLOW_PER_S), times_s))
     if weather.direct_w_m2 is not None and weather.sun is not None:
         # Walls that face the morning and walls that face the evening: the sun's way along the ground.
         level = weather.sun - (weather.sun @ weather.up)[:, None] * weather.up
         _, _, axes = torch.linalg.svd(level - level.mean(0), full_matrices=False)
-        found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), obs.times_s))
+        found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), times_s))
     return torch.cat(found, 1)
 
 
@@ -58,14 +59,6 @@ def _span(values: Tensor) -> float:
     low = torch.nan_to_num(values, nan=torch.inf).amin(1)
     high = torch.nan_to_num(values, nan=-torch.inf).amax(1)
     return float((high - low)[(high > low)].quantile(0.9)) if bool((high > low).any()) else 0.0
-
-
-def of_the_air(obs: Observations) -> Tensor:
-    """Answers [F, k] to the air alone; k = 0 where the record lacks it."""
-    weather = obs.scene.weather
-    if weather.air_c is None:
-        return torch.zeros(len(obs.times_s), 0, dtype=torch.float64)
-    return _answers(weather, weather.air_c, (SLOW_PER_S,), obs.times_s)
 
 
 def at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:

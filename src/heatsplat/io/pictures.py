@@ -100,6 +100,7 @@ def comparison_panels(
     mask: Any = None,
     bounds: tuple[float, float] | None = None,
     error_limit: float | None = None,
+    against: str = "ground truth",
 ) -> list[Panel]:
     """Ground truth, render and their difference, for one picture or figure.
 
@@ -112,6 +113,7 @@ def comparison_panels(
         mask: [H, W] bool, True where a pixel counts; the others are hatched in ground truth and difference.
         bounds: ends of the colours in °C (image values without a range); None spreads them over the ground truth.
         error_limit: end of the difference's bar in the same unit; None takes that of ``error_limit_of``.
+        against: what the target is called.
     """
     target, prediction = (np.asarray(image, dtype=np.float32) for image in (target, prediction))
     counted, error = difference(target, prediction, thermal_range, mask)
@@ -134,9 +136,9 @@ def comparison_panels(
         bar = None
     error_bar = Bar(-error_limit, error_limit, unit, ERROR)
     return [
-        Panel(pictures[0], "ground truth"),
+        Panel(pictures[0], against),
         Panel(pictures[1], "render", bar),
-        Panel(colorize(error, -error_limit, error_limit, ERROR), "render − ground truth", error_bar),
+        Panel(colorize(error, -error_limit, error_limit, ERROR), f"render − {against}", error_bar),
     ]
 
 

@@ -28,8 +28,10 @@ def find(material: Material) -> list[Finding]:
     tracks = material.tracks
     if tracks is None or len(tracks.points) < MIN_POINTS or len(material.images) < MIN_FRAMES:
         return []
-    beside = beside_courses(tracks.values, tracks.weights, material)
-    for (values, weights), drifts in ((beside, _leap_beside), ((tracks.values, tracks.weights), _in_common)):
+    looks = [(*beside_courses(tracks.values, tracks.weights, material), _leap_beside)]
+    if material.answers is None:  # under one weather surfaces rise and fall in common
+        looks.append((tracks.values, tracks.weights, _in_common))
+    for values, weights, drifts in looks:
         levels = frame_levels(values, weights)
         before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
         if after < LEFT * before and drifts(material, values, weights, levels):
