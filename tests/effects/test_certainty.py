@@ -12,6 +12,7 @@ from heatsplat.effects.joint.courses import ANY
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import fit_of
 from heatsplat.effects.joint.model import Model
+from heatsplat.effects.physical import agc, frame_offset
 from heatsplat.effects.physical.attenuation import with_distance
 
 
@@ -51,6 +52,18 @@ def test_too_few_frames_are_told_with_how_many_are_needed():
     evidence = gained(looked(fit, NOTHING), "harmonic_source", "points change by")
     assert not evidence.told and evidence.statistic is None
     assert evidence.reason == "cannot be told: of 30 frames 7 see a point, and 13 are needed"
+
+
+def test_offsets_stay_where_gains_beside_them_are_left_out():
+    """A gain for each image brings a shift that takes the offsets; where gains are nothing they are still there."""
+    found = looked(fit_to(DRIFTING), Model.of(frame_offset=1, agc=1))
+    gains, offsets = agc.EFFECT.evidence(found), frame_offset.EFFECT.evidence(found)
+    assert gains.statistic == 0.0 and "nothing is lost without it" in gains.reason
+    assert offsets.told and offsets.statistic > frame_offset.EFFECT.threshold and offsets.gain_db > 5
+    stretched = levels() * (1 + 0.2 * drawn(FRAMES, seed=14)) + 0.1 * drawn(FRAMES, seed=15)
+    both = looked(fit_to(stretched), Model.of(frame_offset=1, agc=1))
+    assert agc.EFFECT.evidence(both).statistic > agc.EFFECT.threshold
+    assert frame_offset.EFFECT.evidence(both).statistic == 0.0
 
 
 def test_a_drift_that_goes_as_heat_may_be_heat():

@@ -56,7 +56,7 @@ def tilt(tmp_path, monkeypatch):
 
 def test_a_file_adds_an_effect(tilt):
     catalogue, assembly = tilt
-    assert assembly.NAMES[-1] == "tilt" and len(assembly.NAMES) == 24
+    assert assembly.NAMES[-1] == "tilt" and len(assembly.NAMES) == 25
     assert assembly.choices(CONF | {"tilt": True})["tilt"] == "on"
     verdict = catalogue._verdict(catalogue.CATALOGUE[-1], SimpleLook(), "auto")
     assert verdict.on and verdict.settings == {"start": 0.5}
@@ -64,7 +64,7 @@ def test_a_file_adds_an_effect(tilt):
     verdicts |= {"tilt": verdict, "agc": catalogue.Verdict("agc", True, 9.0, 1.0, "")}
     found = assembly.reconcile(verdicts)
     assert not found["agc"].on and found["agc"].reason == "a tilt excludes gains"
-    templates = PARTS | {"states": {"static": {}}, "parts": {}, "clip": "none"}
+    templates = PARTS | {"states": {"static": {}}, "parts": {}, "grid": {}, "clip": "none"}
     assert assembly.assemble(found, templates)["sensor"]["parts"] == {
         "tilt": {"_target_": "Tilt", "start": 0.5, "lr": 0.1}
     }

@@ -10,7 +10,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
-from heatsplat.effects.joint.evidence import gained, outdone
+from heatsplat.effects.joint.evidence import gained, judged, outdone
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
@@ -22,12 +22,17 @@ IN_COMMON = 0.15  # share of what half of the points leave that the other half h
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether each image has an offset that all its points share. Where gains change, their shift takes it."""
+    sentence = "images differ from each other by an offset of"
     both = inspected.joint is not None and {"agc", "frame_offset"} <= inspected.joint[1].names
     if both and not outdone(inspected, "agc", {"frame_offset", "tone"}):
+        fit, model = inspected.joint
+        alone = fit.without(model, "agc")
+        if inspected.certainty.idle("agc", model, alone):  # gains that are left out take no offsets
+            return judged(inspected, "frame_offset", sentence, alone, fit.without(alone, "frame_offset"))
         found = "gains change from image to image, and their shift takes what offsets there are"
         doubt = inspected.certainty.doubts.get("agc")
         return Evidence(None, f"{found}, if they do: {doubt}", told=False) if doubt else Evidence(0.0, found)
-    return gained(inspected, "frame_offset", "images differ from each other by an offset of")
+    return gained(inspected, "frame_offset", sentence)
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
