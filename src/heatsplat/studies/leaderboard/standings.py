@@ -126,9 +126,12 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
     entry.scores.append(score)
     entry.costs.append({**told, "steps": results["run"].get("steps")})
     entry.folders.append(folder)
-    entry.commands.append(
-        [f"{name}={value}" for name, value in overrides.items() if name not in ("row", "leaderboard.root")]
-    )
+    entry.commands.append([f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name)])
+
+
+def _of_the_board(name: str) -> bool:
+    """Whether an override says how a board is filled, or where its scenes lie on one machine, and not how a method trains."""
+    return name in ("row", "experiment", "data.root") or name.startswith("leaderboard.")
 
 
 def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
