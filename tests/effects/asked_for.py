@@ -1,4 +1,4 @@
-"""What holds of every effect of the scene's own geometry: on where it is asked for, and refused without directed light."""
+"""What is asked of every effect of the scene's own geometry: to be there where it is asked for, and to name the light it lacks."""
 
 from types import SimpleNamespace
 
@@ -9,27 +9,26 @@ from heatsplat.effects import assembly
 from heatsplat.effects.base import Effect, Verdict
 
 
-def brings_the_sun(effect: Effect, on: object, off: object) -> None:
-    """Where it is asked for, the sun comes with it, and of the state's settings its own alone differs: ``on`` for ``off``."""
+def asked_for(effect: Effect) -> tuple[set[str], dict[str, tuple]]:
+    """The effects that are on where this one alone is asked for, and the settings of the state that differ without it, each with
+    its value (with it, without it)."""
     asked = {other: Verdict(other, other == effect.name, None, None, "asked") for other in assembly.NAMES}
     found = assembly.reconcile(asked)
-    assert {"solar", effect.name} <= {name for name in found if found[name].on}
     templates = compose(["method=auto"])["effects"]
-    state = assembly.assemble(found, templates)["thermal"]["state"]
-    without = assembly.assemble(assembly.without(found, effect.name), templates)["thermal"]["state"]
-    assert (state[effect.name], without[effect.name]) == (on, off)
-    assert {key for key in state if state[key] != without[key]} == {effect.name}
+    state, without = (
+        assembly.assemble(verdicts, templates)["thermal"]["state"]
+        for verdicts in (found, assembly.without(found, effect.name))
+    )
+    on = {name for name in found if found[name].on}
+    return on, {key: (state[key], without[key]) for key in state if state[key] != without[key]}
 
 
-def needs_directed_light(effect: Effect) -> None:
-    """Weather that does not say from where light comes is named, and then no image tells the effect."""
-    series = torch.ones(2)
-    weather = SimpleNamespace(sun=series, direct_w_m2=series, diffuse_w_m2=series)
-    assert effect.missing(SimpleNamespace(weather=weather)) is None
-    weather.sun = None
-    assert "lacks sun" in effect.missing(SimpleNamespace(weather=weather))
-    nowhere = SimpleNamespace(beside=lambda name: None, parts=("solar",))
-    evidence = effect.evidence(SimpleNamespace(weathered=nowhere))
-    assert not evidence.told and "from where light comes" in evidence.reason
-    night = SimpleNamespace(parts=("radiation",))
-    assert "does not shine" in effect.evidence(SimpleNamespace(weathered=night)).reason
+def lacks(effect: Effect, **series: torch.Tensor | None) -> str | None:
+    """What a scene lacks whose weather has sun, direct and diffuse light, but for the series that are given."""
+    weather = dict.fromkeys(("sun", "direct_w_m2", "diffuse_w_m2"), torch.ones(2)) | series
+    return effect.missing(SimpleNamespace(weather=SimpleNamespace(**weather)))
+
+
+def told(effect: Effect, parts: tuple[str, ...]):
+    """The evidence under a weather in which so much of the sky plays a part, and that does not say from where light comes."""
+    return effect.evidence(SimpleNamespace(weathered=SimpleNamespace(beside=lambda name: None, parts=parts)))
