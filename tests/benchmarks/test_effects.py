@@ -33,7 +33,7 @@ def commands(monkeypatch):
 
     def trained(command, **_):
         given.append(command)
-        place = next(word.partition("=")[2] for word in command if word.startswith("hydra.run.dir="))
+        place = next(word.partition("=")[2].strip("'") for word in command if word.startswith("hydra.run.dir="))
         preset = next(word.partition("=")[2] for word in command if word.startswith("data.scene="))
         truth, on = set(PRESETS[preset]), set()
         if "effects=auto" in command or any(word.endswith("=on") for word in command):

@@ -1,4 +1,4 @@
-"""What is asked of every effect of the scene's own geometry: to be there where it is asked for, and to name the light it lacks."""
+"""What is asked of every effect of the scene's own geometry: there where it is asked for, and told what light it lacks."""
 
 from types import SimpleNamespace
 

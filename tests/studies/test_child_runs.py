@@ -10,8 +10,9 @@ from heatsplat.studies.child_runs import trained
 
 SCRIPT = """import json, sys
 from pathlib import Path
+from hydra.core.override_parser.overrides_parser import OverridesParser
 settings = dict(text.split("=", 1) for text in sys.argv[1:])
-place = Path(settings.pop("hydra.run.dir"))
+place = Path(OverridesParser.create().parse_override("hydra.run.dir=" + settings.pop("hydra.run.dir")).value())
 (place / ".hydra").mkdir(parents=True, exist_ok=True)
 (place / ".hydra" / "overrides.yaml").write_text(json.dumps([f"{k}={v}" for k, v in settings.items()]))
 if settings.get("seed") == "13":
@@ -34,8 +35,9 @@ def script(tmp_path) -> str:
     return str(path)
 
 
-def test_a_run_is_trained_once(script, tmp_path):
-    place = tmp_path / "study" / "one"
+@pytest.mark.parametrize("name", ["one", "thermal.frequencies=8, it's"])
+def test_a_run_is_trained_once(script, tmp_path, name):
+    place = tmp_path / "study" / name
     for threads in (1, 2):
         assert trained(place, script, ["seed=3", f"threads={threads}"], tmp_path / "study").run["seed"] == "3"
     assert (place / "times").read_text() == "once\n"

@@ -36,7 +36,8 @@ def trained(place: Path, train: str | None, overrides: Sequence[str], study: Pat
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
     program = [train] if train else ["-c", INSTALLED]
-    command = [sys.executable, *program, *overrides, f"hydra.run.dir={place}"]
+    quoted = str(place).replace("'", "\\'")  # Hydra takes no bare "=" or "," in a path
+    command = [sys.executable, *program, *overrides, f"hydra.run.dir='{quoted}'"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         failed = place / FAILED

@@ -20,6 +20,7 @@ from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
 SHOWN = ("views", "times")  # parts of which the view in the middle is shown
+QUALITY = 30  # of its WebP: hundreds of pictures are in one page
 
 
 def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
@@ -103,9 +104,13 @@ def _pictures(entries: Sequence[Entry], board: Board) -> list[dict[str, Any]]:
                 "low": low,
                 "high": high,
                 "limit": limit,
-                "truth": data_uri(colorize(exact, low, high, THERMAL)),
-                "renders": {method: data_uri(colorize(image, low, high, THERMAL)) for method, image in renders.items()},
-                "errors": {method: data_uri(colorize(image, -limit, limit, ERROR)) for method, image in errors.items()},
+                "truth": data_uri(colorize(exact, low, high, THERMAL), QUALITY),
+                "renders": {
+                    method: data_uri(colorize(image, low, high, THERMAL), QUALITY) for method, image in renders.items()
+                },
+                "errors": {
+                    method: data_uri(colorize(image, -limit, limit, ERROR), QUALITY) for method, image in errors.items()
+                },
             }
         )
     return shown
