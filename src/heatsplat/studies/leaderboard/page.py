@@ -20,7 +20,7 @@ from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
 SHOWN = ("views", "times")  # parts of which the view in the middle is shown
-QUALITY = 30  # of its WebP: hundreds of pictures are in one page
+QUALITY = 25  # of its WebP: hundreds of pictures are in one page
 
 
 def page(entries: Sequence[Entry], board: Board, folder: Path | None) -> str:
