@@ -41,6 +41,10 @@ or the weather says only roughly how it changes, it has to do so beside any chan
 which each point has its own measure. What gains less than 0.1 dB is absent, and so is a change where no such course gains more.
 An effect that was left out is in doubt only where it explains what was left out as well as one that is in doubt itself.
 
+What a hot thing warms as it passes shares no course with other points: each changes at a moment of its own. Where the scene
+cools otherwise, such points are counted (`effects/joint/moments.py`), and a source of all harmonics stands for what warms them.
+On `moving_source` they are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
+
 Sun, sky and wind are judged by balances of heat fitted with and without them (`effects/weathered.py`), massive walls by balances
 of bodies of one rate, with a core, and without an end. Shadows are cast by the sparse points: they add no number to a balance,
 gain 0.13 dB (3.2 standard errors) on `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, where there are none. Hidden sky, light
