@@ -20,7 +20,7 @@ from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import Frame, instant
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.writer import write_world
@@ -458,6 +458,11 @@ def write_whole(model: pycolmap.Reconstruction, folder: Path, work: Path) -> Non
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     model.write_binary(str(fresh))
+    put_whole(fresh, folder)
+
+
+def put_whole(fresh: Path, folder: Path) -> None:
+    """Puts a model that was written elsewhere in the place of one that may be there."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     fresh.rename(folder)
@@ -477,7 +482,7 @@ def _shape(path: Path) -> tuple[int, int]:
 
 
 def _moment(frame: Frame) -> float:
-    return 0.0 if frame.time is None else frame.time.timestamp()
+    return 0.0 if frame.time is None else instant(frame.time)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
