@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from camera_files import fff, raw_for, temperatures
+from camera_files import dji_jpeg, fff, raw_for, temperatures, with_segment
 from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
@@ -131,6 +131,21 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     (tmp_path / "broken" / "c.png").write_bytes(b"\x89PNG broken")
     with pytest.raises(SceneError, match=r"c\.png is corrupt"):
         read_frames(tmp_path / "broken")
+
+
+def test_pictures_of_dji_without_temperatures_are_refused_with_what_to_run_unless_bounds_are_given(tmp_path):
+    counts = (np.arange(512 * 640).reshape(512, 640) % 3000 + 18000).astype(np.uint16)
+    xmp = b'http://ns.adobe.com/xap/1.0/\0<x drone-dji:ImageSource="InfraredCamera"/>'
+    grey = cv2.imencode(".jpg", cv2.merge([(FLOATS * 5).astype(np.uint8)] * 3))[1].tobytes()
+    for name, data in (("counts", dji_jpeg(counts)), ("cut", with_segment(grey, 0xE1, xmp))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "DJI_1_T.JPG").write_bytes(data)
+        with pytest.raises(
+            SceneError, match="DJI_1_T.JPG is a thermal picture of DJI .*dji_irp -s IMAGE.JPG -a measure .*bounds_c"
+        ):
+            read_frames(tmp_path / name)
+    (frame,) = read_frames(tmp_path / "cut", Reading(Meaning(bounds_c=[0.0, 51.0])))
+    np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.6)  # of a JPEG
 
 
 def test_greys_that_were_stored_as_colours_are_greys(tmp_path):
