@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
@@ -22,7 +22,7 @@ from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_i
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of
-from heatsplat.physics.radiometry import Conditions
+from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position, instant
 from heatsplat.preparation.meaning import Meaning
 
@@ -110,6 +110,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             "or greys"
         )
     kind, thermal = there[0], kinds[there[0]]
+    reading.meaning.check_use(kind, KINDS[kind])
     notes: list[str] = []
     frames = list(_frames_of(kind, thermal, folder, reading, notes))
     frames = _paired(frames, [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])])
@@ -197,25 +198,39 @@ def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -
             )
         for number, (start, length) in enumerate(places):
             record = flir.Record(flir.read_part(path, start, length), f"{path}, frame {number}")
-            yield _of_flir(
-                record, path, _name(path, folder, number), number, partial(flir.read_part, path, start, length)
-            )
+            read = partial(flir.read_part, path, start, length)
+            yield _of_flir(record, path, _name(path, folder, number), number, read, planck=reading.meaning.planck)
         return
     data = read_bytes(path)
     if payload := flir.payload_of(data):
         record = flir.Record(payload, str(path))
-        yield _of_flir(record, path, _name(path, folder), 0, lambda: flir.payload_of(read_bytes(path)), data)
+        read = partial(_payload, path)
+        yield _of_flir(record, path, _name(path, folder), 0, read, data, planck=reading.meaning.planck)
     elif dji.array_of(data) is not None:
         yield _of_dji(path, _name(path, folder), data, reading)
     else:
         raise SceneError(f"{path} is no FLIR file; copy it again or remove it")
 
 
+def _payload(path: Path) -> bytes:
+    return flir.payload_of(read_bytes(path))
+
+
 def _of_flir(
-    record: flir.Record, path: Path, name: str, number: int, read: Callable[[], bytes], data: bytes = b""
+    record: flir.Record,
+    path: Path,
+    name: str,
+    number: int,
+    read: Callable[[], bytes],
+    data: bytes = b"",
+    planck: Sequence[float] | None = None,
 ) -> Frame:
-    """The frame of an FFF record. It is read anew for its pixels, so that a recording need not fit into memory."""
+    """The frame of an FFF record, by the camera's own constants unless others are given.
+
+    It is read anew for its pixels, so that a recording need not fit into memory.
+    """
     found = record.measured()
+    response = found.response if planck is None else PlanckResponse(*(float(x) for x in planck))
     details, camera = _of_exif(data)
     if found.time is not None:
         details["time"] = found.time
@@ -230,7 +245,7 @@ def _of_flir(
         path,
         number,
         load=lambda: again().counts(),
-        calibration=Calibration(found.response),
+        calibration=Calibration(response),
         conditions=found.conditions,
         sources=dict.fromkeys(found.given, "file"),
         camera=CameraInfo(
@@ -247,6 +262,8 @@ def _of_flir(
 
 
 def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
+    if reading.meaning.planck is not None:
+        raise SceneError(f"counts.planck are constants of FLIR's cameras; {path} is of DJI and holds kelvin")
     stated, xmp = dji.parameters_in(data), dji.xmp_in(data)
     details, camera = _of_exif(data)
 

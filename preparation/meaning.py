@@ -26,6 +26,13 @@ OTHERS = {
     "0.1 K of a Lepton in low gain": 0.1,
     "0.4 K of FLIR's low gain": 0.4,
 }
+# By kind of files, which settings say what their numbers mean; a camera's own calibration goes before scale and bounds.
+SETTINGS = {
+    "radiometric": ("counts.planck",),
+    "counts": ("counts.scale", "counts.offset_c", "counts.planck"),
+    "float": ("counts.scale", "counts.offset_c"),
+    "grey": ("bounds_c",),
+}
 # Floats in this range may be kelvin of a room or °C of a furnace; nothing tells.
 MAYBE_KELVIN = (200.0, 400.0)
 
@@ -56,6 +63,19 @@ class Meaning:
             raise SceneError(f"bounds_c needs two values [min, max] in °C, got {list(self.bounds_c)}")
         if len(self.band_um) != 2 or not 0 < self.band_um[0] < self.band_um[1]:
             raise SceneError(f"band_um needs two rising wavelengths in µm, got {list(self.band_um)}")
+
+    def check_use(self, kind: str, what: str) -> None:
+        """Raises SceneError where something is said that files of this kind, ``what``, have no use for."""
+        said = {f"counts.{name}": getattr(self, name) for name in ("scale", "offset_c", "planck")} | {
+            "bounds_c": self.bounds_c
+        }
+        used = SETTINGS[kind]
+        if idle := [name for name, value in said.items() if value is not None and name not in used]:
+            raise SceneError(
+                f"{idle[0]} changes nothing for {what}; what their numbers mean is said by {' or '.join(used)}, or by the files"
+            )
+        if kind == "counts" and self.offset_c is not None and self.scale is None:
+            raise SceneError("counts.offset_c is the °C of count 0 and needs counts.scale, the °C per count, beside it")
 
     @property
     def response(self) -> BandResponse:

@@ -85,7 +85,9 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
-        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)  # it would fill the screen
+        pycolmap.logging.minloglevel = int(
+            pycolmap.logging.Level.FATAL
+        )  # what went wrong is said below, by names of frames
         search = Search(self, frames, target)
         search.copies()
         search.find_features()

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from camera_files import dji_jpeg, fff, raw_for, temperatures, with_segment
 from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
 
@@ -68,6 +69,27 @@ def test_photos_belong_to_the_frames_of_their_exposure(tmp_path):
     first, second = read_frames(tmp_path)
     assert first.rgb == tmp_path / "rgb" / "DJI_20240101120001_0007_V.jpg" and second.rgb is None
     assert first.time == datetime(2024, 1, 1, 12)
+
+
+def test_constants_of_a_camera_that_are_given_go_before_those_of_its_files(tmp_path):
+    own, path = read_frames(write_flir(tmp_path, 1))[0], tmp_path
+    p = own.calibration.response
+    (other,) = read_frames(path, Reading(Meaning(planck=[p.r1, p.b, p.f, p.o + 300, p.r2])))
+    lower = other.calibration.response.kelvin(torch.tensor([15000.0])) - p.kelvin(torch.tensor([15000.0]))
+    assert float(lower) > 0.5 and np.nanmedian(other.temperature() - own.temperature()) > 0.5
+
+
+def test_what_is_said_of_numbers_and_changes_nothing_is_refused(tmp_path):
+    write_flir(tmp_path / "flir", 1)
+    with pytest.raises(
+        SceneError, match="counts.scale changes nothing for radiometric files; .* counts.planck, or by the files"
+    ):
+        read_frames(tmp_path / "flir", Reading(Meaning(scale=0.01)))
+    write_images(tmp_path / "counts", {"a.png": (100 * (FLOATS + 273.15)).astype(np.uint16)})
+    with pytest.raises(SceneError, match="bounds_c changes nothing for 16-bit images"):
+        read_frames(tmp_path / "counts", Reading(Meaning(bounds_c=[0, 50])))
+    with pytest.raises(SceneError, match="counts.offset_c is the °C of count 0 and needs counts.scale"):
+        read_frames(tmp_path / "counts", Reading(Meaning(offset_c=0.0)))
 
 
 def test_a_zone_is_given_to_times_that_have_none(tmp_path):
