@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from rich.progress import Progress, track
 from heatsplat.contracts import SceneError, check_option, evenly_spread
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame, instant
@@ -27,6 +29,7 @@ from heatsplat.preparation.writer import write_world
 
 log = logging.getLogger(__name__)
 
+MADE_OF = "made_of"  # file in the work folder
 WORK = ".poses"  # folder in the prepared one: copies, features and matches, from which a stopped search goes on
 PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
@@ -89,6 +92,7 @@ class FindPoses:
             pycolmap.logging.Level.FATAL
         )  # what went wrong is said below, by names of frames
         search = Search(self, frames, target)
+        search.begin()
         search.copies()
         search.find_features()
         search.match()
@@ -116,6 +120,14 @@ class Search:
         self.name_of = {copy: name for name, copy in self.copy_of.items()}
         self.database = self.work / "database.db"
         self.origin = self._origin()
+
+    def begin(self) -> None:
+        """Takes away what an earlier search left that had other frames or other settings."""
+        made_of, note = self._made_of(), self.work / MADE_OF
+        if self.work.is_dir() and (not note.is_file() or note.read_text() != made_of):
+            log.info("frames or settings of the search for cameras have changed: it begins anew")
+            shutil.rmtree(self.work)
+        write_atomically(note, made_of)
 
     def copies(self) -> None:
         """8-bit copies of all frames (and photos) in the work folder."""
@@ -275,6 +287,12 @@ class Search:
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
         return Section("Poses", lines, values)
+
+    def _made_of(self) -> str:
+        """What copies, features and matches depend on."""
+        stats = [(self.target / "images" / name).stat() for name in self.frames]
+        images = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(self.frames, stats, strict=True)]
+        return hashlib.sha256(repr([self.options, images, *self.frames.values()]).encode()).hexdigest()
 
     # What the frames say -----------------------------------------------------------------------------------------------
 
