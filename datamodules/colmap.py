@@ -16,6 +16,7 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
+from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
 
@@ -61,6 +62,7 @@ class Colmap(SceneDataModule):
         time_csv_name, time_csv_time: its columns of image names and of times (seconds or ISO date-times).
         ambient_c: temperature of the surroundings in °C, or None.
         metres_per_unit: scale of the sparse model; None takes the world.json of a prepared folder, where there is one.
+        random_points: number of points to make up where the sparse model has none.
         shared: options of every loader (``SceneDataModule``).
     """
 
@@ -81,6 +83,7 @@ class Colmap(SceneDataModule):
         time_csv_time: str = "time_s",
         ambient_c: float | None = None,
         metres_per_unit: float | None = None,
+        random_points: int = 20_000,
         **shared: Any,
     ) -> None:
         super().__init__(**shared)
@@ -102,6 +105,7 @@ class Colmap(SceneDataModule):
         self.time_csv_columns = (time_csv_name, time_csv_time)
         self.ambient_c = ambient_c
         self.metres_per_unit = metres_per_unit
+        self.random_points = random_points
 
     def load(self) -> SceneData:
         folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)")
@@ -139,11 +143,15 @@ class Colmap(SceneDataModule):
             notes["masks"] = f"{masked} of {len(frames)} images have a mask in {self.masks}/ ({self.mask_keep} counts)"
         if rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
+        points, colors = model.points, model.colors
+        if not len(points):
+            points, colors = random_points([f.viewmat for f in frames], self.random_points, self.seed), None
+            notes |= told_random(len(points), ": the sparse model has none")
         scene = self.finish(
             folder.name,
             frames,
-            model.points,
-            point_colors=model.colors,
+            points,
+            point_colors=colors,
             thermal_range=bounds,
             counts=counts,
             ambient_c=self.ambient_c,

@@ -22,7 +22,7 @@ from heatsplat.datamodules.formats.images import (
     split_alpha,
 )
 from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
-from heatsplat.datamodules.points import ply_points, random_points
+from heatsplat.datamodules.points import ply_points, random_points, told_random
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
 from heatsplat.datamodules.timestamps import stem_of
@@ -64,8 +64,8 @@ class Nerfstudio(SceneDataModule):
         if first.assumed:
             notes["keys_assumed"] = f"image paths stand under {first.assumed}"
         frames, found = self._frames(folder, listed, bounds)
-        points, colors, source = self._points(folder, first, frames)
-        notes |= found | {"points_source": source, "time_source": "none: the data set has no times"}
+        points, colors, origin = self._points(folder, first, frames)
+        notes |= found | origin | {"time_source": "none: the data set has no times"}
         split, says = self._split(frames, first)
         notes |= says
         if assumed := [notes[key] for key in ("keys_assumed", "images_assumed", "split_assumed") if key in notes]:
@@ -150,8 +150,8 @@ class Nerfstudio(SceneDataModule):
 
     def _points(
         self, folder: Path, transforms: Transforms, frames: Sequence[RawFrame]
-    ) -> tuple[np.ndarray, np.ndarray | None, str]:
-        """Points in the world of the JSON, their colours, and where they come from."""
+    ) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
+        """Points in the world of the JSON, their colours, and notes about where they come from."""
         rejected = ""
         if find_model(folder) is not None:
             model = read_model(folder)
@@ -165,14 +165,15 @@ class Nerfstudio(SceneDataModule):
             spread = np.ptp(np.stack([np.linalg.inv(f.viewmat)[:3, 3] for f in frames]), axis=0).max()
             if apart <= 0.05 * spread + 1e-6:
                 place = model.folder.relative_to(folder)
-                return model.points @ turn[:3, :3].T + turn[:3, 3], model.colors, f"{place} (COLMAP), applied_transform"
+                points = model.points @ turn[:3, :3].T + turn[:3, 3]
+                return points, model.colors, {"points_source": f"{place} (COLMAP), applied_transform"}
             rejected = f"; the model in {model.folder} is not used: its cameras lie up to {apart:.3g} units elsewhere"
         ply = transforms.values.get("ply_file_path")
         if ply and (transforms.path.parent / str(ply)).is_file():
             points, colors = ply_points(transforms.path.parent / str(ply))
-            return points, colors, f"{ply}{rejected}"
+            return points, colors, {"points_source": f"{ply}{rejected}"}
         points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
-        return points, None, f"{len(points)} random points in the cube that the cameras look at{rejected}"
+        return points, None, told_random(len(points), rejected)
 
 
 def find_transforms(folder: Path) -> dict[Path, str | None]:

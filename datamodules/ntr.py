@@ -14,7 +14,7 @@ from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import range_in
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
-from heatsplat.datamodules.points import obj_vertices, random_points
+from heatsplat.datamodules.points import obj_vertices, random_points, told_random
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.surroundings import OutdoorDataModule
 from heatsplat.datamodules.weather import utc_seconds
@@ -81,7 +81,7 @@ class NTR(OutdoorDataModule):
         }
         if missing:
             notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
-        points, notes["points_source"] = mesh_points(folder, frames, self.random_points, self.seed)
+        points, origin = mesh_points(folder, frames, self.random_points, self.seed)
         return self.finish(
             folder.name,
             frames,
@@ -89,7 +89,7 @@ class NTR(OutdoorDataModule):
             thermal_range=self.bounds,
             ambient_c=self.ambient_c,
             metres_per_unit=self.metres_per_unit,
-            notes=notes,
+            notes=notes | origin,
             **self.surroundings.read(folder, {}, frames),
         )
 
@@ -136,10 +136,10 @@ def listed_frames(
     return frames, missing
 
 
-def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, str]:
-    """Points [P, 3] of a scene and where they come from: vertices of mesh.obj, or ``count`` random ones without it."""
+def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """Points [P, 3] of a scene and notes on their origin: vertices of mesh.obj, or ``count`` random ones without it."""
     mesh = folder / "mesh.obj"
     if mesh.is_file():
-        return obj_vertices(mesh), "vertices of mesh.obj"
+        return obj_vertices(mesh), {"points_source": "vertices of mesh.obj"}
     points = random_points([f.viewmat for f in frames], count, seed)
-    return points, f"{len(points)} random points in the cube that the cameras look at: no mesh.obj"
+    return points, told_random(len(points), ": no mesh.obj")

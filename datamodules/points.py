@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,6 +38,11 @@ def random_points(viewmats: Sequence[np.ndarray], count: int, seed: int) -> np.n
     half = max(np.median(np.linalg.norm(centers - centre, axis=1)), radius)
     unit = torch.rand((count, 3), generator=generator_for(seed, 0, "random points"), dtype=torch.float64)
     return centre + half * (2.0 * unit.numpy() - 1.0)
+
+
+def told_random(count: int, why: str) -> dict[str, Any]:
+    """Notes of points that were made up: nothing may be judged by where they lie."""
+    return {"points_source": f"{count} random points in the cube that the cameras look at{why}", "points_random": count}
 
 
 def obj_vertices(path: Path) -> np.ndarray:

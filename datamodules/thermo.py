@@ -109,11 +109,11 @@ class Thermo(OutdoorDataModule):
         """Frames, points with their colours, and notes, from the JSON files or the sparse model."""
         if _has_transforms(folder):
             frames, missing = listed_frames(self, folder, partial(self._described, meta))
-            points, source = mesh_points(folder, frames, self.random_points, self.seed)
+            points, origin = mesh_points(folder, frames, self.random_points, self.seed)
             notes: dict[str, Any] = {
                 "registered": len(frames) + len(missing),
                 "cameras": "transforms_train.json and transforms_test.json, OpenCV axes",
-                "points_source": source,
+                **origin,
             }
             if missing:
                 notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"

@@ -14,16 +14,18 @@ import torch
 from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
-from heatsplat.datamodules.formats.exif import exif_in
+from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
-from heatsplat.preparation.frames import Reading, read_recording
+from heatsplat.preparation.frame import Frame, instant
+from heatsplat.preparation.frames import Reading, read_recording, taken_at, zone_of
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section
 
 log = logging.getLogger(__name__)
 
+QUARTER_S = 900.0  # zones lie whole quarters of an hour apart
 DONE = {"dead_pixels": "The masks of the prepared scene leave them out."}  # what a preparation does by itself
 
 
@@ -97,20 +99,32 @@ def _recorded(folder: Path, reading: Reading) -> Material:
     images = [frames[i].pixels() for i in chosen]
     kept = [k for k, image in enumerate(images) if image.shape == images[0].shape]
     known = all(frame.calibration is not None for frame in frames)
-    times = [None if frame.time is None else frame.time.timestamp() for frame in frames]
+    times = [None if frame.time is None else instant(frame.time) for frame in frames]
     return Material(
         names=[frame.name for frame in frames],
         times_s=None if any(time is None for time in times) else times,
         chosen=[chosen[k] for k in kept],
         images=torch.from_numpy(np.stack([images[k] for k in kept])).double(),
         unit_k=1.0 if known else None,
-        rgb_times_s=_photo_times([frame.rgb for frame in frames]),
+        rgb_times_s=_photo_times(frames, reading.zone),
     )
 
 
-def _photo_times(photos: Sequence[Path | None]) -> list[float] | None:
-    """When photos were taken, on their camera's clock; None where one does not say."""
-    times = [None if photo is None else exif_in(photo.read_bytes()).get("time") for photo in photos]
-    if not times or any(time is None for time in times):
-        return None
-    return [time.timestamp() for time in times]
+def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | None:
+    """When photos were taken, on their camera's clock; None where one does not say.
+
+    Where only one of the two clocks says its zone, the other is taken to be in the zone that brings them closest: whole
+    quarters of an hour between them are no error of a clock.
+    """
+    found = []
+    for frame in frames:
+        taken = None if frame.rgb is None else taken_at(read_bytes(frame.rgb))
+        if taken is None or frame.time is None:
+            return None
+        if taken.tzinfo is None and zone is not None:
+            taken = taken.replace(tzinfo=zone_of(zone))
+        apart = instant(taken) - instant(frame.time)
+        if (taken.tzinfo is None) != (frame.time.tzinfo is None):
+            apart -= QUARTER_S * round(apart / QUARTER_S)
+        found.append(instant(frame.time) + apart)
+    return found or None

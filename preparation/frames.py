@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from functools import partial
@@ -22,8 +22,8 @@ from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_i
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of
-from heatsplat.physics.radiometry import Conditions
-from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
+from heatsplat.physics.radiometry import Conditions, PlanckResponse
+from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position, instant
 from heatsplat.preparation.meaning import Meaning
 
 __all__ = ["Attitude", "CameraInfo", "Frame", "Position", "Reading", "Recording", "read_frames", "read_recording"]
@@ -86,8 +86,15 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
+    greys_known = reading.meaning.of_greys(folder)[0] is not None
     for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file()):
-        kinds.setdefault(_kind(path), []).append(path)
+        kind = _kind(path)
+        if kind == "sealed" and not greys_known:
+            raise SceneError(
+                f"{path} is a thermal picture of DJI whose temperatures cannot be read: its sensor values are counts, or not "
+                f"there; {dji.CONVERT}. bounds_c=[min,max] takes the pictures as greys between these °C"
+            )
+        kinds.setdefault("colour" if kind == "sealed" else kind, []).append(path)
     if "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
         kinds = _greys_in_colour(kinds, folder)
     there = [kind for kind in KINDS if kinds.get(kind)]
@@ -103,13 +110,14 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             "or greys"
         )
     kind, thermal = there[0], kinds[there[0]]
+    reading.meaning.check_use(kind, KINDS[kind])
     notes: list[str] = []
     frames = list(_frames_of(kind, thermal, folder, reading, notes))
     frames = _paired(frames, [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])])
     frames = [_zoned(frame, reading.zone) for frame in _with_table(frames, reading, notes)]
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
-        frames.sort(key=lambda f: (_instant(f.time), f.name))
+        frames.sort(key=lambda f: (instant(f.time), f.name))
     else:
         notes.append(
             f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time; they are in the order of names"
@@ -117,18 +125,18 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     return Recording(frames, notes)
 
 
-def _instant(moment: datetime | None) -> float:
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
 def _kind(path: Path) -> str:
-    """ "radiometric", "float", "counts", "grey" or "colour". Raises SceneError for what is no image."""
+    """ "radiometric", "float", "counts", "grey", "colour", or "sealed": a thermal picture whose numbers only its maker's
+    software converts. Raises SceneError for what is no image."""
     if path.suffix.lower() in RECORDS:
         return "radiometric"
     if path.suffix.lower() in (".jpg", ".jpeg"):
         data = read_bytes(path)
-        if flir.payload_of(data) or dji.array_of(data) is not None:
+        array = dji.array_of(data)
+        if flir.payload_of(data) or (array is not None and dji.holds_temperatures(array)):
             return "radiometric"
+        if array is not None or dji.is_thermal(data):
+            return "sealed"
     try:
         with Image.open(path) as image:
             mode = image.mode
@@ -190,25 +198,39 @@ def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -
             )
         for number, (start, length) in enumerate(places):
             record = flir.Record(flir.read_part(path, start, length), f"{path}, frame {number}")
-            yield _of_flir(
-                record, path, _name(path, folder, number), number, partial(flir.read_part, path, start, length)
-            )
+            read = partial(flir.read_part, path, start, length)
+            yield _of_flir(record, path, _name(path, folder, number), number, read, planck=reading.meaning.planck)
         return
     data = read_bytes(path)
     if payload := flir.payload_of(data):
         record = flir.Record(payload, str(path))
-        yield _of_flir(record, path, _name(path, folder), 0, lambda: flir.payload_of(read_bytes(path)), data)
+        read = partial(_payload, path)
+        yield _of_flir(record, path, _name(path, folder), 0, read, data, planck=reading.meaning.planck)
     elif dji.array_of(data) is not None:
         yield _of_dji(path, _name(path, folder), data, reading)
     else:
         raise SceneError(f"{path} is no FLIR file; copy it again or remove it")
 
 
+def _payload(path: Path) -> bytes:
+    return flir.payload_of(read_bytes(path))
+
+
 def _of_flir(
-    record: flir.Record, path: Path, name: str, number: int, read: Callable[[], bytes], data: bytes = b""
+    record: flir.Record,
+    path: Path,
+    name: str,
+    number: int,
+    read: Callable[[], bytes],
+    data: bytes = b"",
+    planck: Sequence[float] | None = None,
 ) -> Frame:
-    """The frame of an FFF record. It is read anew for its pixels, so that a recording need not fit into memory."""
+    """The frame of an FFF record, by the camera's own constants unless others are given.
+
+    It is read anew for its pixels, so that a recording need not fit into memory.
+    """
     found = record.measured()
+    response = found.response if planck is None else PlanckResponse(*(float(x) for x in planck))
     details, camera = _of_exif(data)
     if found.time is not None:
         details["time"] = found.time
@@ -223,7 +245,7 @@ def _of_flir(
         path,
         number,
         load=lambda: again().counts(),
-        calibration=Calibration(found.response),
+        calibration=Calibration(response),
         conditions=found.conditions,
         sources=dict.fromkeys(found.given, "file"),
         camera=CameraInfo(
@@ -240,7 +262,8 @@ def _of_flir(
 
 
 def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
-    dji.temperatures(dji.array_of(data), path)  # refuses what only DJI's SDK converts
+    if reading.meaning.planck is not None:
+        raise SceneError(f"counts.planck are constants of FLIR's cameras; {path} is of DJI and holds kelvin")
     stated, xmp = dji.parameters_in(data), dji.xmp_in(data)
     details, camera = _of_exif(data)
 
@@ -250,11 +273,8 @@ def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
         except (KeyError, ValueError):
             return None
 
-    if text := xmp.get("UTCAtExposure"):
-        try:
-            details["time"] = datetime.fromisoformat(text).replace(tzinfo=UTC)
-        except ValueError:
-            log.debug("%s: UTCAtExposure is %r", path, text)
+    if (taken := taken_at(data)) is not None:
+        details["time"] = taken
     if (place := details.get("position")) is not None:
         spread = [s for s in (number("RtkStdLat"), number("RtkStdLon")) if s is not None]
         details["position"] = replace(
@@ -278,6 +298,16 @@ def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
         camera=replace(camera, serial=xmp.get("CameraSerialNumber") or camera.serial),
         **details,
     )
+
+
+def taken_at(data: bytes) -> datetime | None:
+    """When a picture was taken: DJI's UTC at the exposure, or EXIF's clock, with a zone where it says one; None without."""
+    if text := dji.xmp_in(data).get("UTCAtExposure"):
+        try:
+            return datetime.fromisoformat(text).replace(tzinfo=UTC)
+        except ValueError:
+            log.debug("UTCAtExposure is %r", text)
+    return exif_in(data).get("time")
 
 
 def _of_exif(data: bytes) -> tuple[dict[str, object], CameraInfo]:

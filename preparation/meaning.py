@@ -19,6 +19,20 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 CENTIKELVIN = 0.01
 # 16-bit frames whose median and whose bulk lie so are taken for kelvin x 100 (Lepton's TLinear, Boson's radiometric video).
 MEDIAN_C, BULK_K = (-40.0, 100.0), 200.0
+# °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
+OTHERS = {
+    "DJI's 1/64 K": 1.0 / PER_KELVIN,
+    "0.04 K of FLIR's Vue, Duo and Tau": 0.04,
+    "0.1 K of a Lepton in low gain": 0.1,
+    "0.4 K of FLIR's low gain": 0.4,
+}
+# By kind of files, which settings say what their numbers mean; a camera's own calibration goes before scale and bounds.
+SETTINGS = {
+    "radiometric": ("counts.planck",),
+    "counts": ("counts.scale", "counts.offset_c", "counts.planck"),
+    "float": ("counts.scale", "counts.offset_c"),
+    "grey": ("bounds_c",),
+}
 # Floats in this range may be kelvin of a room or °C of a furnace; nothing tells.
 MAYBE_KELVIN = (200.0, 400.0)
 
@@ -50,6 +64,19 @@ class Meaning:
         if len(self.band_um) != 2 or not 0 < self.band_um[0] < self.band_um[1]:
             raise SceneError(f"band_um needs two rising wavelengths in µm, got {list(self.band_um)}")
 
+    def check_use(self, kind: str, what: str) -> None:
+        """Raises SceneError where something is said that files of this kind, ``what``, have no use for."""
+        said = {f"counts.{name}": getattr(self, name) for name in ("scale", "offset_c", "planck")} | {
+            "bounds_c": self.bounds_c
+        }
+        used = SETTINGS[kind]
+        if idle := [name for name, value in said.items() if value is not None and name not in used]:
+            raise SceneError(
+                f"{idle[0]} changes nothing for {what}; what their numbers mean is said by {' or '.join(used)}, or by the files"
+            )
+        if kind == "counts" and self.offset_c is not None and self.scale is None:
+            raise SceneError("counts.offset_c is the °C of count 0 and needs counts.scale, the °C per count, beside it")
+
     @property
     def response(self) -> BandResponse:
         """Of a camera that sees the band."""
@@ -80,12 +107,16 @@ class Meaning:
                 "counts.scale and counts.offset_c say otherwise",
             )
         middle = float(np.median(sample))
-        drone = middle / PER_KELVIN - KELVIN_AT_0_C
-        hint = f" As DJI's 1/64 K they would be {drone:.1f} °C (counts.scale={1 / PER_KELVIN})."
+        would = {name: (scale, scale * middle - KELVIN_AT_0_C) for name, scale in OTHERS.items()}
+        hints = [
+            f" As {name} they would be {celsius:.1f} °C (counts.scale={scale:g})."
+            for name, (scale, celsius) in would.items()
+            if MEDIAN_C[0] < celsius < MEDIAN_C[1]
+        ]
         raise SceneError(
             f"{path} holds 16-bit counts around {middle:.0f}, which are no kelvin x 100. Say what they mean: "
             "counts.scale and counts.offset_c (°C = scale * count + offset), or counts.planck=[R1,B,F,O,R2] of the camera."
-            + (hint if MEDIAN_C[0] < drone < MEDIAN_C[1] else "")
+            + "".join(hints)
         )
 
     def of_floats(self, sample: np.ndarray, path: Path) -> tuple[Calibration, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
@@ -18,15 +19,17 @@ from rich.progress import Progress, track
 from heatsplat.contracts import SceneError, check_option, evenly_spread
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import Frame, instant
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.writer import write_world
 
 log = logging.getLogger(__name__)
 
+MADE_OF = "made_of"  # file in the work folder
 WORK = ".poses"  # folder in the prepared one: copies, features and matches, from which a stopped search goes on
 PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
@@ -85,8 +88,11 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
-        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)  # it would fill the screen
+        pycolmap.logging.minloglevel = int(
+            pycolmap.logging.Level.FATAL
+        )  # what went wrong is said below, by names of frames
         search = Search(self, frames, target)
+        search.begin()
         search.copies()
         search.find_features()
         search.match()
@@ -114,6 +120,14 @@ class Search:
         self.name_of = {copy: name for name, copy in self.copy_of.items()}
         self.database = self.work / "database.db"
         self.origin = self._origin()
+
+    def begin(self) -> None:
+        """Takes away what an earlier search left that had other frames or other settings."""
+        made_of, note = self._made_of(), self.work / MADE_OF
+        if self.work.is_dir() and (not note.is_file() or note.read_text() != made_of):
+            log.info("frames or settings of the search for cameras have changed: it begins anew")
+            shutil.rmtree(self.work)
+        write_atomically(note, made_of)
 
     def copies(self) -> None:
         """8-bit copies of all frames (and photos) in the work folder."""
@@ -273,6 +287,12 @@ class Search:
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
         return Section("Poses", lines, values)
+
+    def _made_of(self) -> str:
+        """What copies, features and matches depend on."""
+        stats = [(self.target / "images" / name).stat() for name in self.frames]
+        images = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(self.frames, stats, strict=True)]
+        return hashlib.sha256(repr([self.options, images, *self.frames.values()]).encode()).hexdigest()
 
     # What the frames say -----------------------------------------------------------------------------------------------
 
@@ -458,6 +478,11 @@ def write_whole(model: pycolmap.Reconstruction, folder: Path, work: Path) -> Non
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     model.write_binary(str(fresh))
+    put_whole(fresh, folder)
+
+
+def put_whole(fresh: Path, folder: Path) -> None:
+    """Puts a model that was written elsewhere in the place of one that may be there."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     fresh.rename(folder)
@@ -477,7 +502,7 @@ def _shape(path: Path) -> tuple[int, int]:
 
 
 def _moment(frame: Frame) -> float:
-    return 0.0 if frame.time is None else frame.time.timestamp()
+    return 0.0 if frame.time is None else instant(frame.time)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

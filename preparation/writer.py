@@ -11,7 +11,6 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from heatsplat.physics.defects import dead_pixels
 from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, measured_signal, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import Frame, instant
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
 PARTIAL = ".partial"  # folder of what is being written
@@ -202,18 +201,14 @@ def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
 def rows(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row for each frame: file, time, place, temperatures."""
     timed = all(frame.time is not None for frame in frames)
-    first = _seconds(frames[0].time) if timed else 0.0
+    first = instant(frames[0].time) if timed else 0.0
     found = []
     for frame, record in zip(frames, records, strict=True):
         quantiles = record["quantiles"] or [None] * len(QUANTILES)
-        row = {"file": record["file"]} | ({"time_s": _seconds(frame.time) - first} if timed else {})
+        row = {"file": record["file"]} | ({"time_s": instant(frame.time) - first} if timed else {})
         row |= {"time": record["time"], **(record["position"] or {}), **(record["attitude"] or {})}
         found.append(row | {"least": quantiles[0], "median": quantiles[len(quantiles) // 2], "most": quantiles[-1]})
     return found
-
-
-def _seconds(moment: datetime) -> float:
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -19,6 +19,12 @@ SIZES = {640 * 512 * 2: (512, 640), 1280 * 1024 * 2: (1024, 1280)}
 RANGE_C = (-60.0, 650.0)
 PER_KELVIN = 64.0  # counts where the array holds temperatures (M3T and some M4T files)
 
+# What to run where the array holds counts, or is not there; docs/your_own_data.md has the whole of it.
+CONVERT = (
+    "only DJI's Thermal SDK converts them: dji_irp -s IMAGE.JPG -a measure --measurefmt float32 -o IMAGE.raw for each file, "
+    "then make a float TIFF of each .raw (docs/your_own_data.md, Files of DJI)"
+)
+
 # Object parameters of the M3T's kind (ExifTool's ThermalParams2): five floats, then a mark of their block 32 bytes on.
 _PARAMETERS_MARK = b"\x2c\x01\x20\x00"
 _XMP_VALUE = re.compile(rb'drone-dji:(\w+)\s*=\s*"([^"]{0,200})"')
@@ -30,20 +36,31 @@ def array_of(data: bytes) -> np.ndarray | None:
     return np.frombuffer(joined, "<u2").reshape(SIZES[len(joined)]) if len(joined) in SIZES else None
 
 
+def is_thermal(data: bytes) -> bool:
+    """Whether a picture is one of a DJI thermal camera, even where its array is cut or of an unknown size."""
+    stored = [payload for marker, payload in segments(data) if marker in (0xE3, 0xE4)]
+    said = xmp_in(data)
+    return said.get("ImageSource") == "InfraredCamera" or bool(stored) and (bool(said) or b"iirp" in stored[-1][:16])
+
+
+def holds_temperatures(counts: np.ndarray) -> bool:
+    """Whether an array holds 1/64 K in steps of 1/16 K, and not counts that only DJI's SDK converts."""
+    celsius = counts / PER_KELVIN - KELVIN_AT_0_C
+    return not (counts % 4).any() and celsius.min() >= RANGE_C[0] and celsius.max() <= RANGE_C[1]
+
+
 def temperatures(counts: np.ndarray, path: Path) -> np.ndarray:
     """Apparent temperatures in °C [H, W] float32 of an array that holds 1/64 K.
 
     Raises:
         SceneError: it holds counts that only DJI's SDK converts.
     """
-    celsius = counts.astype(np.float32) / PER_KELVIN - KELVIN_AT_0_C
-    if (counts % 4).any() or celsius.min() < RANGE_C[0] or celsius.max() > RANGE_C[1]:
+    if not holds_temperatures(counts):
         raise SceneError(
-            f"{path}: its sensor values are not multiples of 1/16 K (as in M3T files) but counts that only DJI's Thermal SDK "
-            "converts: export temperatures as float TIFF with it (dji_irp -a measure --measurefmt float32 -s IMAGE.JPG -o OUT), "
-            "or use the pictures with data.radiometric=never"
+            f"{path}: its sensor values are not multiples of 1/16 K (as in M3T files) but counts; {CONVERT}. "
+            "data.radiometric=never takes the pictures as greys"
         )
-    return celsius.astype(np.float32)
+    return counts.astype(np.float32) / PER_KELVIN - np.float32(KELVIN_AT_0_C)
 
 
 def parameters_in(data: bytes) -> dict[str, float]:

@@ -6,7 +6,7 @@ import pytest
 from camera_files import dji_jpeg, with_segment
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.formats.dji import array_of, parameters_in, temperatures, xmp_in
+from heatsplat.datamodules.formats.dji import array_of, is_thermal, parameters_in, temperatures, xmp_in
 
 M3T = Path(__file__).parents[3] / "shared" / "data" / "m3t_heath"
 needs_m3t = pytest.mark.skipif(not M3T.is_dir(), reason="real DJI data is not at ../shared/data/m3t_heath")
@@ -21,8 +21,17 @@ def test_the_array_is_read_and_is_temperatures_where_it_holds_sixteenths_of_a_ke
 
 
 def test_counts_are_refused_with_the_command_that_converts_them():
-    with pytest.raises(SceneError, match="b.jpg: .*dji_irp -a measure --measurefmt float32"):
+    with pytest.raises(SceneError, match="b.jpg: .*dji_irp -s IMAGE.JPG -a measure --measurefmt float32"):
         temperatures(RAW + 1, Path("b.jpg"))
+
+
+def test_a_thermal_picture_is_known_without_its_array():
+    plain = dji_jpeg(RAW[:100])
+    assert not is_thermal(plain)  # of another maker
+    xmp = b"http://ns.adobe.com/xap/1.0/\0<x drone-dji:%s/>"
+    assert is_thermal(with_segment(plain, 0xE1, xmp % b'Version="1.6"'))
+    picture = with_segment(b"\xff\xd8\xff\xd9", 0xE1, xmp % b'ImageSource="InfraredCamera"')
+    assert is_thermal(picture) and not is_thermal(picture.replace(b"InfraredCamera", b"WideCamera____"))
 
 
 @pytest.mark.parametrize("start", [0, 32])

@@ -52,7 +52,9 @@ def test_dji_arrays_of_sixteenths_of_a_kelvin_are_temperatures(tmp_path):
 def test_dji_arrays_of_counts_are_refused(tmp_path, raw):
     path = tmp_path / "a.jpg"
     path.write_bytes(dji_jpeg(np.reshape(raw, (512, 640))))
-    with pytest.raises(SceneError, match="a.jpg: .*only DJI's Thermal SDK converts: .*data.radiometric=never"):
+    with pytest.raises(
+        SceneError, match="a.jpg: .*only DJI's Thermal SDK converts them: dji_irp .*data.radiometric=never"
+    ):
         read_celsius(path)
 
 

@@ -1,8 +1,13 @@
 """The doctor on folders: a scene that trains, and a camera's files."""
 
 import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
+from camera_files import with_segment
+from PIL import Image
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
@@ -10,7 +15,9 @@ from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
-from heatsplat.preparation.doctor import check, section
+from heatsplat.preparation.doctor import _photo_times, check, section
+from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frames import read_frames, taken_at
 
 
 def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
@@ -24,6 +31,43 @@ def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
     write_camera(recording, tmp_path / "camera", Field(dead_pixels=5, rgb=True, rgb_clock_s=400.0))
     said = section(tmp_path / "camera")
     assert {"dead_pixels", "pairing"} <= {one["check"] for one in said.values["findings"]}
+
+
+def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
+    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    write_camera(recording, tmp_path / "camera", Field(rgb=True))
+    frames = read_frames(tmp_path / "camera")
+
+    def photos(hours: float, minutes: float = 0.0, zone: str = "") -> list[Frame]:
+        """The frames with photos of their moments, by a clock that shows the time of another zone."""
+        found = []
+        for number, frame in enumerate(frames):
+            exif = Image.Exif()
+            shown = frame.time.replace(tzinfo=None) + timedelta(hours=hours, minutes=minutes)
+            exif.get_ifd(0x8769)[0x9003] = shown.strftime("%Y:%m:%d %H:%M:%S")
+            exif.get_ifd(0x8769)[0x9291] = f"{shown.microsecond:06d}"
+            if zone:
+                exif.get_ifd(0x8769)[0x9011] = zone
+            Image.new("L", (8, 8)).save(tmp_path / f"{number}.jpg", exif=exif)
+            found.append(replace(frame, rgb=tmp_path / f"{number}.jpg"))
+        return found
+
+    def apart(photos: list[Frame], zone: str | None = None) -> float:
+        times = _photo_times(photos, zone)
+        return float(np.median(np.array(times) - [frame.time.timestamp() for frame in photos]))
+
+    assert frames[0].time.tzinfo is not None
+    assert apart(photos(2.0)) == pytest.approx(0.0, abs=1e-3)
+    assert apart(photos(2.0, minutes=1.5)) == pytest.approx(90.0, abs=1e-3)
+    assert apart(photos(2.0), "+01:00") == pytest.approx(3600.0, abs=1e-3)  # it is told, so an hour is an hour
+    assert apart(photos(2.0, zone="+02:00")) == pytest.approx(0.0, abs=1e-3)
+    assert apart(photos(2.0, zone="+00:00")) == pytest.approx(7200.0, abs=1e-3)
+
+
+def test_photos_of_dji_have_the_clock_of_their_thermal_pictures(tmp_path):
+    xmp = b'http://ns.adobe.com/xap/1.0/\0<x drone-dji:UTCAtExposure="2024-08-06T15:35:05.376048"/>'
+    picture = with_segment(b"\xff\xd8\xff\xd9", 0xE1, xmp)
+    assert taken_at(picture) == datetime(2024, 8, 6, 15, 35, 5, 376048, tzinfo=UTC)
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):

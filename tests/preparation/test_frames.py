@@ -5,7 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from camera_files import fff, raw_for, temperatures
+import torch
+from camera_files import dji_jpeg, fff, raw_for, temperatures, with_segment
 from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
@@ -70,6 +71,27 @@ def test_photos_belong_to_the_frames_of_their_exposure(tmp_path):
     assert first.time == datetime(2024, 1, 1, 12)
 
 
+def test_constants_of_a_camera_that_are_given_go_before_those_of_its_files(tmp_path):
+    own, path = read_frames(write_flir(tmp_path, 1))[0], tmp_path
+    p = own.calibration.response
+    (other,) = read_frames(path, Reading(Meaning(planck=[p.r1, p.b, p.f, p.o + 300, p.r2])))
+    lower = other.calibration.response.kelvin(torch.tensor([15000.0])) - p.kelvin(torch.tensor([15000.0]))
+    assert float(lower) > 0.5 and np.nanmedian(other.temperature() - own.temperature()) > 0.5
+
+
+def test_what_is_said_of_numbers_and_changes_nothing_is_refused(tmp_path):
+    write_flir(tmp_path / "flir", 1)
+    with pytest.raises(
+        SceneError, match="counts.scale changes nothing for radiometric files; .* counts.planck, or by the files"
+    ):
+        read_frames(tmp_path / "flir", Reading(Meaning(scale=0.01)))
+    write_images(tmp_path / "counts", {"a.png": (100 * (FLOATS + 273.15)).astype(np.uint16)})
+    with pytest.raises(SceneError, match="bounds_c changes nothing for 16-bit images"):
+        read_frames(tmp_path / "counts", Reading(Meaning(bounds_c=[0, 50])))
+    with pytest.raises(SceneError, match="counts.offset_c is the °C of count 0 and needs counts.scale"):
+        read_frames(tmp_path / "counts", Reading(Meaning(offset_c=0.0)))
+
+
 def test_a_zone_is_given_to_times_that_have_none(tmp_path):
     write_images(tmp_path, {"DJI_20240701120000_0007_T.tiff": FLOATS})
     (frame,) = read_frames(tmp_path, Reading(zone="Europe/Berlin"))
@@ -131,6 +153,21 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     (tmp_path / "broken" / "c.png").write_bytes(b"\x89PNG broken")
     with pytest.raises(SceneError, match=r"c\.png is corrupt"):
         read_frames(tmp_path / "broken")
+
+
+def test_pictures_of_dji_without_temperatures_are_refused_with_what_to_run_unless_bounds_are_given(tmp_path):
+    counts = (np.arange(512 * 640).reshape(512, 640) % 3000 + 18000).astype(np.uint16)
+    xmp = b'http://ns.adobe.com/xap/1.0/\0<x drone-dji:ImageSource="InfraredCamera"/>'
+    grey = cv2.imencode(".jpg", cv2.merge([(FLOATS * 5).astype(np.uint8)] * 3))[1].tobytes()
+    for name, data in (("counts", dji_jpeg(counts)), ("cut", with_segment(grey, 0xE1, xmp))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "DJI_1_T.JPG").write_bytes(data)
+        with pytest.raises(
+            SceneError, match="DJI_1_T.JPG is a thermal picture of DJI .*dji_irp -s IMAGE.JPG -a measure .*bounds_c"
+        ):
+            read_frames(tmp_path / name)
+    (frame,) = read_frames(tmp_path / "cut", Reading(Meaning(bounds_c=[0.0, 51.0])))
+    np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.6)  # of a JPEG
 
 
 def test_greys_that_were_stored_as_colours_are_greys(tmp_path):

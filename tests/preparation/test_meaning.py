@@ -24,6 +24,12 @@ def test_kelvin_times_100_is_recognised_and_nothing_else_is_guessed():
             Meaning().of_counts(other, HERE)
     with pytest.raises(SceneError, match=r"As DJI's 1/64 K they would be 29.5 °C \(counts.scale=0.015625\)"):
         Meaning().of_counts(room * 0 + 19371, HERE)
+    with pytest.raises(
+        SceneError, match=r"As 0.04 K of FLIR's Vue, Duo and Tau they would be 6.6 °C \(counts.scale=0.04\)"
+    ):
+        Meaning().of_counts(room * 0 + 6994, HERE)
+    with pytest.raises(SceneError, match=r"As 0.1 K of a Lepton in low gain they would be 21.9 °C"):
+        Meaning().of_counts(room * 0 + 2950, HERE)
 
 
 def test_what_is_said_goes_before_what_is_guessed():

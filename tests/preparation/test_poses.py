@@ -49,6 +49,24 @@ def test_few_frames_are_all_matched_and_a_video_only_with_its_neighbours(tmp_pat
     assert len(search.pairs()) == 30 * 29 / 2
 
 
+def test_a_search_goes_on_and_begins_anew_where_frames_or_settings_have_changed(tmp_path):
+    search = search_of(tmp_path, 4)
+    search.begin()
+    left = search.work / "database.db"
+
+    def stays(options: FindPoses) -> bool:
+        left.touch()
+        again = Search(options, list(search.frames.values()), tmp_path)
+        again.begin()
+        return left.is_file()
+
+    assert stays(FindPoses(Sift())) and stays(FindPoses(Sift()))
+    assert not stays(FindPoses(Sift(most=99))) and stays(FindPoses(Sift(most=99)))
+    assert not stays(FindPoses(Sift(most=99), clip=2.0)) and not stays(FindPoses(Sift()))
+    (tmp_path / "images" / "f002.tif").write_bytes(b"corrected for another emissivity")
+    assert not stays(FindPoses(Sift())) and stays(FindPoses(Sift()))
+
+
 def test_gps_counts_where_it_tells_frames_apart(tmp_path):
     assert search_of(tmp_path, 5).origin is not None
     (tmp_path / "b").mkdir()

@@ -4,13 +4,18 @@ import base64
 import json
 import re
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from swinging import frames, ready, wall
 
+from heatsplat.sensors.base import SensorChain
+from heatsplat.sensors.rolling_readout import RollingReadout
+from heatsplat.sensors.thermal_lag import ThermalLag
 from heatsplat.viewer.page import page
-from heatsplat.viewer.payload import Block, _attribute, _small
+from heatsplat.viewer.payload import Block, _added, _attribute, _small
 
 
 def back(block: bytes, place: dict) -> np.ndarray:
@@ -56,3 +61,26 @@ def test_a_page_holds_what_it_was_given_whatever_a_scene_is_called():
     assert json.loads(found) == header and "<b>" not in text
     packed = re.search(r'id="block">(.*?)</script>', text, re.S)[1]
     assert zlib.decompress(base64.b64decode(packed)) == b"12345678"
+
+
+def test_what_a_part_adds_that_needs_to_know_how_far_away_things_are():
+    frame = frames()[4]
+    image, depth = wall(frame.time_s)
+    asked = []
+
+    def render(frame, depth=False):
+        asked.append(depth)
+        return SimpleNamespace(features=image[..., None], seen_depth=wall(frame.time_s)[1])
+
+    parts = {
+        "thermal_lag": ready(ThermalLag(), raw_tau=0.3),
+        "rolling_readout": ready(RollingReadout(), raw_readout=0.4),
+    }
+    module = SimpleNamespace(render=render, sensor=SensorChain(parts), thermal=SimpleNamespace(modality_channels=(1,)))
+    block = Block()
+    told = _added(module, frame, tuple(image.shape), 30.0, block)
+    assert asked == [True] and [one["name"] for one in told] == ["thermal lag", "rolling readout"]
+    after = module.sensor(image[..., None], frame, depth)
+    added = sum(one["step"] * back(block.content, one) for one in told)
+    np.testing.assert_allclose(added, 30.0 * (after.detach()[..., 0] - image), atol=told[0]["step"] + told[1]["step"])
+    assert np.abs(added).max() > 1.0

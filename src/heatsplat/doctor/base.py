@@ -52,7 +52,7 @@ class Material:
         rgb: visible images [H, W, 3] of the same frames and cameras, or None.
         rgb_times_s: when the photos of all frames were taken, on their own camera's clock, or None.
         cameras: of the same frames, or None.
-        points: [P, 3] of the scene, or None.
+        points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         views: the views of ``images``, for tracks; empty without cameras.
@@ -151,7 +151,7 @@ def material_of(scene: SceneData) -> Material:
         masks=masks,
         rgb=[view.rgb for view in views] if views and all(view.rgb is not None for view in views) else None,
         cameras=[view.camera for view in views],
-        points=scene.points,
+        points=None if "points_random" in scene.notes else scene.points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
         clipped=scene.notes.get("clipped_fraction"),
         views=views,

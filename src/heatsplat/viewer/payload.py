@@ -175,10 +175,11 @@ def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
 @torch.no_grad()
 def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> list[Mapping[str, Any]]:
     """What each part of the sensor adds to the image of a frame, in their order, in the scene's unit."""
-    image = module.render(frame).features[..., : module.thermal.modality_channels[0]]
+    output = module.render(frame, depth=module.sensor.needs_depth)
+    image, depth = output.features[..., : module.thermal.modality_channels[0]], output.seen_depth
     told = []
     for name, part in module.sensor.parts.items():
-        after = part(image, frame)
+        after = part(image, frame, depth) if part.needs_depth else part(image, frame)
         difference = (after - image).mean(-1).cpu() * span
         steps, step = steps_of(_small(difference, size).flatten())
         told.append(block.add(steps.view(size), "i2") | {"step": step, "name": name.replace("_", " ")})

@@ -1,0 +1,95 @@
+"""Cameras of other tools, taken as they are: what was given is what the prepared scene has."""
+
+import json
+
+import numpy as np
+import pytest
+from recordings import write_flir, write_images
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import read_model, write_model
+from heatsplat.doctor.base import material_of
+from heatsplat.preparation.given_poses import GivenPoses
+from heatsplat.preparation.prepare import prepare
+
+PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
+OPENCV = ("OPENCV", (60.0, 61.0, 39.0, 33.0, 0.05, -0.01, 0.001, 0.002), 80, 64)  # at twice the frames' size
+FISHEYE = ("OPENCV_FISHEYE", (30.0, 30.0, 20.0, 16.0, 0.01, 0.0, 0.0, 0.0), 40, 32)
+
+
+def pose(index: int) -> np.ndarray:
+    angle = 0.05 * index
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    viewmat[:3, 3] = [0.1 * index, -0.02 * index, 4.0]
+    return viewmat
+
+
+def test_a_model_of_the_camera_s_files_becomes_that_of_the_prepared_images(tmp_path):
+    source = write_flir(tmp_path / "files", 5)
+    names = [f"images/IR_{i:04d}.JPG" for i in (0, 1, 2, 4)]  # in a folder, and in another case
+    points = np.random.default_rng(0).uniform(-1, 1, (30, 3))
+    given = {name: pose(i) for i, name in enumerate([*names, "images/other.jpg"])}
+    kinds = {name: int(name == names[1]) for name in given}
+    model = tmp_path / "tool" / "sparse" / "0"
+    write_model(model, given, [OPENCV, FISHEYE], points, np.full((30, 3), 51), camera_of=kinds)
+    target = tmp_path / "scene"
+    page = prepare(str(source), target, **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
+    found = read_model(target)
+    assert found.names == ("IR_0000.tiff", "IR_0001.tiff", "IR_0002.tiff", "IR_0004.tiff")
+    np.testing.assert_allclose(np.stack(found.viewmats), np.stack([pose(i) for i in range(4)]), atol=1e-12)
+    stored = {lens.model: lens for lens in read_model(tmp_path / "tool").lenses}
+    for place, lens in enumerate(found.lenses):
+        wanted = stored["OPENCV_FISHEYE" if place == 1 else "OPENCV"]
+        size = (lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.fisheye)
+        assert size == (wanted.fx, wanted.fy, wanted.cx, wanted.cy, wanted.width, wanted.height, wanted.fisheye)
+        np.testing.assert_array_equal(lens.distortion, wanted.distortion)
+    np.testing.assert_allclose(np.sort(found.points, 0), np.sort(points, 0))
+    text = page.read_text()
+    assert "4 of 5 frames have a camera" in text and "- IR_0003: the model has no camera for it" in text
+    assert "1 of its cameras belong to no frame" in text and (target / "report" / "cameras.png").is_file()
+    scene = Colmap(root=str(target)).scene
+    assert len(scene.train) + len(scene.test) == 4 and scene.thermal_range is not None
+    said = prepare(str(source), target, **PLAIN, poses=GivenPoses(str(model))).read_text()  # its own folder is as good
+    assert "4 of 5 frames have a camera" in said
+
+
+def test_a_transforms_file_without_points_trains_from_random_ones_which_nothing_is_judged_by(tmp_path):
+    source = write_flir(tmp_path / "files", 9)
+    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": f"./images/IR_{i:04d}.png", "transform_matrix": (np.linalg.inv(pose(i)) @ turned).tolist()}
+        for i in range(9)
+    ]
+    (tmp_path / "tool").mkdir()
+    values = {"fl_x": 38.0, "k1": 0.02, "frames": frames}
+    (tmp_path / "tool" / "transforms.json").write_text(json.dumps(values))
+    target = tmp_path / "scene"
+    page = prepare(str(source), target, **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
+    assert "It has no points" in page.read_text()
+    np.testing.assert_allclose(read_model(target).viewmats[3], pose(3), atol=1e-12)
+    scene = Colmap(root=str(target), random_points=50).scene
+    assert scene.points.shape == (50, 3) and "the sparse model has none" in scene.notes["points_source"]
+    assert scene.notes["time_source"] == "frames.csv"
+    assert material_of(scene).points is None and material_of(scene).tracks is None
+
+
+def test_what_does_not_belong_to_the_recording_is_refused_by_name(tmp_path):
+    source = write_flir(tmp_path / "files", 3)
+
+    def refused(said: str) -> None:
+        with pytest.raises(SceneError, match=said):
+            prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
+
+    write_images(tmp_path / "tool", {})
+    refused("neither a COLMAP model .sparse/0. nor a transforms.json")
+    model = tmp_path / "tool" / "sparse" / "0"
+    points = np.zeros((4, 3)), np.zeros((4, 3))
+    write_model(model, {"a/left_1.png": pose(0)}, [FISHEYE], *points)
+    refused(
+        "none of the 1 cameras of .*sparse/0 belongs to a frame: it has names like 'a/left_1.png', the recording like 'IR_0"
+    )
+    write_model(model, {"IR_0001.jpg": pose(0)}, [("PINHOLE", (30.0, 30.0, 16.0, 16.0), 32, 32)], *points)
+    refused("camera of IR_0001.jpg is one of 32x32 pixels, the frame has 40x32")
+    assert len(list((tmp_path / "scene" / "images").glob("*.tiff"))) == 3  # the temperatures stay
