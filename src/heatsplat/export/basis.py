@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 FIRST = 17  # moments to begin with, evenly over the span
-CHECKS = 7  # moments between the samples at which nothing was fitted
+CHECKS = 7  # moments between the samples at which nothing was fitted, and
+ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
 GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 
@@ -25,7 +26,8 @@ class TimeBasis:
         offsets: [N] float32.
         coefficients: [N, r] float32.
         curves: [r, T] float32.
-        worst: largest error found of any Gaussian, at all samples and at ``checks`` moments between them.
+        worst: largest error found of any Gaussian, at all samples and at ``checks`` moments between them; where samples ran
+            out, some of these are where values bend most.
         checks: how many these were.
     """
 
@@ -109,12 +111,13 @@ def time_basis(
     basis = TimeBasis(times, offsets, coefficients, curves, worst, 0)
     if not basis.rank and worst == 0.0:
         return constant_basis(offsets)
-    shares = [(i * GOLDEN) % 1.0 for i in range(1, CHECKS + 1)]
-    for share in shares:
-        moment = first_s + share * (last_s - first_s)
+    checked = [first_s + (i * GOLDEN) % 1.0 * (last_s - first_s) for i in range(1, CHECKS + 1)]
+    for _, start, end in heapq.nsmallest(ROUGHEST // 2, queue):
+        checked += [0.75 * start + 0.25 * end, 0.25 * start + 0.75 * end]
+    for moment in checked:
         error = (basis.at(moment) - values_at(moment).detach().float().cpu()).abs().max().item()
         worst = max(worst, error)
-    return TimeBasis(times, offsets, coefficients, curves, worst, CHECKS)
+    return TimeBasis(times, offsets, coefficients, curves, worst, len(checked))
 
 
 def _factors(residual: Tensor, tolerance: float, most: int) -> tuple[Tensor, Tensor, float]:
