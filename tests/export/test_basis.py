@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,6 +40,31 @@ def test_a_kink_gets_samples_and_a_flat_stretch_does_not():
     near = ((basis.times_s - 0.7).abs() < 0.02).sum()
     assert near >= 4 and len(basis.times_s) < 60
     assert basis.at(0.7).abs().max() < 1e-4
+
+
+def test_bends_that_are_known_are_samples():
+    """A record of 60 uneven samples, linear between them: with its moments known, nothing is left between."""
+    generator = torch.Generator().manual_seed(0)
+    at = torch.rand(60, generator=generator, dtype=torch.float64).sort().values.tolist()
+    heights = torch.randn(60, generator=generator, dtype=torch.float64).tolist()
+
+    def values_at(time: float) -> torch.Tensor:
+        return torch.tensor([float(np.interp(time, at, heights))])
+
+    known, unknown = (time_basis(values_at, 0.0, 1.0, 1e-3, 170, bends=bends) for bends in (at, ()))
+    assert set(at) <= set(known.times_s.tolist())
+    moments = torch.linspace(0, 1, 397).tolist()
+    errors = [max((b.at(t) - values_at(t)).abs().item() for t in moments) for b in (known, unknown)]
+    assert errors[0] < 1e-3 < 0.1 < errors[1] and unknown.worst > 0.1  # where samples run out, the error is told
+    assert set(at) - set(time_basis(values_at, 0.0, 1.0, 1e-3, 100, bends=at).times_s.tolist())  # too many for it
+
+
+def test_errors_of_what_is_clipped_are_those_after_clipping():
+    def values_at(time: float) -> torch.Tensor:
+        return torch.tensor([0.5 + 0.1 * time, 5.0 + math.sin(40 * time)])
+
+    plain, clipped = (time_basis(values_at, 0.0, 1.0, 1e-4, 40, clipped=clipped) for clipped in (False, True))
+    assert len(clipped.times_s) < len(plain.times_s) and clipped.worst < 1e-4 < plain.worst
 
 
 def test_what_does_not_change_has_no_curve():

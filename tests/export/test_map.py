@@ -46,6 +46,25 @@ def test_temperature_and_attributes_lie_where_they_are(two_plates, tmp_path):
         assert np.isnan(nothing).all()
 
 
+def test_attributes_that_few_of_a_pixel_lack_are_those_of_the_others(two_plates, tmp_path):
+    """A Gaussian without a U-value before one that has it: as 0 it would make the wall a better one."""
+    seen = two_plates.seen
+    seen = replace(
+        seen,
+        means=torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.0], [2.0, 1.0, 0.5]]),
+        quats=seen.quats[[0, 0, 1]], scales=seen.scales[[0, 0, 1]], opacities=torch.tensor([0.3, 0.99, 0.99]),
+        layers=[replace(two_plates.layer, basis=constant_basis(torch.tensor([0.2, 0.2, 0.8])))],
+        attributes={"u": torch.tensor([torch.nan, 1.5, torch.nan])},
+    )  # fmt: skip
+    moment = moments(two_plates.module, seen, 600.0)[0]
+    Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep").write(moment, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as found:
+        places = place_of(moment.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(seen.means).tolist()
+        (wall,), (unknown,) = (found.sample([place[:2]]) for place in (places[1], places[2]))
+    assert wall[1] == pytest.approx(1.5, rel=1e-3)
+    assert np.isfinite(unknown[0]) and np.isnan(unknown[1])
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -1,9 +1,10 @@
 """What training cameras have seen, on a wall whose answers are known without a renderer."""
 
+import pytest
 import torch
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.geometry.coverage import Sighting, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.projection import look_at
 
 K = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -76,3 +77,17 @@ def test_depth_maps_may_be_coarser_than_the_image():
 def test_surface_depth_is_infinite_where_a_pixel_is_open():
     depth = surface_depth(torch.tensor([[1.8, 0.2]]), torch.tensor([[0.9, 0.1]]))
     assert torch.equal(depth, torch.tensor([[2.0, torch.inf]]))
+
+
+def test_a_mean_leaves_out_what_is_not_known():
+    """Three Gaussians of a pixel by weight 0.4, 0.3 and 0.1; of the second column only some are known."""
+    columns = torch.tensor([[1.0, 4.0], [2.0, torch.nan], [3.0, 8.0]])
+    weights = torch.tensor([0.4, 0.3, 0.1])
+    alpha = weights.sum().view(1, 1)
+    found = seen_means((weights @ gap_free(columns)).view(1, 1, -1), alpha, 2)[0, 0]
+    assert found.tolist() == pytest.approx([1.3 / 0.8, 2.4 / 0.5])
+    columns[0, 1] = torch.nan  # now most of what the pixel shows has none
+    found = seen_means((weights @ gap_free(columns)).view(1, 1, -1), alpha, 2)[0, 0]
+    assert found[0].item() == pytest.approx(1.3 / 0.8) and found[1].isnan()
+    assert gap_free(columns[:, :1]).shape == (3, 1)  # without gaps nothing is added
+    assert seen_means(torch.zeros(1, 1, 2), torch.zeros(1, 1), 2).isnan().all()

@@ -71,7 +71,7 @@ def test_it_loads_without_an_error_and_shows_the_scene(page):
     assert [entry for entry in page.get_log("browser") if entry["level"] == "SEVERE"] == []
     assert pixels(page).std(axis=0).max() > 20
     assert "Gaussians" in page.find_element("id", "facts").text
-    assert "Worst error" in page.find_element("id", "notes").get_attribute("textContent")
+    assert "worst error" in page.find_element("id", "notes").get_attribute("textContent")
 
 
 def test_the_report_is_one_page_with_all_its_pictures(browser, folder):
@@ -188,6 +188,38 @@ def test_everything_beside_it_draws(page):
         page.execute_script("viewer.choose({how: 'swipe'})")
         assert np.abs(pixels(page) - difference).mean() > 1, other
     assert page.execute_script("return viewer.errors") == []
+
+
+def test_away_from_a_camera_its_image_gives_way_to_the_scene(page):
+    page.execute_script("viewer.goTo(0, true); viewer.choose({other: 'recorded', how: 'difference'})")
+    assert page.execute_script("return viewer.differing")
+    told = "viewer.turn(0.05, 0); return document.getElementById('message').textContent"
+    assert "N and P" in page.execute_script(told)
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    assert not page.execute_script("return viewer.differing") and pixels(page).std(axis=0).max() > 20
+    keys(page, "n")
+    assert page.execute_script("return viewer.differing && viewer.beside") == "recorded"
+
+
+def test_what_a_gaussian_has_not_learned_is_left_out_of_maps(page):
+    """Values of half of the Gaussians of each pixel's weight and more are taken away: such pixels have none."""
+    page.execute_script("viewer.goTo(0); viewer.choose({quantity: 'learned time_constant_s', other: 'nothing'})")
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    page.execute_script("viewer.frame(performance.now())")
+    before = np.array(page.execute_script("return viewer.sampled()"))
+    found = page.execute_script("""const v = viewer, c = v.camera, one = v.attribute, kept = one.values.slice();
+      const pixel = v.splats.weightsAt(c, 0.5 * c.width, 0.5 * c.height), at = () => v.splats.attributeAt(pixel, one);
+      const all = at(), told = [];
+      one.values[pixel.ids[pixel.weights.indexOf(Math.min(...pixel.weights))]] = 65535;
+      told.push(at());
+      one.values.fill(65535);
+      told.push(Number.isNaN(at()));
+      v.stale.values = true; v.frame(performance.now());
+      told.push(v.sampled().length);
+      one.values.set(kept); v.stale.values = true; v.frame(performance.now());
+      return [all, ...told, v.sampled().length];""")
+    assert found[1] == pytest.approx(found[0], rel=0.05) and found[2] is True and found[3] == 0
+    assert found[4] == len(before) > 1000 and before.min() > -1  # log10 of seconds
 
 
 def test_a_second_run_is_itself(page, folder):

@@ -48,6 +48,12 @@ def test_attributes_keep_their_values_and_name_their_unit():
     assert _attribute("nothing", torch.full((4,), torch.nan), Block())["high"] == 1.0
 
 
+def test_attributes_that_a_gaussian_lacks_are_no_low_ones():
+    block = Block()
+    told = _attribute("u_value_w_m2_k", torch.tensor([0.3, torch.nan, 1.3]), block)
+    assert back(block.content, told["values"]).tolist() == [0, 65535, 65534]
+
+
 def test_small_images_are_means():
     image = torch.arange(16.0).view(4, 4)
     assert _small(image, (2, 2)).tolist() == [[2.5, 4.5], [10.5, 12.5]]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-FIRST = 17  # moments to begin with, evenly over the span
-CHECKS = 7  # moments between the samples at which nothing was fitted
+FIRST = 17  # moments to begin with, evenly over the span; bends that are known come on top
+CHECKS = 7  # moments between the samples at which nothing was fitted, and
+ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
 GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 
@@ -25,7 +26,8 @@ class TimeBasis:
         offsets: [N] float32.
         coefficients: [N, r] float32.
         curves: [r, T] float32.
-        worst: largest error found of any Gaussian, at all samples and at ``checks`` moments between them.
+        worst: largest error found of any Gaussian, at all samples and at ``checks`` moments between them; where samples ran
+            out, some of these are where values bend most.
         checks: how many these were.
     """
 
@@ -67,6 +69,8 @@ def time_basis(
     tolerance: float,
     most_times: int = 257,
     most_curves: int = 48,
+    bends: Sequence[float] = (),
+    clipped: bool = False,
 ) -> TimeBasis:
     """The shortest basis whose worst error over all Gaussians and moments stays below ``tolerance``, as far as was looked.
 
@@ -81,16 +85,24 @@ def time_basis(
         tolerance: in units of the values.
         most_times: samples at most.
         most_curves: curves at most.
+        bends: moments at which values may bend, such as the samples of a weather record; where they fit into a half of
+            ``most_times`` they are samples.
+        clipped: values count as 0 below 0 and as 1 above 1, and so do their errors.
     """
     moments = torch.linspace(first_s, last_s, FIRST, dtype=torch.float64).tolist()
+    inside = [moment for moment in bends if first_s < moment < last_s]
+    if FIRST + len(inside) <= most_times // 2:
+        moments = sorted({*moments, *inside})
     seen = {moment: values_at(moment).detach().float().cpu() for moment in moments}
     queue: list[tuple[float, float, float]] = []
+
+    def error_of(found: Tensor, true: Tensor) -> float:
+        return ((found.clamp(0, 1) - true.clamp(0, 1)) if clipped else found - true).abs().max().item()
 
     def halve(start: float, end: float) -> None:
         middle = 0.5 * (start + end)
         seen[middle] = values_at(middle).detach().float().cpu()
-        straight = 0.5 * (seen[start] + seen[end])
-        error = (seen[middle] - straight).abs().max().item()
+        error = error_of(0.5 * (seen[start] + seen[end]), seen[middle])
         if error > tolerance / 3:
             heapq.heappush(queue, (-error, start, end))
 
@@ -109,12 +121,12 @@ def time_basis(
     basis = TimeBasis(times, offsets, coefficients, curves, worst, 0)
     if not basis.rank and worst == 0.0:
         return constant_basis(offsets)
-    shares = [(i * GOLDEN) % 1.0 for i in range(1, CHECKS + 1)]
-    for share in shares:
-        moment = first_s + share * (last_s - first_s)
-        error = (basis.at(moment) - values_at(moment).detach().float().cpu()).abs().max().item()
-        worst = max(worst, error)
-    return TimeBasis(times, offsets, coefficients, curves, worst, CHECKS)
+    checked = [first_s + (i * GOLDEN) % 1.0 * (last_s - first_s) for i in range(1, CHECKS + 1)]
+    for _, start, end in heapq.nsmallest(ROUGHEST // 2, queue):
+        checked += [0.75 * start + 0.25 * end, 0.25 * start + 0.75 * end]
+    for moment in checked:
+        worst = max(worst, error_of(basis.at(moment), values_at(moment).detach().float().cpu()))
+    return TimeBasis(times, offsets, coefficients, curves, worst, len(checked))
 
 
 def _factors(residual: Tensor, tolerance: float, most: int) -> tuple[Tensor, Tensor, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,10 +19,15 @@ TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
 TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
 VIEWS = 6  # training cameras over which what depends on the view is averaged
 JUDGED = 48  # training cameras at most that are compared with that mean
-TIMES = 257  # samples of a quantity over time at most
-FEW_TIMES = 65  # the same of what costs much to ask for: the truth of a scene, and models for which
+TIMES = 257  # samples of a quantity over time at most, and
+BENDS = 769  # where a weather record bends curves at each of its samples
+CURVES = 48  # curves of a quantity at most; of few Gaussians more,
+COEFFICIENTS = 4_800_000  # up to so many numbers of 16 bits
+MOST_CURVES = 192  # but no more than these
+FEW_TIMES = 65  # the same of models for which
 WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
 TABLE = 257  # entries of a table of temperatures
+CHUNK = 16384  # points whose truth is asked for at once
 
 
 @dataclass(frozen=True)
@@ -150,10 +155,18 @@ def snapshot(module: Any) -> Snapshot:
     surface = _surface(module, blended, kept) if span is not None else None
     clipped = surface is not None and _alike(_inside(surface), camera, span, tolerance / slope)
     sent = surface if clipped else camera
-    most = int(min(TIMES, max(FEW_TIMES, WORK / (max(module.thermal.cost, 1) * len(means) * len(cameras)))))
-    layers = [replace(_layer("camera", "as seen", sent, span, tolerance, slope, most), clipped=clipped)]
+    record = () if scene.weather is None else tuple(scene.weather.times_s.tolist())
+    bends = record if "weather" in module.thermal.needs else ()
+    most = BENDS if bends else TIMES
+    most = int(min(most, max(FEW_TIMES, WORK / (max(module.thermal.cost, 1) * len(means) * len(cameras)))))
+    curves = max(CURVES, min(MOST_CURVES, COEFFICIENTS // max(len(kept), 1)))
+
+    def layer(name: str, label: str, values_at: Callable, clipped: bool = False) -> Layer:
+        return _layer(name, label, values_at, span, tolerance / slope, slope, most, curves, bends, clipped)
+
+    layers = [layer("camera", "as seen", sent, clipped)]
     if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
-        layers.append(_layer("surface", "of the surface", surface, span, tolerance, slope, most))
+        layers.append(layer("surface", "of the surface", surface))
     for part in module.thermal.removable:
 
         def without(time_s: float | None, part: str = part) -> Tensor:
@@ -162,10 +175,13 @@ def snapshot(module: Any) -> Snapshot:
 
         if not _alike(without, camera, span, tolerance / slope):
             label = f"without {part.replace('_', ' ')}"
-            layers.append(_layer(f"without {part}", label, without, span, tolerance, slope, most))
+            layers.append(layer(f"without {part}", label, without))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
-        truth = _truth(scene, means[kept].cpu(), blended)
-        layers.append(_layer("truth", "truth", truth, span, tolerance, slope, FEW_TIMES))
+        truth = _truth(scene, means[kept].cpu(), blended, span)
+        most = BENDS if record else TIMES
+        layers.append(
+            _layer("truth", "truth", truth, span, tolerance / slope, slope, most, curves, record, clipped=False)
+        )
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
     colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
@@ -233,12 +249,15 @@ def _layer(
     tolerance: float,
     slope: float,
     most_times: int,
+    most_curves: int,
+    bends: Sequence[float],
+    clipped: bool,
 ) -> Layer:
     if span is None:
         basis = constant_basis(values_at(None).cpu())
     else:
-        basis = time_basis(values_at, *span, tolerance / slope, most_times)
-    return Layer(name, label, basis, basis.worst * slope)
+        basis = time_basis(values_at, *span, tolerance, most_times, most_curves, bends, clipped)
+    return Layer(name, label, basis, basis.worst * slope, clipped)
 
 
 def _surface(module: Any, blended: Callable, kept: Tensor) -> Callable[[float], Tensor] | None:
@@ -257,9 +276,21 @@ def _surface(module: Any, blended: Callable, kept: Tensor) -> Callable[[float], 
     return surface
 
 
-def _truth(scene: SceneData, points: Tensor, blended: Callable) -> Callable[[float], Tensor]:
+def _truth(scene: SceneData, points: Tensor, blended: Callable, span: tuple[float, float]) -> Callable[[float], Tensor]:
+    """Blended values of the true temperatures at points [N, 3].
+
+    Most of what a moment costs is to find what lights and surrounds the points, which many moments share: values at TIMES
+    moments evenly over the span are asked for at once.
+    """
+    even = torch.linspace(*span, TIMES, dtype=torch.float64)
+    known = torch.cat([scene.truth(some, even).float() for some in points.split(CHUNK)])
+
     def truth(time_s: float) -> Tensor:
-        celsius = scene.truth(points, torch.tensor([time_s], dtype=torch.float64))[:, :1]
+        place = (time_s - span[0]) / (span[1] - span[0]) * (TIMES - 1)
+        if abs(place - round(place)) < 1e-6:
+            celsius = known[:, round(place), None]
+        else:
+            celsius = scene.truth(points, torch.tensor([time_s], dtype=torch.float64))[:, :1]
         return blended(scene.thermal_range.to_unit(celsius).float())
 
     return truth

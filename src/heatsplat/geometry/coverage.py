@@ -14,6 +14,7 @@ from heatsplat.geometry.projection import to_camera, to_pixels
 
 OPEN = 0.5  # a pixel with less opacity than this shows no surface, but what is far behind everything
 DEPTH_TOLERANCE = 0.05  # of the depth: what lies so little behind a surface belongs to it
+MOSTLY = 0.5  # share of what a pixel shows of which a quantity must be known for the pixel to have one
 FAR = 1e6  # depth of a pixel without a surface, in distances between the cameras
 
 
@@ -35,6 +36,26 @@ class Sighting:
 def surface_depth(depth: Tensor, alpha: Tensor) -> Tensor:
     """Camera z [H, W] of what a renderer shows, from its accumulated depth and opacity; infinite where it is open."""
     return torch.where(alpha >= OPEN, depth / alpha.clamp(min=OPEN), torch.inf)
+
+
+def gap_free(columns: Tensor) -> Tensor:
+    """Columns [N, C] for a renderer that adds them up: where some are not finite 0 in their place, and [N, C] more that say
+    which are known; else the columns themselves. ``seen_means`` takes what was rendered."""
+    known = columns.isfinite()
+    return columns if known.all() else torch.cat([columns.where(known, 0.0), known.to(columns)], dim=1)
+
+
+def seen_means(features: Tensor, alpha: Tensor, count: int) -> Tensor:
+    """Means [H, W, C] over those Gaussians of a pixel of which a quantity is known; NaN where there are none, or too few of them.
+
+    Args:
+        features: [H, W, C or 2 C] as rendered of ``gap_free``'s columns.
+        alpha: [H, W] opacity.
+        count: C.
+    """
+    alpha = alpha[..., None]
+    weights = features[..., count:] if features.shape[-1] > count else alpha
+    return (features[..., :count] / weights).where((alpha > 0) & (weights >= MOSTLY * alpha), torch.nan)
 
 
 def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Tensor:

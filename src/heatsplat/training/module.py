@@ -18,6 +18,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.coverage import gap_free, seen_means
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
@@ -486,14 +487,13 @@ class SplatTraining(pl.LightningModule):
         """Images [H, W] of what the thermal model tells of its Gaussians (``ThermalModel.attributes``), by name.
 
         Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality; NaN where none
-        is seen. Empty for models that tell nothing.
+        is seen, or most have none. Empty for models that tell nothing.
         """
         told = self.attributes(frame)
         if not told:
             return {}
-        output = self.composited(frame, torch.stack(list(told.values()), dim=1))
-        alpha = output.alpha[0, ..., None]
-        maps = torch.where(alpha > 0, output.features / alpha, torch.nan)
+        output = self.composited(frame, gap_free(torch.stack(list(told.values()), dim=1)))
+        maps = seen_means(output.features, output.alpha[0], len(told))
         return dict(zip(told, maps.unbind(-1), strict=True))
 
     def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:

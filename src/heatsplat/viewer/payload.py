@@ -19,7 +19,7 @@ from heatsplat.io.quantities import words_and_unit
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
 CAMERAS = 36  # training cameras that are in the page, with their images
 THUMBNAIL = 144  # pixels of the longer side of an image
-UNKNOWN = 65535  # of a thumbnail's pixel that is masked
+UNKNOWN = 65535  # of a thumbnail's pixel that is masked, and of a Gaussian that has no value of an attribute
 LEVELS = 65534  # steps between the ends of a range in 16 bits
 ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
 LOG_RATIO = 100.0  # an attribute above 0 whose ends are further apart than this is stored as its logarithm
@@ -121,14 +121,14 @@ def _layer(layer: Layer, block: Block) -> dict[str, Any]:
 
 
 def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:
-    """16 bits between the quantiles of ATTRIBUTE_SHARE; NaN is the lowest value."""
+    """16 bits between the quantiles of ATTRIBUTE_SHARE; NaN is UNKNOWN."""
     known = values[values.isfinite()].double().numpy()
     low, high = np.quantile(known, ATTRIBUTE_SHARE).tolist() if len(known) else (0.0, 1.0)
     logarithmic = low > 0 and high / low > LOG_RATIO
     if logarithmic:
         values, low, high = values.clamp_min(1e-30).log10(), math.log10(low), math.log10(high)
     span = high - low if high > low else 1.0
-    share = ((values.double() - low) / span).nan_to_num(0.0).clamp(0, 1)
+    levels = ((values.double() - low) / span).clamp(0, 1) * LEVELS
     label, unit = words_and_unit(name)
     return {
         "name": name,
@@ -137,7 +137,7 @@ def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:
         "low": low,
         "high": low + span,
         "log": logarithmic,
-        "values": block.add((share * LEVELS).round(), "u2"),
+        "values": block.add(levels.round().nan_to_num(UNKNOWN), "u2"),
     }
 
 

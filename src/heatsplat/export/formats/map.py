@@ -16,7 +16,7 @@ from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_of
 from heatsplat.export.seams import comparison, mosaic, smoothed
-from heatsplat.geometry.coverage import OPEN, covered, surface_depth
+from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
 from heatsplat.io.pictures import write_png
 from heatsplat.shots import at_time, first_free_id, sightings
@@ -146,13 +146,13 @@ class Map(Format):
         seen, module = moment.seen, moment.module
         told = extra_columns(moment)
         columns = torch.stack([moment.blended, *told.values()], dim=1)
+        values = gap_free(columns)
         with torch.no_grad():
             output = module.renderer(
-                seen.means, seen.quats, seen.scales, seen.opacities[None], columns.nan_to_num(), camera, None,
-                (columns.shape[1],), depth=True,
+                seen.means, seen.quats, seen.scales, seen.opacities[None], values, camera, None, (values.shape[1],), depth=True,
             )  # fmt: skip
-        alpha = output.alpha[0, ..., None]
-        means = (output.features / alpha).where(alpha >= OPEN, torch.nan)
+        means = seen_means(output.features, output.alpha[0], columns.shape[1])
+        means = means.where(output.alpha[0, ..., None] >= OPEN, torch.nan)
         depth = surface_depth(output.depth, output.alpha[0])
         if self.unseen == "nan":
             scene = module.scene
@@ -167,9 +167,9 @@ class Map(Format):
             certainty = Uncertainty(module)
             deviation = certainty.deviation(frame)
             bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
-            shown = means[..., 0].isfinite().cpu()
+            shown = dict(zip(told, means[..., 1:].isfinite().cpu().unbind(-1), strict=True))
             for name, spread in certainty.attribute_deviations(frame).items():
-                intervals[f"{name} {DEVIATION}"] = spread.where(shown, torch.nan).numpy()
+                intervals[f"{name} {DEVIATION}"] = spread.where(shown[name], torch.nan).numpy()
         return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)} | intervals
 
 

@@ -1,4 +1,4 @@
-"""SPZ, Niantic's packed splats: about a tenth of a PLY."""
+"""SPZ, Niantic's packed splats: a fifth to a quarter of a PLY."""
 
 from __future__ import annotations
 

@@ -105,7 +105,8 @@ void main() {
     return;
   }
   if (kind == 1) {
-    shown = paint(map, mix(learned.x, learned.y, a.r / max(a.a, 1e-6)), range, a.a);
+    bool told = a.g >= MOSTLY * a.a;  // the share that has the attribute
+    shown = told ? paint(map, mix(learned.x, learned.y, a.r / max(a.g, 1e-6)), range, a.a) : vec4(paper, 1.0);
     return;
   }
   float value = decoded(table, a.r + behind * background.x);
@@ -159,7 +160,7 @@ class Drawing {
       Object.assign(this, { format: gl.RGBA8, type: gl.UNSIGNED_BYTE, precision: "8 bits" });
     }
     this.splatting = this.program(SPLAT_VERTEX.replaceAll("WIDTH", WIDTH), SPLAT_FRAGMENT);
-    this.showing = this.program(SHOW_VERTEX, SHOW_FRAGMENT);
+    this.showing = this.program(SHOW_VERTEX, SHOW_FRAGMENT.replaceAll("MOSTLY", MOSTLY));
     this.empty = gl.createVertexArray();
     this.targets = {};
     this.blank = this.texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));

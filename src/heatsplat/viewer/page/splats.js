@@ -1,6 +1,7 @@
 // The Gaussians of one scene: what they emit at a time, and what a single pixel of them shows, in double precision.
 
 const ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.999, TRANSMITTANCE_MIN = 1e-4, FOV_MARGIN = 0.3;  // of heatsplat.renderers.base
+const MOSTLY = 0.5;  // share of what a pixel shows that must have an attribute for the pixel to have one
 
 class Splats {
   constructor({ told, array }) {
@@ -71,8 +72,13 @@ class Splats {
     for (let i = 0, j = start; i < this.count; i++, j += stride) target[j] = Math.min(Math.max(target[j], least), most);
   }
 
-  fillAttribute(one, target, start, stride) {
-    for (let i = 0, j = start; i < this.count; i++, j += stride) target[j] = one.values[i] / 65534;
+  // An attribute as a share between its ends, and beside it whether a Gaussian has one: 65535 stands for none.
+  fillAttribute(one, target) {
+    for (let i = 0; i < this.count; i++) {
+      const known = one.values[i] !== 65535;
+      target[2 * i] = known ? one.values[i] / 65534 : 0;
+      target[2 * i + 1] = Number(known);
+    }
   }
 
   // Gaussians that reach a pixel of a camera, front to back, with their blending weights: what the renderer does there.
@@ -141,9 +147,17 @@ class Splats {
     });
   }
 
+  // The mean over the Gaussians of a pixel that have one; NaN where most have none.
   attributeAt(pixel, one) {
     const { ids, weights, left } = pixel;
-    const share = ids.reduce((total, id, j) => total + weights[j] * one.values[id], 0) / 65534 / Math.max(1 - left, 1e-9);
+    let total = 0, known = 0;
+    ids.forEach((id, j) => {
+      if (one.values[id] === 65535) return;
+      total += weights[j] * one.values[id];
+      known += weights[j];
+    });
+    if (!(known >= MOSTLY * (1 - left))) return NaN;
+    const share = total / 65534 / Math.max(known, 1e-9);
     const value = one.low + share * (one.high - one.low);
     return one.log ? 10 ** value : value;
   }

@@ -2,6 +2,7 @@
 
 const $ = (id) => document.getElementById(id);
 const COLOURS = ["#ff9e4a", "#6cb6ff", "#7bd88f", "#f07ab8", "#c9a2ff", "#e8d44d", "#5fd3d0", "#ff7b72"];
+const AT_CAMERAS = "Images of cameras are known where these stood: N and P go to the next.";
 const CHART_TIMES = 121, BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
 
 class Viewer {
@@ -61,8 +62,17 @@ class Viewer {
     return this.differing ? `difference ${this.state.other}` : this.attribute ? this.state.quantity : "values";
   }
 
+  // What stands beside it, of which images of cameras are known at their places alone.
+  get beside() {
+    return this.state.at === null && this.ofCamera ? "nothing" : this.state.other;
+  }
+
+  get ofCamera() {
+    return this.state.other === "recorded" || this.state.other === "sensor";
+  }
+
   get differing() {
-    return this.state.other !== "nothing" && this.state.other !== "visible" && this.state.how === "difference" && this.layer !== null;
+    return this.beside !== "nothing" && this.beside !== "visible" && this.state.how === "difference" && this.layer !== null;
   }
 
   get mapName() {
@@ -96,12 +106,11 @@ class Viewer {
     $("timeBar").hidden = !this.told.span;
     if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
     this.cameras.forEach((one, i) => $("cameras").append(this.thumbnail(one, i)));
-    const worst = Math.max(...this.splats.layers.map((layer) => layer.worst));
-    const ranks = this.splats.layers.map((layer) => `${layer.coefficients.length} for ${layer.name}`).join(", ");
     const unit = this.told.unit || "image values", small = (value) => Number(value.toPrecision(2));
+    const ranks = this.splats.layers.map((layer) => `${layer.coefficients.length} for ${layer.name}, ${small(layer.worst)} ${unit}`).join("; ");
     const notes = [];
     if (this.told.span) {
-      notes.push(`Time: each Gaussian's curve is a sum of shared ones (${ranks}). Worst error of any Gaussian found: ${small(worst)} ${unit} `
+      notes.push(`Time: each Gaussian's curve is a sum of shared ones. How many, and worst error of any Gaussian found: ${ranks} `
         + `(aim: ${this.told.tolerance}), at every sample and ${this.splats.layers[0].checks} moments between.`);
       notes.push(`Beyond the record: ${this.told.beyondRecord}.`);
     }
@@ -170,15 +179,20 @@ class Viewer {
   // Moving ----------------------------------------------------------------------------------------------------------
 
   look(camera) {
-    this.camera = camera;
+    if (this.ofCamera && this.state.at !== null) this.say(AT_CAMERAS);
+    this.show(camera);
     this.state.at = null;
+  }
+
+  show(camera) {
+    this.camera = camera;
     this.stale.order = true;
     this.request();
   }
 
   goTo(i, withTime = false) {
     const count = this.cameras.length, place = (i % count + count) % count, one = this.cameras[place];
-    this.look(one.camera);
+    this.show(one.camera);
     this.state.at = place;
     this.lastCamera = place;
     if (withTime && one.time !== null) this.setTime(one.time);
@@ -296,11 +310,11 @@ class Viewer {
   fillValues() {
     const { splats, scene } = this, { other, time, otherTime } = this.state;
     const layer = this.layer;
-    if (this.attribute) splats.fillAttribute(this.attribute, scene.filled, 0, 2);
+    if (this.attribute) splats.fillAttribute(this.attribute, scene.filled);
     else if (layer) splats.fill(layer, time, scene.filled, 0, 2);
     const beside = splats.layer(other);
     if (other === "time" && layer) splats.fill(layer, otherTime, scene.filled, 1, 2);
-    else if (beside) splats.fill(beside, time, scene.filled, 1, 2);
+    else if (beside && layer) splats.fill(beside, time, scene.filled, 1, 2);
     this.drawing.update(scene);
     if (this.run && other === "run") {
       const second = this.run.scene.splats;
@@ -311,7 +325,7 @@ class Viewer {
 
   paint() {
     const { drawing, scene, state, view, told } = this, { width } = $("canvas");
-    const other = this.layer || state.quantity === "visible" ? state.other : "nothing";
+    const other = this.layer || state.quantity === "visible" ? this.beside : "nothing";
     const picture = this.pictureBeside(other);
     const textures = { table: scene.table, map: this.maps[state.map].texture, differences: this.maps[DIFFERENCES].texture, picture };
     textures.first = drawing.blend(scene, view, "first").texture;
@@ -384,7 +398,8 @@ class Viewer {
     const alpha = blended[j + 3], { splats, told } = this;
     if (alpha < 0.02) return null;
     if (this.attribute) {
-      const { low, high, log } = this.attribute, value = low + blended[j] / alpha * (high - low);
+      const { low, high, log } = this.attribute, value = low + blended[j] / blended[j + 1] * (high - low);
+      if (blended[j + 1] < MOSTLY * alpha) return null;
       return log ? 10 ** value : value;
     }
     const layer = this.layer;
@@ -466,7 +481,7 @@ class Viewer {
     $("how").hidden = state.other === "nothing" || state.other === "visible" || this.layer === null;
     $("otherTimeRow").hidden = state.other !== "time";
     $("parts").hidden = state.other !== "sensor";
-    const swiping = state.other !== "nothing" && this.layer !== null && !this.differing;
+    const swiping = this.beside !== "nothing" && this.layer !== null && !this.differing;
     $("divider").hidden = !swiping;
     $("divider").style.left = `${100 * state.split}%`;
     if (told.span) {
@@ -486,7 +501,7 @@ class Viewer {
     $("barLow").textContent = digits(this.range[0]);
     $("barHigh").textContent = digits(this.range[1]);
     const quantity = $("quantity").selectedOptions[0]?.text || "";
-    $("barName").textContent = (this.differing ? `difference to ${$("other").selectedOptions[0].text}` : quantity.replace(/^learned: /, ""))
+    $("barName").textContent = (this.differing ? `minus ${$("other").selectedOptions[0].text}` : quantity.replace(/^learned: /, ""))
       + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
     drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
     this.drawMarks(ratio);
@@ -599,7 +614,8 @@ class Viewer {
       };
       item.append(swatch, text(`probe ${probe.name}`), text(unit ? `${value.toFixed(2)} ${unit}` : value.toFixed(4)), close);
       if (this.splats.attributes.length) {
-        const told = this.splats.attributes.map((one) => `${one.label} ${Number(this.splats.attributeAt(probe.pixel, one).toPrecision(3))} ${one.unit}`.trim());
+        const number = (value) => Number.isNaN(value) ? "unknown" : Number(value.toPrecision(3));
+        const told = this.splats.attributes.map((one) => `${one.label} ${number(this.splats.attributeAt(probe.pixel, one))} ${one.unit}`.trim());
         item.append(Object.assign(document.createElement("small"), { textContent: told.join(" · ") }));
       }
       return item;
@@ -631,9 +647,9 @@ class Viewer {
     Object.assign(this.state, changes);
     this.stale.values = true;
     if (this.state.other === "run" && !this.run) this.state.other = "nothing";
-    if ("other" in changes && (this.state.other === "recorded" || this.state.other === "sensor")) {
+    if ("other" in changes && this.ofCamera) {
       this.goTo(this.state.at ?? this.lastCamera ?? 0, true);
-      this.say("Known where a training camera stood, at its time: N and P go to the next.");
+      this.say(AT_CAMERAS);
     }
     if (this.layer && this.chartTimes) this.probes.forEach((probe) => this.measure(probe));
     if (!this.state.ranges[this.rangeName]) {
