@@ -44,3 +44,11 @@ def test_a_scene_without_times_has_one_moment(cooling):
     assert moment.time_s is None and torch.equal(moment.values, cooling.values)
     with pytest.raises(SceneError, match="leave time out"):
         moments(cooling.module, seen, 3.0)
+
+
+@pytest.mark.parametrize("layer", ["auto", "camera"])
+def test_nothing_is_beyond_the_range_of_images_where_values_are_clipped(cooling, layer):
+    beyond = replace(cooling.layer, name="camera", basis=constant_basis(torch.tensor([-3.0, 0.5, 2.0])), clipped=True)
+    found = moments(cooling.module, replace(cooling.seen, layers=[beyond]), 600.0, layer)[0]
+    low, high = cooling.seen.limits
+    assert found.values.tolist() == pytest.approx([low, 0.5 * (low + high), high], abs=0.01)

@@ -84,7 +84,8 @@ def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, 
             )
         chosen = there[name]
         blended = chosen.basis.at(time_s)
-        blended = blended.clamp(0, 1) if chosen.clipped and layer == "camera" else blended
+        # As images have it: beyond their range nothing was ever trained, and single Gaussians are far off there.
+        blended = blended.clamp(0, 1) if chosen.clipped else blended
         whole = Moment(seen, chosen, time_s, blended, blended, module)
         found.append(Moment(seen, chosen, time_s, blended, whole.of_blended(blended), module))
     return found
