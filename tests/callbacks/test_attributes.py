@@ -1,14 +1,23 @@
 """Maps of a model's attributes: which views, what the picture shows, and none without attributes or companions."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from fake_run import HEIGHT, WIDTH, FakeModule, evaluate, events, fit, trainer, wall
 
-from heatsplat.callbacks.attributes import AttributeErrors, AttributeMaps, attribute_picture
+from heatsplat.callbacks import attributes
+from heatsplat.callbacks.attributes import (
+    LEARNED_FILE,
+    AttributeErrors,
+    AttributeMaps,
+    LearnedValues,
+    attribute_picture,
+)
 from heatsplat.callbacks.metrics import QualityMetrics
+from heatsplat.callbacks.report import learned_section
 from heatsplat.contracts import ViewSet
 from heatsplat.io.pictures import UNKNOWN
 from heatsplat.io.tables import read_csv
@@ -113,3 +122,33 @@ def test_scenes_without_true_attributes_have_no_errors(tmp_path):
     module = Knowing(wall(), tmp_path)
     evaluate(module, trainer(tmp_path, [AttributeErrors()]))
     assert "attribute_errors" not in module.results.data
+
+
+def learned(folder, monkeypatch, **options):
+    """What is written of a model of two Gaussians of one metre and a hundred of a millimetre."""
+    scene = wall()
+    scales = torch.cat([torch.ones(2, 3), torch.full((100, 3), 1e-3)])
+    splats = SimpleNamespace(scales=scales, opacities=torch.ones(1, 102))
+    told = {
+        "emissivity": torch.cat([torch.tensor([0.4, 0.8]), torch.full((100,), 0.1)]),
+        "absent": torch.full((102,), torch.nan),
+    }
+    off = {"emissivity": torch.cat([torch.tensor([0.05, 0.05]), torch.full((100,), 9.0)])}
+    monkeypatch.setattr(attributes, "Uncertainty", lambda module: SimpleNamespace(of_attributes=lambda frame: off))
+    module = SimpleNamespace(scene=scene, splats=splats, attributes=lambda frame: told, output_dir=folder)
+    LearnedValues(**options).on_test_epoch_end(None, module)
+    return read_csv(folder / LEARNED_FILE)
+
+
+def test_what_was_learned_counts_gaussians_by_their_area(tmp_path, monkeypatch):
+    (row,) = learned(tmp_path, monkeypatch)
+    assert (row["name"], row["low"], row["high"], row["deviation"]) == ("emissivity", 0.4, 0.8, None)
+    text = "\n".join(learned_section(tmp_path))
+    assert "0.4 to 0.8" in text and "±" not in text and "callbacks=uncertainty" in text
+
+
+def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_asked_for(tmp_path, monkeypatch):
+    (row,) = learned(tmp_path, monkeypatch, deviations=True)
+    assert row["deviation"] == 0.05
+    text = "\n".join(learned_section(tmp_path))
+    assert "± 0.05" in text and "in the median" in text

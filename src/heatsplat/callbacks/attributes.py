@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
+import torch
+from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.callbacks.images import file_stem
@@ -15,6 +17,7 @@ from heatsplat.io.quantities import words_and_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
 from heatsplat.shots import at_time
+from heatsplat.uncertainty import Uncertainty
 
 LEARNED_FILE = "learned.csv"
 COLORMAP = "viridis"  # not that of temperatures
@@ -81,7 +84,14 @@ class LearnedValues(pl.Callback):
     """Writes learned.csv at the end of the test: of each attribute its unit, and what the median Gaussian and nine in ten have.
 
     Gaussians count by their opacity and the area of their largest section, and at one moment, the middle of the record.
+
+    Args:
+        deviations: whether how far the value of a single Gaussian is likely off stands beside, in the median
+            (``Uncertainty.of_attributes``); renders every training view several times.
     """
+
+    def __init__(self, deviations: bool = False) -> None:
+        self.deviations = deviations
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene, frame = module.scene, module.scene.train.frames[0]
@@ -93,14 +103,25 @@ class LearnedValues(pl.Callback):
             return
         sizes = module.splats.scales.detach().sort(dim=1).values[:, 1:].prod(1)
         weights = (module.splats.opacities[0].detach() * sizes).double().cpu().numpy()
+        off: dict[str, Tensor] = {}
+        if self.deviations:
+            with (
+                torch.inference_mode(False),
+                torch.no_grad(),
+            ):  # a test allows no gradient, of which deviations are made
+                off = Uncertainty(module).of_attributes(frame)
         rows = []
         for name, values in told.items():
             words, unit = words_and_unit(name)
             ends = _quantiles(values.double().cpu().numpy(), weights, (0.05, 0.5, 0.95))
             if ends is not None:
                 low, median, high = (float(f"{end:.6g}") for end in ends)
-                rows.append({"name": words, "unit": unit, "median": median, "low": low, "high": high})
-        write_csv(module.output_dir / LEARNED_FILE, rows, ("name", "unit", "median", "low", "high"))
+                usual = _quantiles(off[name].double().cpu().numpy(), weights, (0.5,)) if name in off else None
+                deviation = None if usual is None else float(f"{usual[0]:.3g}")
+                rows.append(
+                    {"name": words, "unit": unit, "median": median, "low": low, "high": high, "deviation": deviation}
+                )
+        write_csv(module.output_dir / LEARNED_FILE, rows, ("name", "unit", "median", "low", "high", "deviation"))
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray | None:

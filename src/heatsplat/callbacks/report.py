@@ -25,7 +25,7 @@ from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
-from heatsplat.io.tables import markdown_table, read_csv
+from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
@@ -232,7 +232,7 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
         lines += ["", f"The numbers are in [{CURVE_FILE}]({CURVE_FILE})."]
     lines += _picture_section("Temperature over time", folder, "renders/probes.png", "probes")
     lines += _surfaces_section(folder)
-    lines += _learned_section(folder)
+    lines += learned_section(folder)
     lines += ["", "## The run", "", *_bullets(run)]
     lines += _effects_section(content["effects"])
     lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
@@ -273,22 +273,27 @@ def _surfaces_section(folder: Path) -> list[str]:
     return ["", "## Hottest and coldest surfaces", "", *picture, *table, "", note]
 
 
-def _learned_section(folder: Path) -> list[str]:
+def learned_section(folder: Path) -> list[str]:
     """What the Gaussians have beside their temperature (``callbacks.attributes``)."""
     found = read_csv(folder / LEARNED_FILE) if (folder / LEARNED_FILE).exists() else []
     if not found:
         return []
-    rows = [
-        (row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}", row["unit"] or "")
-        for row in found
-    ]
+    known = any(row["deviation"] for row in found)
+    rows = []
+    for row in found:
+        told = [row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}"]
+        told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
+        rows.append((*told, row["unit"] or ""))
     note = (
         "Nine in ten Gaussians, weighted by opacity and area, lie in the interval: how the scene varies, not how uncertain a "
-        f"value is. The table is [{LEARNED_FILE}]({LEARNED_FILE})."
-    )
+        + ("value is; that is the standard deviation of one of them, in the median. " if known else
+           "value is, which `evaluate.py callbacks=uncertainty` tells. ")
+        + f"The table is [{LEARNED_FILE}]({LEARNED_FILE})."
+    )  # fmt: skip
     pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
     maps = [f"![maps of what was learned]({path.relative_to(folder).as_posix()})" for path in pictures]
-    table = markdown_table(("", "median", "nine in ten", "unit"), rows, "lrrl")
+    heads = ("", "median", "nine in ten", *["one of them"] * known, "unit")
+    table = markdown_table(heads, rows, "l" + "r" * (len(heads) - 2) + "l")
     return ["", "## What was learned", "", *table, "", note, "", *maps]
 
 
