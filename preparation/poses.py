@@ -14,11 +14,13 @@ from typing import Any
 import cv2  # before pycolmap: formats/colmap.py says why
 import numpy as np
 import pycolmap
+import torch
 from rich.progress import Progress, track
 
 from heatsplat.contracts import SceneError, check_option, evenly_spread
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.features import Features
@@ -215,6 +217,7 @@ class Search:
         options.mapper.abs_pose_refine_focal_length = options.ba_refine_focal_length
         if self.options.by == "rgb":
             options.ba_refine_focal_length = True
+            options.ba_refine_sensor_from_rig = False  # few frames do not tell it: cameras collapse (``settle_rig``)
         options.use_prior_position = self.origin is not None
         options.use_robust_loss_on_prior_position = True
         folder = self.work / "models"
@@ -236,12 +239,13 @@ class Search:
         # Of a camera that stands still noise places a few frames somewhere.
         if len(kept) < 3 or len(kept) < len(self.frames) / 2 and self._stands_still():
             raise SceneError(self._nothing())
-        written = thermal_only(model, self.name_of)
+        placed_by_photos = settle_rig(model, self.name_of) if self.options.by == "rgb" else None
+        written = thermal_only(model, self.name_of, placed_by_photos)
         folder = self.target / "sparse" / "0"
         write_whole(written, folder, self.work)
         write_world(self.target, None if self.origin is None else 1.0)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
-        errors = self._gps_residuals(model, kept)
+        errors = self._gps_residuals(list(written.images.values()))
         camera = next(iter(kept.values())).camera
         values: dict[str, Any] = {
             "registered": len(kept),
@@ -268,13 +272,12 @@ class Search:
         else:
             lines.append("World: scale and orientation of the reconstruction; no GPS that would tell them.")
         if self.options.by == "rgb":
-            rig = next(iter(model.rigs.values()))
-            sensor = camera.sensor_id
-            pose = rig.sensor_from_rig(sensor)
-            values["thermal_from_rgb"] = np.asarray(pose.matrix()).round(6).tolist()
-            where = ", ".join(f"{x:.4g}" for x in pose.inverse().translation)
+            turn, offset = self._rig(model, written)
+            values["thermal_from_rgb"] = {"degrees": turn, "offset": offset}
+            where = ", ".join(f"{x:.4g}" for x in offset)
             lines.append(
-                f"The thermal camera stands at ({where}) in the axes of the visible one (right, down, forward)."
+                f"The thermal camera is turned by {turn:.2f}° against the visible one and stands at ({where}) in its axes "
+                "(right, down, forward), as far as they tell: both are brought to the same places in the mean."
             )
         placed = sorted(written.images.values(), key=lambda image: (_moment(self.frames[image.name]), image.name))
         if len(written.points3D) > 2:
@@ -293,6 +296,18 @@ class Search:
         stats = [(self.target / "images" / name).stat() for name in self.frames]
         images = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(self.frames, stats, strict=True)]
         return hashlib.sha256(repr([self.options, images, *self.frames.values()]).encode()).hexdigest()
+
+    def _rig(self, model: pycolmap.Reconstruction, written: pycolmap.Reconstruction) -> tuple[float, list[float]]:
+        """By how many degrees the thermal camera is turned against the visible one, and where it stands in that one's axes."""
+        photos = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
+        between = [
+            image.cam_from_world() * photos[self._photo(image.name)].inverse()
+            for image in written.images.values()
+            if self._photo(image.name) in photos
+        ]
+        turn = np.median([np.degrees(pose.rotation.angle()) for pose in between])
+        offset = np.mean([pose.inverse().translation for pose in between], axis=0)
+        return round(float(turn), 4), offset.round(4).tolist()
 
     # What the frames say -----------------------------------------------------------------------------------------------
 
@@ -387,13 +402,13 @@ class Search:
                 )
             )
 
-    def _gps_residuals(self, model: pycolmap.Reconstruction, kept: dict[str, pycolmap.Image]) -> np.ndarray | None:
+    def _gps_residuals(self, placed: Sequence[pycolmap.Image]) -> np.ndarray | None:
         """Root mean square of how far cameras lie from their fixes: horizontally and vertically, in metres."""
         if self.origin is None:
             return None
-        known = {copy: fix for copy in kept if (fix := _fix(self.frames[self.name_of[copy]])) is not None}
-        found = np.array([kept[copy].projection_center() for copy in known])
-        away = found - east_north_up(np.array(list(known.values())), self.origin)
+        known = [(image, fix) for image in placed if (fix := _fix(self.frames[image.name])) is not None]
+        found = np.array([image.projection_center() for image, _ in known])
+        away = found - east_north_up(np.array([fix for _, fix in known]), self.origin)
         return np.sqrt(np.array([(away[:, :2] ** 2).sum(1).mean(), (away[:, 2] ** 2).mean()]))
 
     # What did not work --------------------------------------------------------------------------------------------------
@@ -451,8 +466,42 @@ class Search:
         )
 
 
-def thermal_only(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> pycolmap.Reconstruction:
-    """The thermal images of a model under their own names, each a frame of its own, with the points of all cameras."""
+def settle_rig(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> Similarity | None:
+    """Finds how the thermal camera is turned against the visible one, in the model, by a bundle adjustment of all images.
+
+    No feature is common to both, so nothing but their poses ties the two worlds: about an orbit that looks at its middle the
+    thermal one may have any size. Returns the similarity that brings the thermal cameras to the visible ones beside them;
+    None where fewer than three stand beside one.
+    """
+    adjusted = pycolmap.BundleAdjustmentConfig()
+    placed = {image.name: image for image in model.images.values() if image.has_pose}
+    for image in placed.values():
+        adjusted.add_image(image.image_id)
+    adjusted.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions(refine_sensor_from_rig=True, print_summary=False)
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.create_default_bundle_adjuster(options, adjusted, model).solve()
+    pairs = [
+        (placed[name], placed.get(name.replace("thermal/", "rgb/", 1))) for name in sorted(placed) if name in name_of
+    ]
+    both = [(thermal, photo) for thermal, photo in pairs if photo is not None]
+    if len(both) < 3:
+        return None
+    thermal, visible = (torch.from_numpy(np.stack([_matrix(pair[k]) for pair in both])) for k in (0, 1))
+    return pose_errors(thermal, visible).similarity
+
+
+def _matrix(image: pycolmap.Image) -> np.ndarray:
+    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def thermal_only(
+    model: pycolmap.Reconstruction, name_of: dict[str, str], moved: Similarity | None = None
+) -> pycolmap.Reconstruction:
+    """The thermal images of a model under their own names, each a frame of its own, with the points of all cameras.
+
+    ``moved`` is applied to the images and to the points that they see, not to those that photos alone see.
+    """
     kept = [image for image in model.images.values() if image.has_pose and image.name in name_of]
     own = pycolmap.Reconstruction()
     for camera_id in sorted({image.camera_id for image in kept}):
@@ -464,11 +513,19 @@ def thermal_only(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> pyc
             image_id=image.image_id,
             keypoints=np.array([p.xy for p in image.points2D]).reshape(-1, 2),
         )
-        own.add_image_with_trivial_frame(fresh, image.cam_from_world())
+        pose = image.cam_from_world()
+        if moved is not None:
+            turn = pose.rotation.matrix() @ moved.rotation.numpy().T
+            pose = pycolmap.Rigid3d(
+                pycolmap.Rotation3d(turn), float(moved.scale) * pose.translation - turn @ moved.shift.numpy()
+            )
+        own.add_image_with_trivial_frame(fresh, pose)
     seen = {image.image_id for image in kept}
     for key, point in sorted(model.points3D.items()):
         track = pycolmap.Track([e for e in point.track.elements if e.image_id in seen])
-        own.add_point3D_with_id(key, pycolmap.Point3D(xyz=point.xyz, color=point.color, error=point.error, track=track))
+        own_place = moved is None or not track.elements
+        xyz = point.xyz if own_place else moved(torch.from_numpy(point.xyz)[None])[0].numpy()
+        own.add_point3D_with_id(key, pycolmap.Point3D(xyz=xyz, color=point.color, error=point.error, track=track))
     return own
 
 
