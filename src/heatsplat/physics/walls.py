@@ -7,7 +7,7 @@ from torch import Tensor
 OUTSIDE_M2_K_W = 0.04  # resistance between surface and air outside, by convention (ISO 6946, table 7)
 CONVECTION = (4.0, 4.0)  # W/(m² K) in still air, and W s/(m³ K) for wind, by convention (ISO 6946, annex C)
 LEAST_K = 1.0  # between indoors and the outer surface: below, a loss says nothing of the wall
-MOST_INWARD_W_M2 = 10.0  # that errors make of a wall that loses next to nothing; what takes in more (ground) is none of a heated room
+MOST_INWARD_W_M2 = 10.0  # that errors make of a wall that loses next to nothing; ground takes in more
 
 
 def u_value(loss_w_m2: Tensor, indoor_c: float, surface_c: Tensor) -> Tensor:
