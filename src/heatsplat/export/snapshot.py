@@ -27,7 +27,9 @@ COEFFICIENTS = 4_800_000  # up to so many numbers of 16 bits
 MOST_CURVES = 192  # but no more than these
 FEW_TIMES = 65  # the same of models for which
 WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
-RECALLED = 4  # times as many under weather: moments in order go on from what was marched before, in place of all of the record
+RECALLED = (
+    4  # times as many under weather: moments in order go on from what was marched before, in place of all of the record
+)
 TABLE = 257  # entries of a table of temperatures
 CHUNK = 16384  # points whose truth is asked for at once
 
