@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.export.basis import constant_basis, rounded, steps_of, time_basis
+from heatsplat.export.basis import _directions, constant_basis, rounded, steps_of, time_basis
 
 COUNT = 200
 
@@ -87,3 +87,12 @@ def test_coefficients_are_already_what_sixteen_bits_hold():
     steps, size = steps_of(torch.tensor([0.0, -1.0, 0.5]))
     assert steps.tolist() == [0, -32767, 16384] and size == pytest.approx(1 / 32767)
     assert steps_of(torch.zeros(2))[0].tolist() == [0, 0]
+
+
+def test_curves_sought_in_a_subspace_are_the_singular_vectors():
+    draws = torch.Generator().manual_seed(3)
+    values = torch.randn(300, 20, generator=draws) * 0.7 ** torch.arange(20.0) @ torch.randn(20, 200, generator=draws)
+    found = _directions(values, 12)
+    best = torch.linalg.svdvals(values)[12:].norm()
+    assert found.shape == (200, 12) and torch.allclose(found.T @ found, torch.eye(12), atol=1e-4)
+    assert (values - values @ found @ found.T).norm() <= 1.001 * best

@@ -13,6 +13,11 @@ FIRST = 17  # moments to begin with, evenly over the span; bends that are known 
 CHECKS = 7  # moments between the samples at which nothing was fitted, and
 ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
 GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
+OVERSAMPLED, TURNS = (
+    16,
+    2,
+)  # of the subspace in which singular vectors are sought: curves more than wanted, and its turns
+ROWS = 16384  # Gaussians whose errors are looked at together
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 
 
@@ -130,24 +135,45 @@ def time_basis(
 
 
 def _factors(residual: Tensor, tolerance: float, most: int) -> tuple[Tensor, Tensor, float]:
-    """Coefficients [N, r], curves [r, T] and the largest residual; ``residual`` [N, T] is used up."""
-    gram = (
-        (residual.T.double() @ residual.double()) if len(residual) else torch.zeros(residual.shape[1]).diag().double()
-    )
-    vectors = torch.linalg.eigh(gram).eigenvectors.flip(1).T.float()
+    """Coefficients [N, r], curves [r, T] and the largest error of their products for values [N, T], r at most ``most``."""
     worst = residual.abs().max().item() if residual.numel() else 0.0
-    coefficients, curves = [], []
-    for vector in vectors:
-        if worst <= tolerance or len(curves) == most:
-            break
-        weights = rounded(residual @ vector)
-        residual -= weights[:, None] * vector
-        coefficients.append(weights)
-        curves.append(vector)
-        worst = residual.abs().max().item()
-    if not curves:
+    if worst <= tolerance:
         return residual.new_zeros(len(residual), 0), residual.new_zeros(0, residual.shape[1]), worst
-    return torch.stack(coefficients, dim=1), torch.stack(curves), worst
+    directions = _directions(residual, most)
+    coefficients = torch.stack([rounded(column) for column in (residual @ directions).unbind(1)], dim=1)
+
+    def error_of(rank: int) -> float:
+        found = (
+            (some - own[:, :rank] @ directions[:, :rank].T).abs().max().item()
+            for some, own in zip(residual.split(ROWS), coefficients.split(ROWS), strict=True)
+        )
+        return max(found)
+
+    few, enough = 0, directions.shape[1]
+    worst = error_of(enough)
+    while worst <= tolerance and enough - few > 1:
+        middle = (few + enough) // 2
+        error = error_of(middle)
+        few, enough, worst = (few, middle, error) if error <= tolerance else (middle, enough, worst)
+    return coefficients[:, :enough].contiguous(), directions[:, :enough].T.contiguous(), worst
+
+
+def _directions(values: Tensor, most: int) -> Tensor:
+    """The first right singular vectors of values [N, T], [T, r] with r at most ``most``, in the order of their values.
+
+    Where there are many samples they are sought in a random subspace a little wider, turned twice towards the values (Halko,
+    Martinsson and Tropp 2011, 4.4): products of N x T x r in place of N x T x T.
+    """
+    count = values.shape[1]
+    wide = min(count, most + OVERSAMPLED)
+    within = torch.eye(count)
+    if wide < count:
+        within = torch.randn(count, wide, generator=torch.Generator().manual_seed(0))
+        for _ in range(TURNS):
+            within = torch.linalg.qr(values.T @ (values @ within)).Q
+    inner = (values @ within if wide < count else values).double()
+    vectors = torch.linalg.eigh(inner.T @ inner).eigenvectors.flip(1).float()
+    return (within @ vectors)[:, :most]
 
 
 def rounded(column: Tensor) -> Tensor:
