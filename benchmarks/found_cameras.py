@@ -11,6 +11,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -59,8 +60,8 @@ def run(
         output_dir: of the study; files, prepared scenes and runs lie in it.
         prepare, train: paths of prepare.py and train.py.
         cases: name -> a recording that is written as a camera would (scene, frames, width, height, and the rest of
-            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings: overrides
-            of prepare.py.
+            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings and train:
+            further overrides of prepare.py and train.py.
         overrides: of train.py; None: nothing is trained.
         threads: CPU threads of training; None is all cores.
 
@@ -83,7 +84,7 @@ def run(
         prepared(
             prepare, [f"source={files}", "poses=given", f"poses.model={place / 'model'}", *settings], place / "true"
         )
-        lines = [*overrides, "data=colmap", f"threads={'null' if threads is None else threads}"]
+        lines = [*overrides, *case.get("train", ()), "data=colmap", f"threads={'null' if threads is None else threads}"]
         for kind in ("found", "true"):
             results = trained(place / f"trained_{kind}", train, [*lines, f"data.root={place / kind}"], output_dir)
             training.append([name, kind, *_scores(results)])
@@ -129,20 +130,32 @@ def prepared(prepare: str, settings: Sequence[str], target: Path) -> dict[str, f
     command = [sys.executable, prepare, *settings, f"target={target}"]
     target.mkdir(parents=True, exist_ok=True)
     with (target.parent / f"{target.name}.log").open("w+") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)  # of this process alone
+        process, most = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT), 0.0
+        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+            most = max(most, _peak_mib(process.pid))
+            time.sleep(0.05)
+        _, status, usage = ended  # whose largest size would be at least that of this process
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             said.seek(0)
             raise SceneError(f"{' '.join(command)}\nfailed:\n{said.read()[-2000:]}")
-    spent = {"cpu_s": usage.ru_utime + usage.ru_stime, "mib": usage.ru_maxrss / 1024}
+    spent = {"cpu_s": usage.ru_utime + usage.ru_stime, "mib": most}
     write_atomically(note, json.dumps(spent))
     return spent
 
 
+def _peak_mib(process: int) -> float:
+    """The most memory that a process has had so far (Linux); 0 where it has ended."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
+
+
 def _given(case: Mapping[str, Any], place: Path) -> tuple[Path, Truth]:
     """Folder of a case's files, and their true cameras."""
-    case = {key: value for key, value in case.items() if key != "settings"}
+    case = {key: value for key, value in case.items() if key not in ("settings", "train")}
     if "files" in case:
         model = read_model(Path(case["model"]))
         stems = [PurePath(name).stem for name in model.names]

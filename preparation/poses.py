@@ -18,6 +18,7 @@ import torch
 from rich.progress import Progress, track
 
 from heatsplat.contracts import SceneError, check_option, evenly_spread
+from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.geometry.alignment import Similarity, pose_errors
@@ -282,7 +283,7 @@ class Search:
         if len(written.points3D) > 2:
             draw_cameras(
                 self.target / PICTURE,
-                [viewmat_of(image) for image in placed],
+                [pose_matrix(image) for image in placed],
                 np.array([point.xyz for point in written.points3D.values()]),
                 self.origin is not None,
             )
@@ -496,13 +497,8 @@ def settle_rig(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> Simil
     both = [(thermal, photo) for thermal, photo in pairs if photo is not None]
     if len(both) < 3:
         return None
-    thermal, visible = (torch.from_numpy(np.stack([viewmat_of(pair[k]) for pair in both])) for k in (0, 1))
+    thermal, visible = (torch.from_numpy(np.stack([pose_matrix(pair[k]) for pair in both])) for k in (0, 1))
     return pose_errors(thermal, visible).similarity
-
-
-def viewmat_of(image: pycolmap.Image) -> np.ndarray:
-    """World to camera [4, 4], OpenCV axes."""
-    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 def thermal_only(
