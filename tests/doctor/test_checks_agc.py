@@ -3,6 +3,8 @@
 import torch
 from materials import changed, checks, clean
 
+from heatsplat.doctor.checks.agc import _leaps
+
 
 def test_contrast_that_the_camera_stretches_is_no_temperature():
     gain = 1.0 + 0.4 * torch.sin(3.0 * torch.arange(len(clean().images), dtype=torch.float64))
@@ -14,3 +16,17 @@ def test_contrast_that_the_camera_stretches_is_no_temperature():
     assert "agc" not in checks(
         changed(clean(), wild, unit_k=None, bounds_c=None)
     )  # greys that nobody calls temperatures
+
+
+def test_mist_that_comes_and_goes_is_no_camera_that_stretches():
+    images, middle = clean().images, clean().images.mean()
+    for rate, found in ((0.8, False), (2.5, True)):
+        gain = 1.0 + 0.4 * torch.sin(rate * torch.arange(len(images), dtype=torch.float64))
+        seen = (middle + gain[:, None, None] * (images - middle)).clamp(0, 1)
+        assert ("agc" in checks(changed(clean(), seen))) == found
+
+
+def test_a_steady_change_does_not_leap_over_a_gap_in_time():
+    times = torch.tensor([0.0, 10.0, 20.0, 120.0, 130.0, 135.0], dtype=torch.float64)
+    assert float(_leaps(1.0 - 0.002 * times, times).abs().max()) < 1e-12
+    assert float(_leaps(1.0 - 0.002 * times, None).abs().max()) > 0.05

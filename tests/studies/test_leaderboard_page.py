@@ -21,8 +21,8 @@ def test_the_page_has_all_entries_pictures_and_links(tmp_path):
     run_of(sweep, "3dgs", "cooling", 0, 1.0)
     run_of(sweep, "etgs", "cooling", 0, -1.0)
     asked = board(root)
-    entries = standings(sweep, asked)
-    text = page(entries, asked, sweep)
+    found = standings(sweep, asked)
+    text = page(found, asked, sweep)
     assert "http" not in text.replace("http://www.w3.org/2000/svg", "")  # self-contained
     told = content(text)
     (scene,) = told["scenes"]
@@ -35,4 +35,4 @@ def test_the_page_has_all_entries_pictures_and_links(tmp_path):
     entry = next(one for one in told["entries"] if one["method"] == "3dgs")
     assert entry["links"] == ["3dgs_cooling_steps_0/.hydra/config.yaml"] and len(entry["rank"]) == 2
     assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("made for")
-    assert content(page(entries, asked, None))["entries"][0]["links"] == []
+    assert content(page(found, asked, None))["entries"][0]["links"] == []

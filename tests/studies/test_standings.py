@@ -5,23 +5,42 @@ import json
 import pytest
 from boards import board, hand_in, protocol_folder, run_of
 
-from heatsplat.studies.leaderboard.standings import beside_reference, ranks, spread_of, standings, usual_spread
+from heatsplat.contracts import SceneError
+from heatsplat.studies.leaderboard.earlier import read_page
+from heatsplat.studies.leaderboard.report import write_leaderboard
+from heatsplat.studies.leaderboard.standings import (
+    Entry,
+    beside_reference,
+    ranks,
+    spread_of,
+    standard_error,
+    standings,
+    usual_spread,
+)
+from heatsplat.studies.score import SceneScore
 
 
 def test_a_difference_within_the_spread_is_a_tie():
-    apart = [[1.0, 1.02, 0.98], [1.5, 1.49, 1.51], [1.01, 1.03, 0.99]]
-    assert ranks(apart, None) == [(1, 2), (3, 3), (1, 2)]
-    assert ranks(apart, None, higher=True) == [(2, 3), (1, 1), (2, 3)]
-    wide = [[0.9, 1.1], [1.1, 1.3], [1.3, 1.5]]  # errors of 0.1: two of them of a difference are 0.28
-    assert ranks(wide, None) == [(1, 2), (1, 3), (2, 3)]
+    means, errors = [1.0, 1.5, 1.01], [0.012, 0.006, 0.012]
+    assert ranks(means, errors) == [(1, 2), (3, 3), (1, 2)]
+    assert ranks(means, errors, higher=True) == [(2, 3), (1, 1), (2, 3)]
+    assert ranks([1.0, 1.2, 1.4], [0.1] * 3) == [(1, 2), (1, 3), (2, 3)]  # two errors of a difference are 0.28
+    assert ranks([1.0, 1.2], [0.0, 0.0]) == [(1, 1), (2, 2)]
+
+
+def entry_of(*values: float) -> Entry:
+    """An entry whose seeds have these errors."""
+    scores = [SceneScore([{"name": "near_00003", "part": "near", "mae_c": value}]) for value in values]
+    return Entry("a", "b", "steps", scores)
 
 
 def test_one_seed_spreads_as_the_others_do():
-    usual = usual_spread([[1.0, 1.2], [2.0, 2.4], [5.0]])
+    usual = usual_spread([entry_of(1.0, 1.2), entry_of(2.0, 2.4), entry_of(5.0), entry_of()], "mae_c")
     assert usual == pytest.approx(0.02**0.5 / 1.1)
-    assert ranks([[1.0], [1.2], [2.0]], usual) == [(1, 2), (1, 2), (3, 3)]
-    assert ranks([[1.0], [1.2]], None) == [(1, 1), (2, 2)]
-    assert usual_spread([[1.0], [2.0]]) is None
+    assert standard_error(entry_of(2.0), "mae_c", usual) == pytest.approx(2.0 * usual)
+    assert standard_error(entry_of(2.0), "mae_c", None) == 0.0
+    assert standard_error(entry_of(1.0, 1.2), "mae_c", usual) == pytest.approx(0.1)
+    assert usual_spread([entry_of(1.0), entry_of(2.0)], "mae_c") is None
 
 
 def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
@@ -36,7 +55,7 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     (tmp_path / "theirs" / "metrics.json").write_text(json.dumps(told))
     asked = board(root, submissions=[str(tmp_path / "theirs")])
     for _ in range(2):  # the second time from score.json
-        found = {(one.method, one.scene): one for one in standings(sweep, asked)}
+        found = {(one.method, one.scene): one for one in standings(sweep, asked).entries}
     assert found["3dgs", "cooling"].mean("mae_c") == pytest.approx(1.05, abs=1e-4)
     assert found["3dgs", "cooling"].cost("seconds") == 8.0 and found["theirs", "cooling"].cost("seconds") == 99
     assert [found[name, "cooling"].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
@@ -51,5 +70,43 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert beside["etgs", "steps"] == (pytest.approx(0.5, abs=1e-4), 1)
     (sweep / "3dgs_cooling_steps_0" / "submission" / "near_00003.tiff").unlink()
     (sweep / "3dgs_cooling_steps_0" / "score.json").unlink()
-    left = next(one for one in standings(sweep, asked) if (one.method, one.scene) == ("3dgs", "cooling"))
+    left = next(one for one in standings(sweep, asked).entries if (one.method, one.scene) == ("3dgs", "cooling"))
     assert len(left.scores) == 1 and "lacks 1 of the 3" in left.reason
+
+
+def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
+    root, first, then = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "first", tmp_path / "then"
+    for seed, off in ((0, 1.0), (1, 1.1)):
+        run_of(first, "3dgs", "cooling", seed, off, seconds=8.0)
+        run_of(first, "etgs", "cooling", seed, off + 1, seconds=9.0)
+    hand_in(tmp_path / "theirs" / "cooling", -0.25)
+    told = {"method": "theirs", "track": "steps", "scenes": {"cooling": {"seconds": 99}}}
+    (tmp_path / "theirs" / "metrics.json").write_text(json.dumps(told))
+    asked = {"tracks": ["steps"], "note": ""}
+    write_leaderboard(first, board(root, **asked, submissions=[str(tmp_path / "theirs")]))
+
+    run_of(
+        then, "3dgs", "cooling", 0, 5.0, seconds=24.0
+    )  # fewer seeds than the page has; a machine three times as slow
+    for seed in (0, 1):
+        run_of(then, "etgs", "cooling", seed, 0.5, seconds=30.0)
+    page = first / "leaderboard.html"
+    write_leaderboard(then, board(root, **asked, earlier=[str(page)]))
+    for sweep, own in ((then, [str(page)]), (tmp_path / "none", [str(then / "leaderboard.html")])):
+        sweep.mkdir(exist_ok=True)  # the page of a merged table tells the same once more
+        found = standings(sweep, board(root, **asked, earlier=own))
+        entries = {one.method: one for one in found.entries}
+        assert entries["3dgs"].mean("mae_c") == pytest.approx(1.05, abs=1e-4)
+        assert entries["etgs"].mean("mae_c") == pytest.approx(0.5, abs=1e-4)
+        assert [entries[name].cost("seconds") for name in ("3dgs", "etgs", "theirs")] == pytest.approx([8, 10, 99])
+        assert [entries[name].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
+        assert [entries[name].seeds for name in ("3dgs", "etgs", "theirs")] == [2, 2, 1]
+    text = (then / "leaderboard.md").read_text()
+    assert "Seconds of later runs are multiplied by 0.33" in text and "| `theirs` | 0.24 | 1 | 99 |" in text
+    pictures = read_page(then / "leaderboard.html", board(root, **asked))["scenes"][0]["pictures"]
+    assert all(set(shown[which]) == {"3dgs", "etgs", "theirs"} for shown in pictures for which in ("renders", "errors"))
+
+    for text, message in (("<html>", "no page of a leaderboard"), (page.read_text().replace("tiny", "demo"), "sizes")):
+        (tmp_path / "other.html").write_text(text)
+        with pytest.raises(SceneError, match=message):
+            standings(then, board(root, **asked, earlier=[str(tmp_path / "other.html")]))

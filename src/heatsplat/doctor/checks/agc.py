@@ -10,6 +10,9 @@ from heatsplat.doctor.checks.drift import frame_levels
 
 MIN_POINTS, MIN_FRAMES = 40, 5
 GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
+ROUGH = (
+    0.4  # leaps in spreads of the gains: 1.2 where they have no order in time, 0.13 to 0.16 where mist comes and goes
+)
 EXPLAINED = 0.5  # share of what levels leave that gains have to explain
 ALIKE = 0.8  # correlation of what two halves of the points tell of the gains; a pane changes only what it mirrors
 FULL, MOST = 0.012, 0.9  # how near black and white frames reach that the camera stretched, and the share of such frames
@@ -53,17 +56,22 @@ def _gains(material: Material) -> float | None:
     own = known - known.nanmean(dim=0)
     kept = used.sum(0) >= MIN_POINTS // 2
     own, points = own[:, kept], points[:, kept]
+    times = (
+        None
+        if material.times_s is None
+        else torch.tensor(material.times_s, dtype=own.dtype)[list(material.chosen)][kept]
+    )
     gain = _gain(own, points)
     left, after = (own - points).abs().nanmedian(), (own - gain * points).abs().nanmedian()
     if len(gain) < MIN_FRAMES or float(after) > (1.0 - EXPLAINED) * float(left):
         return None
-    # A scene that cools loses contrast smoothly; a camera leaps.
-    leaps = float(_leaps(gain).std()) / float(gain.mean().abs().clamp_min(1e-9))
-    if leaps <= GAIN:
+    # A scene that cools loses contrast smoothly, and so does one that mist drifts through; a camera leaps.
+    leaps = float(_leaps(gain, times).std()) / float(gain.mean().abs().clamp_min(1e-9))
+    if leaps <= GAIN or leaps * float(gain.mean().abs()) <= ROUGH * float(gain.std()):
         return None
     share = (own - gain * points).abs().nanmean(1) / points.abs().nanmean(1).clamp_min(1e-12)
     upper = share > share.nanmedian()
-    one, other = (_leaps(_gain(own[half], points[half])) for half in (upper, ~upper))
+    one, other = (_leaps(_gain(own[half], points[half]), times) for half in (upper, ~upper))
     return leaps if float(torch.corrcoef(torch.stack([one, other]))[0, 1]) > ALIKE else None
 
 
@@ -72,9 +80,12 @@ def _gain(own: Tensor, points: Tensor) -> Tensor:
     return (own * points).nansum(0) / points.square().nansum(0).clamp_min(1e-12)
 
 
-def _leaps(gain: Tensor) -> Tensor:
-    """What a contrast has beyond the middle of its neighbours."""
-    return gain[1:-1] - 0.5 * (gain[:-2] + gain[2:])
+def _leaps(gain: Tensor, times_s: Tensor | None) -> Tensor:
+    """What a contrast has beyond the straight line between its neighbours in time; evenly spread without times."""
+    if times_s is None:
+        times_s = torch.arange(len(gain), dtype=gain.dtype)
+    share = (times_s[1:-1] - times_s[:-2]) / (times_s[2:] - times_s[:-2]).clamp_min(1e-9)
+    return gain[1:-1] - torch.lerp(gain[:-2], gain[2:], share)
 
 
 def _fills_the_range(material: Material) -> bool:

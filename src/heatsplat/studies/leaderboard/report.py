@@ -12,7 +12,7 @@ from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import Entry, beside_reference, spread_of, standings, summary
+from heatsplat.studies.leaderboard.standings import Entry, Standings, beside_reference, spread_of, standings, summary
 
 log = logging.getLogger("heatsplat")
 
@@ -23,23 +23,24 @@ DIGITS = {"psnr": 2, "ssim": 4, "mae_c": 3}
 
 def write_leaderboard(folder: Path, board: Board) -> list[Path]:
     """Writes the table, the CSV and the page into the folder of a sweep, and where the board says besides; their paths."""
-    entries = standings(folder, board)
-    told = summary(entries, board)
+    found = standings(folder, board)
+    told = summary(found.entries, board)
     log.info("%d of %d entries have results, of %d runs", told["filled"], told["entries"], told["runs"])
-    text = markdown(entries, board)
-    files = {folder / TABLE_FILE: text, folder / PAGE_FILE: page(entries, board, folder)}
+    text = markdown(found, board)
+    files = {folder / TABLE_FILE: text, folder / PAGE_FILE: page(found, board, folder)}
     if board.document is not None:
         files[board.document] = text
     if board.page is not None:
-        files[board.page] = page(entries, board, None)
+        files[board.page] = page(found, board, None)
     for path, content in files.items():
         write_atomically(path, content)
-    write_csv(folder / CSV_FILE, _records(entries, board))
+    write_csv(folder / CSV_FILE, _records(found.entries, board))
     return [*files, folder / CSV_FILE]
 
 
-def markdown(entries: Sequence[Entry], board: Board) -> str:
+def markdown(found: Standings, board: Board) -> str:
     """The table: a part for each track, with ranks over all scenes and the error on each."""
+    entries = found.entries
     told, score = summary(entries, board), board.protocol["scores"][0]
     unit = DEFINITIONS[score].unit
     lines = [
@@ -47,7 +48,7 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
         "",
         f"Every method on every scene of the [protocol](protocol.md), written by `experiment=leaderboard`. Scenes of size "
         f"{', '.join(board.sizes)}; {told['runs']} runs, {told['hours']:.2f} h of {_clock(board)} together; seeds "
-        f"{', '.join(map(str, board.seeds))}. {board.note}".rstrip(),
+        f"{', '.join(map(str, board.seeds))}. {' '.join(filter(None, (board.note, found.note)))}".rstrip(),
         "",
         f"The [page]({PAGE_FILE}) beside it sorts, draws error against seconds, and shows renders beside the truth.",
         "",
@@ -58,10 +59,10 @@ def markdown(entries: Sequence[Entry], board: Board) -> str:
     ]
     for track in board.tracks:
         own = [entry for entry in entries if entry.track == track]
-        if not any(entry.scores for entry in own):
+        if not any(entry.seeds for entry in own):
             continue
         settings = " ".join(board.protocol["tracks"][track])
-        if steps := sorted({int(cost["steps"]) for entry in own for cost in entry.costs if cost.get("steps")}):
+        if steps := sorted({int(entry.cost("steps")) for entry in own if entry.cost("steps")}):
             settings += f"`; steps taken: `{steps[0]:,}" + (f" to {steps[-1]:,}" if len(steps) > 1 else "")
         lines += [f"## Equal {track}", "", f"`{settings}`", "", *_table(own, board, track), ""]
         lines += [f"### By what is held out, equal {track}", "", *_parts(own, board), ""]
@@ -91,7 +92,7 @@ def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
     rows = []
     for method in order(entries, board, track):
         own = [places.get((method, scene)) for scene in scenes]
-        if not any(one and one.scores for one in own):
+        if not any(one and one.seeds for one in own):
             continue
         ratio, count = beside.get((method, track), (None, 0))
         seconds = [one.cost("seconds") for one in own if one and one.cost("seconds") is not None]
@@ -117,14 +118,12 @@ def _cell(entry: Entry | None, score: str) -> str:
 def _parts(entries: Sequence[Entry], board: Board) -> list[str]:
     """The three best of each part of each scene."""
     score = board.protocol["scores"][0]
-    parts = list(dict.fromkeys(part for entry in entries for one in entry.scores for part in one.parts))
+    parts = list(dict.fromkeys(part for entry in entries for part in entry.parts))
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     rows = []
     for scene in scenes:
         for part in parts:
-            found = {
-                entry.method: entry.mean(score, part) for entry in entries if entry.scene == scene and entry.scores
-            }
+            found = {entry.method: entry.mean(score, part) for entry in entries if entry.scene == scene and entry.seeds}
             found = {method: value for method, value in found.items() if value is not None}
             if found:
                 best = sorted(found, key=found.get)[:3]
@@ -138,7 +137,7 @@ def _reasons(entries: Sequence[Entry]) -> list[str]:
     """Methods without results and why, scenes of one reason together."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for entry in entries:
-        if not entry.scores:
+        if not entry.seeds:
             reasons.setdefault((entry.method, _short(entry)), []).append(entry.scene)
     return [f"`{method}` on {', '.join(scenes)}: {reason}" for (method, reason), scenes in reasons.items()]
 
@@ -149,11 +148,13 @@ def _short(entry: Entry) -> str:
 
 
 def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object]]:
-    """A row per run in full precision; one without scores for what has none."""
+    """A row per run in full precision, or for all seeds of an earlier page; one without scores for what has none."""
     rows: list[Mapping[str, object]] = []
     for entry in entries:
         about = {"method": entry.method, "scene": entry.scene, "track": entry.track}
-        if not entry.scores:
+        if entry.told is not None:
+            rows.append({**about, **entry.told["scores"], **entry.told["cost"], "seeds": entry.seeds})
+        elif not entry.scores:
             rows.append({**about, "reason": entry.reason})
         for score, cost, folder in zip(entry.scores, entry.costs, entry.folders, strict=True):
             values = {name: score.mean(name) for name in board.protocol["scores"]}

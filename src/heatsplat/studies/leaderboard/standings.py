@@ -16,6 +16,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, write_atomically
 from heatsplat.metrics import DEFINITIONS
 from heatsplat.studies.finished import reason_of
+from heatsplat.studies.leaderboard.earlier import add_earlier, handed_in, place_of, read_page, sentence, told_by
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene, score_submission
@@ -36,6 +37,7 @@ class Entry:
         costs: seconds, memory_mb, gaussians and steps of each, where known.
         folders: where each lies.
         commands: what each was run with.
+        told: what an earlier page says, which stands in place of runs; None where runs speak.
         reason: why there are none.
         rank: best and worst rank that the seeds allow, in its scene and track; None without results.
     """
@@ -47,8 +49,37 @@ class Entry:
     costs: list[dict[str, float]] = field(default_factory=list)
     folders: list[Path] = field(default_factory=list)
     commands: list[list[str]] = field(default_factory=list)
+    told: Mapping[str, Any] | None = None
     reason: str = "not run yet"
     rank: tuple[int, int] | None = None
+
+    @property
+    def seeds(self) -> int:
+        """How many seeds have results."""
+        return len(self.scores) if self.told is None else int(self.told["seeds"])
+
+    @property
+    def parts(self) -> list[str]:
+        """What views are held out by; empty without results."""
+        if self.told is not None:
+            return list(self.told["parts"])
+        return list(dict.fromkeys(part for score in self.scores for part in score.parts))
+
+    @property
+    def command(self) -> str:
+        """What the first seed was run with."""
+        return str(self.told["command"]) if self.told is not None else " ".join(self.commands[0])
+
+    def take(self, told: Mapping[str, Any]) -> None:
+        """Lets what an earlier page says stand in place of the runs."""
+        self.told, self.scores, self.costs, self.folders, self.commands = told, [], [], [], []
+
+    def scale_seconds(self, factor: float) -> None:
+        """Makes the seconds of the runs those of another machine."""
+        self.costs = [
+            {**cost, "seconds": cost["seconds"] * factor} if cost.get("seconds") is not None else cost
+            for cost in self.costs
+        ]
 
     def values(self, score: str, part: str | None = None) -> list[float]:
         """A score of each seed; all views, or those of a part."""
@@ -56,18 +87,48 @@ class Entry:
         return [value for value in found if value is not None and math.isfinite(value)]
 
     def mean(self, score: str, part: str | None = None) -> float | None:
-        """Mean over the seeds."""
+        """Mean over the seeds; of a part, earlier pages have the score that ranks alone."""
+        if self.told is not None:
+            return self.told["scores"].get(score) if part is None else self.told["parts"].get(part)
         values = self.values(score, part)
         return statistics.fmean(values) if values else None
 
+    def deviation(self, score: str) -> float | None:
+        """Standard deviation over the seeds of the score that ranks; None for one seed."""
+        if self.told is not None:
+            return self.told["spread"]
+        values = self.values(score)
+        return statistics.stdev(values) if len(values) > 1 else None
+
     def cost(self, name: str) -> float | None:
         """Mean of a cost over the seeds that tell it."""
+        if self.told is not None:
+            return self.told["cost"].get(name)
         values = [cost[name] for cost in self.costs if cost.get(name) is not None]
         return statistics.fmean(values) if values else None
 
 
-def standings(folder: Path, board: Board) -> list[Entry]:
-    """All entries of a board, in the order of its scenes and methods, submissions last; ranked within scene and track."""
+@dataclass(frozen=True)
+class Standings:
+    """What a board came to.
+
+    Args:
+        entries: in the order of its scenes and methods, submissions last; ranked within scene and track.
+        pages: contents of the earlier pages that stand where no run does.
+        note: what was taken from them.
+    """
+
+    entries: list[Entry]
+    pages: list[Mapping[str, Any]] = field(default_factory=list)
+    note: str = ""
+
+
+def standings(folder: Path, board: Board) -> Standings:
+    """What the runs in a folder, the submissions and earlier pages came to.
+
+    Raises:
+        SceneError: a page is not one of this board, or a submission is none.
+    """
     places = {(run.method, run.scene, run.track): run for run in _entries(board)}
     for path in sorted(folder.glob(f"*/{OVERRIDES}")):
         _add_run(places, path.parents[1], board)
@@ -80,16 +141,25 @@ def standings(folder: Path, board: Board) -> list[Entry]:
             entry.costs.append(dict(score.cost))
             entry.folders.append(submission)
             entry.commands.append([str(told.get("code", "a submission"))])
+    pages = [read_page(path, board) for path in board.earlier]
+    for page in pages:
+        for key in (place_of(one) for one in told_by(page) if handed_in(one)):
+            if key[1] in board.scenes and key[2] in board.tracks:
+                places.setdefault(key, Entry(*key))
+    factors = [add_earlier(places, page) for page in pages]
     entries = list(places.values())
     first = board.protocol["scores"][0]
     higher = DEFINITIONS[first].better == "higher"
-    usual = usual_spread([entry.values(first) for entry in entries])
+    usual = usual_spread(entries, first)
     for scene in dict.fromkeys(entry.scene for entry in entries):
         for track in board.tracks:
-            ranked = [one for one in entries if (one.scene, one.track) == (scene, track) and one.values(first)]
-            for entry, rank in zip(ranked, ranks([one.values(first) for one in ranked], usual, higher), strict=True):
+            ranked = [
+                one for one in entries if (one.scene, one.track) == (scene, track) and one.mean(first) is not None
+            ]
+            means, errors = [one.mean(first) for one in ranked], [standard_error(one, first, usual) for one in ranked]
+            for entry, rank in zip(ranked, ranks(means, errors, higher), strict=True):
                 entry.rank = rank
-    return entries
+    return Standings(entries, pages, sentence(factors))
 
 
 def _entries(board: Board) -> list[Entry]:
@@ -150,41 +220,39 @@ def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
 # Ranks ---------------------------------------------------------------------------------------------------------------
 
 
-def usual_spread(values: Sequence[Sequence[float]]) -> float | None:
+def usual_spread(entries: Sequence[Entry], score: str) -> float | None:
     """Standard deviation over seeds as a share of the mean: root mean square over all that have several; None for none."""
-    shares = [
-        statistics.stdev(own) / statistics.fmean(own) for own in values if len(own) > 1 and statistics.fmean(own) > 0
-    ]
+    shares = [one.deviation(score) / one.mean(score) for one in entries if one.seeds > 1 and (one.mean(score) or 0) > 0]
     return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
 
 
 def spread_of(entries: Sequence[Entry], board: Board) -> str:
     """A sentence on what is taken for the spread of what ran with one seed."""
-    values = [entry.values(board.protocol["scores"][0]) for entry in entries]
-    if not any(len(own) == 1 for own in values):
+    if not any(one.seeds == 1 for one in entries):
         return ""
-    usual = usual_spread(values)
+    usual = usual_spread(entries, board.protocol["scores"][0])
     if usual is None:
         return "All ran with one seed, which tells no spread: ranks are those of the bare numbers."
     return f"What ran with one seed is taken to spread by {100 * usual:.1f} %, as the others do."
 
 
-def ranks(values: Sequence[Sequence[float]], usual: float | None, higher: bool = False) -> list[tuple[int, int]]:
+def standard_error(entry: Entry, score: str, usual: float | None) -> float:
+    """Of the mean over seeds; what ran with one seed is taken to spread by ``usual`` of its mean, all by 0 without it."""
+    deviation = entry.deviation(score)
+    if deviation is None:
+        deviation = (usual or 0.0) * abs(entry.mean(score))
+    return deviation / math.sqrt(entry.seeds)
+
+
+def ranks(means: Sequence[float], errors: Sequence[float], higher: bool = False) -> list[tuple[int, int]]:
     """Best and worst rank of each: those that are not told apart from it by the seeds may stand before or behind it.
 
-    Two are told apart where their means differ by more than two standard errors of the difference. What ran with one seed is
-    taken to spread by ``usual`` of its mean, all by 0 where nothing is known of the spread.
+    Two are told apart where their means differ by more than two standard errors of the difference.
 
     Args:
-        values: a score of each seed, for each method.
-        usual: of ``usual_spread``.
+        means, errors: of each method, a score over its seeds and its standard error.
         higher: whether more is better.
     """
-    means = [statistics.fmean(own) for own in values]
-    errors = [
-        (statistics.stdev(own) if len(own) > 1 else (usual or 0.0) * abs(mean)) / math.sqrt(len(own))
-        for own, mean in zip(values, means, strict=True)
-    ]
     found = []
     for i, mean in enumerate(means):
         apart = [
@@ -212,10 +280,10 @@ def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, 
 
 def summary(entries: Sequence[Entry], board: Board) -> dict[str, Any]:
     """What the whole table cost and how much of it there is."""
-    seconds = [cost["seconds"] for entry in entries for cost in entry.costs if cost.get("seconds") is not None]
+    seconds = [entry.seeds * entry.cost("seconds") for entry in entries if entry.seeds and entry.cost("seconds")]
     return {
-        "runs": sum(len(entry.scores) for entry in entries),
-        "filled": sum(bool(entry.scores) for entry in entries),
+        "runs": sum(entry.seeds for entry in entries),
+        "filled": sum(entry.seeds > 0 for entry in entries),
         "entries": len(entries),
         "hours": sum(seconds) / 3600.0,
         "clock": board.clock,

@@ -1,0 +1,101 @@
+"""A leaderboard's page as the record of its runs: what stands on it goes on counting when their folders are gone."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from heatsplat.contracts import SceneError
+
+if TYPE_CHECKING:
+    from heatsplat.studies.leaderboard.plan import Board
+    from heatsplat.studies.leaderboard.standings import Entry
+
+MARK = "const board = "  # before the JSON of a page
+
+
+def read_page(path: Path, board: Board) -> dict[str, Any]:
+    """The contents of a page that a leaderboard wrote.
+
+    Raises:
+        SceneError: there is no such page, or it has scenes of another size, another score or another reference.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SceneError(f"leaderboard.earlier: {path} cannot be read ({error.strerror})") from error
+    if MARK not in text:
+        raise SceneError(f"leaderboard.earlier: {path} is no page of a leaderboard; give a leaderboard.html")
+    content, _ = json.JSONDecoder().raw_decode(text, text.index(MARK) + len(MARK))
+    wanted = {"sizes": board.sizes, "score": board.protocol["scores"][0], "reference": board.protocol["reference"]}
+    for key, value in wanted.items():
+        if content[key] != value:
+            raise SceneError(f"leaderboard.earlier: {path} has {key} {content[key]}, this board {value}; leave it out")
+    return content
+
+
+def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[str, Any]) -> float | None:
+    """Lets what a page tells stand where a board's folders have fewer seeds; the factor that makes their seconds its.
+
+    Machines differ. Where runs of the reference are in the folders and on the page, the seconds of all folders' runs are
+    multiplied by what the reference took there over what it took here (geometric mean over scenes and tracks); None where no
+    such pair is, and seconds stay as they are.
+    """
+    told = {place_of(one): one for one in told_by(content)}
+    pairs = [
+        (told[key]["cost"]["seconds"], entry.cost("seconds"))
+        for key, entry in places.items()
+        if key in told and key[0] == content["reference"]
+    ]
+    logs = [math.log(there / here) for there, here in pairs if there and here]
+    factor = math.exp(statistics.fmean(logs)) if logs else None
+    if factor is not None:
+        for entry in places.values():
+            entry.scale_seconds(factor)
+    for key, one in told.items():
+        if key in places and one["seeds"] > places[key].seeds:
+            places[key].take(one)
+    return factor
+
+
+def told_by(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Entries of a page that have results."""
+    return [one for one in content["entries"] if one.get("scores")]
+
+
+def place_of(one: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Method, scene and track of an entry of a page."""
+    return one["method"], one["scene"], one["track"]
+
+
+def handed_in(one: Mapping[str, Any]) -> bool:
+    """Whether an entry of a page is a submission: heatsplat's own were run by overrides."""
+    return not one["command"].startswith("method=")
+
+
+def pictures_of(contents: Iterable[Mapping[str, Any]], scene: str, view: str) -> Mapping[str, Any] | None:
+    """Renders and errors of a view that a page shows, as it has them; None where none shows it."""
+    for content in contents:
+        for one in content["scenes"]:
+            if one["name"] == scene:
+                for shown in one["pictures"]:
+                    if shown["view"] == view:
+                        return shown
+    return None
+
+
+def sentence(factors: Sequence[float | None]) -> str:
+    """What was taken from pages, and by how much the seconds of later runs were scaled, for the table."""
+    scaled = [factor for factor in factors if factor is not None]
+    if not factors:
+        return ""
+    text = "What no later run has as many seeds of stands as an earlier page had it."
+    if scaled:
+        text += (
+            f" Seconds of later runs are multiplied by {scaled[0]:.2f}, so that the reference takes what it took there."
+        )
+    return text
