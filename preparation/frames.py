@@ -101,7 +101,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     if len([kind for kind in there if kind != "grey"]) > 1:
         raise SceneError(
             f"{folder} holds several kinds of thermal images: "
-            f"{', '.join(f'{len(kinds[k])} {KINDS[k]} (such as {kinds[k][0].name})' for k in there)}. Put each kind into a "
+            f"{', '.join(f'{KINDS[k]} ({len(kinds[k])}, such as {kinds[k][0].name})' for k in there)}. Put each kind into a "
             "folder of its own and prepare those"
         )
     if not there:

@@ -18,6 +18,7 @@ import torch
 from rich.progress import Progress, track
 
 from heatsplat.contracts import SceneError, check_option, evenly_spread
+from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.geometry.alignment import Similarity, pose_errors
@@ -49,8 +50,8 @@ class FindPoses:
     scale and orientation are the reconstruction's own. One thread and one seed: the same frames give the same bits.
 
     Args:
-        by: "thermal" frames, or "rgb": the photos that belong to them; where the thermal camera stands beside the visible
-            one is then calibrated on the way, from the thermal features.
+        by: "thermal" frames, or "rgb": the photos that belong to them. How the thermal camera is turned against the visible
+            one is then found on the way, from the thermal features; where it stands is taken for the same in the mean.
         features: what finds and matches features.
         camera_model: of COLMAP, for each camera: SIMPLE_RADIAL, RADIAL, OPENCV, ...
         focal_px: focal length of the thermal camera in pixels; None for what the files say, or a guess that is refined.
@@ -90,9 +91,8 @@ class FindPoses:
         Raises:
             SceneError: no two frames could be brought together.
         """
-        pycolmap.logging.minloglevel = int(
-            pycolmap.logging.Level.FATAL
-        )  # what went wrong is said below, by names of frames
+        # What went wrong is said below, by names of frames.
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
         search = Search(self, frames, target)
         search.begin()
         search.copies()
@@ -283,7 +283,7 @@ class Search:
         if len(written.points3D) > 2:
             draw_cameras(
                 self.target / PICTURE,
-                [np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]]) for image in placed],
+                [pose_matrix(image) for image in placed],
                 np.array([point.xyz for point in written.points3D.values()]),
                 self.origin is not None,
             )
@@ -298,7 +298,8 @@ class Search:
         return hashlib.sha256(repr([self.options, images, *self.frames.values()]).encode()).hexdigest()
 
     def _rig(self, model: pycolmap.Reconstruction, written: pycolmap.Reconstruction) -> tuple[float, list[float]]:
-        """By how many degrees the thermal camera is turned against the visible one, and where it stands in that one's axes."""
+        """By how many degrees the thermal camera is turned against the visible one (median over the frames), and where it
+        stands in that one's axes (mean): right, down, forward, in units of the world, which are metres with GPS."""
         photos = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
         between = [
             image.cam_from_world() * photos[self._photo(image.name)].inverse()
@@ -467,11 +468,20 @@ class Search:
 
 
 def settle_rig(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> Similarity | None:
-    """Finds how the thermal camera is turned against the visible one, in the model, by a bundle adjustment of all images.
+    """The similarity that brings the thermal cameras to the visible ones beside them; None where fewer than three stand beside
+    one.
 
-    No feature is common to both, so nothing but their poses ties the two worlds: about an orbit that looks at its middle the
-    thermal one may have any size. Returns the similarity that brings the thermal cameras to the visible ones beside them;
-    None where fewer than three stand beside one.
+    ``model`` is changed: a bundle adjustment of all images (Triggs et al. 2000) in which the thermal camera's place in the rig
+    is free, as one pose for all frames, finds how it is turned. No feature is common to both cameras, so nothing but their
+    poses ties the two worlds: about an orbit that looks at its middle the thermal one may have any size. So its size and
+    place are those at which the centres of both fit best (Umeyama 1991).
+
+    **Convention:** poses are world to camera in OpenCV axes, lengths are in units of the world (metres with GPS); the
+    similarity goes from the thermal world to the visible one.
+
+    Args:
+        model: of both cameras; images of thermal frames are called thermal/..., their photos rgb/... with the same rest.
+        name_of: by name of a thermal image in the model, that of its frame.
     """
     adjusted = pycolmap.BundleAdjustmentConfig()
     placed = {image.name: image for image in model.images.values() if image.has_pose}
@@ -487,12 +497,8 @@ def settle_rig(model: pycolmap.Reconstruction, name_of: dict[str, str]) -> Simil
     both = [(thermal, photo) for thermal, photo in pairs if photo is not None]
     if len(both) < 3:
         return None
-    thermal, visible = (torch.from_numpy(np.stack([_matrix(pair[k]) for pair in both])) for k in (0, 1))
+    thermal, visible = (torch.from_numpy(np.stack([pose_matrix(pair[k]) for pair in both])) for k in (0, 1))
     return pose_errors(thermal, visible).similarity
-
-
-def _matrix(image: pycolmap.Image) -> np.ndarray:
-    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 def thermal_only(

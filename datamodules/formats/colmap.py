@@ -77,16 +77,20 @@ def read_model(scene: Path) -> SparseModel:
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     if not images:
         raise SceneError(f"sparse model {folder} has no registered image; reconstruct the scene again")
-    bottom = np.array([[0.0, 0.0, 0.0, 1.0]])
     points = list(model.points3D.values())
     return SparseModel(
         folder=folder,
         names=tuple(image.name for image in images),
-        viewmats=tuple(np.vstack([image.cam_from_world().matrix(), bottom]) for image in images),
+        viewmats=tuple(pose_matrix(image) for image in images),
         lenses=tuple(lenses[image.camera_id] for image in images),
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
         colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255.0,
     )
+
+
+def pose_matrix(image: pycolmap.Image) -> np.ndarray:
+    """World to camera [4, 4] float64 of an image that has a pose, OpenCV axes."""
+    return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 def write_model(

@@ -70,6 +70,8 @@ class Scene:
     thermal_range: ThermalRange | None = None
     probe_reach_m: float = 0.04
 
+    _asked: tuple[Tensor, SurfaceHeat] | None = None  # points of the last ``truth``, and what warms them
+
     def __init__(self, preset: Preset) -> None:
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
@@ -268,8 +270,11 @@ class Scene:
 
     def truth(self, points: Tensor, times_s: Tensor) -> Tensor:
         """Temperatures [n, F] of the surface nearest to each of ``points`` [n, 3] at ``times_s`` [F], in °C."""
-        on_surface, which = self.nearest(points)
-        return self.celsius(self.heat_at(on_surface, which), times_s.to("cpu", torch.float64).reshape(-1))
+        if self._asked is None or not torch.equal(
+            points, self._asked[0]
+        ):  # of the same points one asks for many moments
+            self._asked = points.clone(), self.heat_at(*self.nearest(points))
+        return self.celsius(self._asked[1], times_s.to("cpu", torch.float64).reshape(-1))
 
     def color(self, points: Tensor, which: Tensor) -> Tensor:
         """Colour [n, 3] in [0, 1] that surface points reflect: Lambertian, dark where the paint absorbs heat."""

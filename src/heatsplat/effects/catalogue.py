@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from pkgutil import iter_modules
 from types import ModuleType
@@ -57,6 +58,8 @@ def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
     if choice == "off":
         return Verdict(effect.name, False, None, None, f"effects.{effect.name}=off")
     evidence = effect.evidence(inspected)
+    if inspected.blind and evidence.statistic is None and evidence.reason == inspected.obs.why:
+        evidence = replace(evidence, told=False)
     if choice == "on":
         return Verdict(effect.name, True, None, None, f"effects.{effect.name}=on", evidence.settings)
     known = evidence.statistic is not None and math.isfinite(evidence.statistic)

@@ -16,6 +16,7 @@ from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import selected
 from heatsplat.effects.observations import Observations, observe
 from heatsplat.effects.surface import normals
+from heatsplat.effects.swept_points import with_swept_points
 from heatsplat.effects.weathered import Weathered
 
 
@@ -23,13 +24,19 @@ class Inspection:
     """A scene, for the evidence of effects.
 
     Args:
-        scene: seen through its training views only; of the others count the sizes.
+        scene: seen through its training views only; of the others count the sizes. Random points give way to those that its
+            images show (``swept_points``).
         effects: those that the joint fit may take in.
     """
 
     def __init__(self, scene: SceneData, effects: Sequence[Effect] = ()) -> None:
-        self.scene = scene
+        self.scene = with_swept_points(scene)
         self.effects = effects
+
+    @property
+    def blind(self) -> bool:
+        """Whether the scene's points were random and its images show no others."""
+        return "points_random" in self.scene.notes and len(self.scene.points) == 0
 
     @cached_property
     def obs(self) -> Observations:

@@ -136,6 +136,8 @@ def observe(scene: SceneData) -> Observations:
         tracks = _pixels(views, images, masks)
     elif len(scene.points) < 1:
         why = "the scene has no points to follow through the images"
+        if "points_random" in scene.notes:
+            why = "cannot be told: the scene has no points of its own, and its images too little texture to find some"
     else:
         tracks = tracks_of(scene.points.double(), views, images, noise)
         if tracks is None:

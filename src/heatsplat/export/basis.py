@@ -13,10 +13,8 @@ FIRST = 17  # moments to begin with, evenly over the span; bends that are known 
 CHECKS = 7  # moments between the samples at which nothing was fitted, and
 ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
 GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
-OVERSAMPLED, TURNS = (
-    16,
-    2,
-)  # of the subspace in which singular vectors are sought: curves more than wanted, and its turns
+OVERSAMPLED = 16  # of the subspace in which singular vectors are sought: more than are wanted, and
+TURNS = 2  # how often it is turned towards the values
 ROWS = 16384  # Gaussians whose errors are looked at together
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 

@@ -21,14 +21,14 @@ VIEWS = 6  # training cameras over which what depends on the view is averaged
 JUDGED = 48  # training cameras at most that are compared with that mean
 TIMES = 257  # samples of a quantity over time at most, and
 BENDS = 3073  # where a weather record bends curves at each of its samples
-VALUES = 2e8  # of all Gaussians at all samples: 0.8 GB
+VALUES = 1e8  # of all Gaussians at all samples: 0.4 GB
 CURVES = 48  # curves of a quantity at most; of few Gaussians more,
 COEFFICIENTS = 4_800_000  # up to so many numbers of 16 bits
 MOST_CURVES = 192  # but no more than these
 FEW_TIMES = 65  # the same of models for which
 WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
 RECALLED = (
-    4  # times as many under weather: moments in order go on from what was marched before, in place of all of the record
+    4  # times as many under weather: a moment goes on from what was marched before, in place of all of the record
 )
 TABLE = 257  # entries of a table of temperatures
 CHUNK = 16384  # points whose truth is asked for at once

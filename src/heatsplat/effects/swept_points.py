@@ -1,0 +1,141 @@
+"""Points of surfaces from images and cameras, for scenes whose own points are random ones."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from heatsplat.contracts import SceneData, View, evenly_spread
+from heatsplat.geometry.projection import to_camera
+from heatsplat.physics.noise import noise_of, quantum_of
+
+log = logging.getLogger(__name__)
+
+WIDEST = 160  # pixels along the longer side of the images that are swept; larger ones shrink
+MAX_VIEWS, REFERENCES, BESIDE = 64, 8, 6  # views that are looked at, swept, and compared with each of these
+PIXELS = 160  # of a swept view, those with the most texture
+REACH = 2  # pixels on either side of a patch
+NEAREST, FARTHEST = 0.2, 3.0  # depths that are tried, in distances of the camera to the middle of the scene
+DEPTHS = 96
+TURNED = 0.04  # least distance of two cameras that are compared, in the same unit
+TEXTURE = 4.0  # standard deviation of a patch, in those of the noise
+ALIKE = 0.9  # correlation of patches that show one surface
+AMBIGUOUS = 0.03  # a depth that is as good but for this, far from the best one, leaves a pixel undecided
+
+
+def with_swept_points(scene: SceneData) -> SceneData:
+    """The scene with points that its images show in place of random ones; the same where it has points of its own."""
+    if "points_random" not in scene.notes:
+        return scene
+    points = swept_points(scene).float()
+    log.info("the scene has no points of its own: effects are looked for at %d that its images show", len(points))
+    return replace(scene, points=points, point_colors=None)
+
+
+def swept_points(scene: SceneData) -> Tensor:
+    """Points [P, 3] float64 in the world, on surfaces with texture that several training views show alike; possibly none.
+
+    A plane sweep (Collins 1996): for pixels of some views, the depth at which the patch around them correlates best with what
+    other views show there. Correlation does not mind a level and a gain of each image, so that a scene may cool meanwhile.
+
+    Args:
+        scene: whose points, random ones in the cube that the cameras look at, tell where the middle of the scene is.
+    """
+    views = [scene.train[i] for i in evenly_spread(len(scene.train), MAX_VIEWS)]
+    views = [view for view in views if view.thermal is not None]
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    if len(views) < 3 or len(scene.points) == 0:
+        return none
+    images = [_shrunk(view) for view in views]
+    noise = noise_of(torch.stack(images), quantum_of(images[0])) if len({i.shape for i in images}) == 1 else 0.0
+    middle = scene.points.double().mean(0)
+    found = [none]
+    for k in evenly_spread(len(views), REFERENCES):
+        others = _beside(views, k, middle)
+        if len(others) >= 3:
+            found.append(_swept(views, images, k, others, noise, middle))
+    return torch.cat(found)
+
+
+def _shrunk(view: View) -> Tensor:
+    image = view.thermal.mean(2).double()
+    if view.mask is not None:
+        image = torch.where(view.mask, image, torch.nan)
+    factor = math.ceil(max(image.shape) / WIDEST)
+    return functional.avg_pool2d(image[None, None], factor)[0, 0]
+
+
+def _beside(views: Sequence[View], k: int, middle: Tensor) -> list[int]:
+    """The views nearest to one, of those that see the scene from elsewhere."""
+    centres = torch.stack([view.camera.center.double() for view in views])
+    apart = (centres - centres[k]).norm(dim=1) / (middle - centres[k]).norm().clamp_min(1e-9)
+    return [int(i) for i in apart.argsort() if apart[i] > TURNED][:BESIDE]
+
+
+def _swept(
+    views: Sequence[View], images: Sequence[Tensor], k: int, others: Sequence[int], noise: float, middle: Tensor
+) -> Tensor:
+    """Points [n, 3] of one view."""
+    image, camera = images[k], views[k].camera
+    height, width = image.shape
+    side = 2 * REACH + 1
+    patches = image.unfold(0, side, 1).unfold(1, side, 1).flatten(2)  # [H - 2 REACH, W - 2 REACH, side²]
+    texture = patches.std(2).nan_to_num(0.0).flatten()
+    order = texture.argsort(descending=True)
+    order = order[texture[order] > max(TEXTURE * noise, 1e-6)]
+    order = order[evenly_spread(len(order), PIXELS)]
+    if not len(order):
+        return image.new_zeros(0, 3)
+    across = patches.shape[1]
+    own = _standard(patches.flatten(0, 1)[order])
+    offsets = torch.arange(side, dtype=torch.float64)
+    down, right = torch.meshgrid(offsets, offsets, indexing="ij")
+    at = (
+        torch.stack([(order % across)[:, None] + right.flatten(), (order // across)[:, None] + down.flatten()], 2) + 0.5
+    )
+    scale = at.new_tensor([camera.width / width, camera.height / height])
+    matrix, viewmat = camera.K.double(), camera.viewmat.double()
+    rays = torch.linalg.solve(matrix, torch.cat([at * scale, torch.ones_like(at[..., :1])], 2)[..., None])[..., 0]
+    away = float((middle - camera.center.double()).norm())
+    depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
+    scores = torch.stack([_alike(own, rays, depths, viewmat, views[i], images[i]) for i in others])
+    seen = scores.isfinite()
+    half = scores.nan_to_num(-1.0).sort(dim=0, descending=True).values[: len(others) // 2 + 1]  # others may be hidden
+    score = torch.where(seen.sum(0) > len(others) // 2, half.mean(0), -1.0)  # [n, D]
+    best, place = score.max(1)
+    far = (torch.arange(DEPTHS) - place[:, None]).abs() > 4
+    rival = torch.where(far, score, -1.0).amax(1)
+    inner = (place > 0) & (place < DEPTHS - 1)
+    kept = (best > ALIKE) & (rival < best - AMBIGUOUS) & inner
+    score, place = score[kept], place[kept]
+    before, peak, after = (score.gather(1, (place + step)[:, None])[:, 0] for step in (-1, 0, 1))
+    shift = 0.5 * (before - after) / (before - 2.0 * peak + after).clamp_max(-1e-9)  # of a parabola's top
+    nearness = 1.0 / depths[place] + shift * (1.0 / depths[1] - 1.0 / depths[0])
+    local = rays[kept, side * side // 2] / nearness[:, None]
+    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, view: View, image: Tensor) -> Tensor:
+    """Correlation [n, D] of patches ``own`` [n, q] with what a view shows where they would lie at each depth; nan outside."""
+    camera = view.camera
+    points = rays[:, None] * depths[:, None, None]  # [n, D, q, 3]
+    world = (points - viewmat[:3, 3]) @ viewmat[:3, :3]
+    local = to_camera(world.flatten(0, 2), camera.viewmat.double())
+    ahead = local[:, 2] > 1e-6
+    pixels = (local @ camera.K.double().T)[:, :2] / local[:, 2:].clamp_min(1e-6)
+    positions = 2.0 * pixels / pixels.new_tensor([camera.width, camera.height]) - 1.0
+    inside = (ahead & (positions.abs() < 1.0).all(1)).view(points.shape[:3]).all(2)
+    values = functional.grid_sample(image[None, None], positions[None, None], align_corners=False)[0, 0, 0]
+    correlation = (_standard(values.view(points.shape[:3])) * own[:, None]).sum(2)
+    return torch.where(inside, correlation, torch.nan)
+
+
+def _standard(patches: Tensor) -> Tensor:
+    """Patches [..., q] without their mean, of length 1."""
+    return functional.normalize(patches - patches.mean(-1, keepdim=True), dim=-1)

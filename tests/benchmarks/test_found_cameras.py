@@ -1,0 +1,89 @@
+"""The study of found cameras: what it hands to prepare.py and train.py, and what it says of either."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from benchmarks import found_cameras
+from benchmarks.found_cameras import TABLE_FILE, prepared
+from heatsplat.composition import CONF
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.colmap import read_model, write_model
+from heatsplat.datamodules.synthetic_scene.film import Size, film
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.io.results import RunResults
+
+LENS = ("PINHOLE", (30.0, 30.0, 16.0, 12.0), 32, 24)
+CASE = {"scene": "cooling", "width": 32, "height": 24, "frames": 5, "dead_pixels": 3}
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def in_another_world(viewmat: np.ndarray) -> np.ndarray:
+    """World to camera where the world is half as large, turned and elsewhere: x -> 0.5 TURN x + (1, 2, 3)."""
+    moved = np.eye(4)
+    moved[:3, :3] = viewmat[:3, :3] @ TURN.T
+    moved[:3, 3] = 0.5 * viewmat[:3, 3] - moved[:3, :3] @ [1.0, 2.0, 3.0]
+    return moved
+
+
+def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, monkeypatch):
+    true = film(Scene(PRESETS["cooling"]), Size(32, 24, 5, 16)).viewmats
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    asked, trained_on = [], []
+
+    def pretend(prepare, settings, target: Path):
+        asked.append(settings)
+        (target / "images").mkdir(parents=True)
+        for frame in range(5):
+            (target / "images" / f"frame_{frame:04d}_T.tiff").touch()
+        poses = {f"frame_{frame:04d}_T.tiff": in_another_world(true[frame]) for frame in (0, 1, 3, 4)}
+        model = poses, [LENS], 0.5 * points @ TURN.T + [1.0, 2.0, 3.0], np.zeros((20, 3))
+        write_model(target / "sparse" / "0", *model)
+        return {"cpu_s": 12.3, "mib": 456.0}
+
+    def train(place, program, overrides, study):
+        trained_on.append(overrides)
+        results = RunResults()
+        for section, name, value in (("test", "psnr", 31.25), ("test", "mae_c", 0.1), ("cost", "gaussians", 1200)):
+            results.put(section, name, value)
+        results.put("cost", "train_seconds", 7.0)
+        return results
+
+    monkeypatch.setattr(found_cameras, "prepared", pretend)
+    monkeypatch.setattr(found_cameras, "trained", train)
+    found_cameras.run(
+        tmp_path, "prepare.py", "train.py", {"room": CASE | {"settings": ["poses.clip=2"]}}, ["max_steps=3"], 1
+    )
+    table = (tmp_path / TABLE_FILE).read_text()
+    assert "| room | 4 of 5 | 0.00° (0.00°) | 0.00 % (0.00 %) | 12 | 456 |" in table
+    assert "| room | found | 31.2 | 0.100 | 1,200 | 7 |" in table and "| room | true | 31.2 " in table
+    given = read_model(tmp_path / "room" / "model")
+    np.testing.assert_allclose(np.stack(given.viewmats), true[[0, 1, 3, 4]], atol=1e-9)
+    np.testing.assert_allclose(np.sort(given.points, 0), np.sort(points, 0), atol=1e-6)
+    assert len(list((tmp_path / "room" / "files" / "thermal").iterdir())) == 5
+    assert (
+        asked[0] == [f"source={tmp_path / 'room' / 'files' / 'thermal'}", "poses.clip=2"] and "poses=given" in asked[1]
+    )
+    assert [lines[-1] for lines in trained_on] == [
+        f"data.root={tmp_path / 'room' / kind}" for kind in ("found", "true")
+    ]
+
+
+def test_what_a_command_takes_is_kept_and_what_it_says_where_it_fails(tmp_path):
+    works = tmp_path / "works.py"
+    works.write_text("import sys; sum(range(10**7)); print(sys.argv)")
+    spent = prepared(str(works), ["a=1"], tmp_path / "one")
+    assert 0.05 < spent["cpu_s"] < 60.0 and 4.0 < spent["mib"] < 60.0  # not those of the tests
+    works.write_text("raise SystemExit('no cameras')")
+    assert prepared(str(works), ["a=1"], tmp_path / "one") == spent
+    with pytest.raises(SceneError, match=f"(?s){Path(sys.executable).name}.*target=.*no cameras"):
+        prepared(str(works), ["a=1"], tmp_path / "two")
+
+
+def test_its_configuration_names_cases_that_there_are():
+    cases = yaml.safe_load((Path(CONF) / "study" / "found_cameras.yaml").read_text())["cases"]
+    assert len(cases) > 3 and all(case["scene"] in {*PRESETS, found_cameras.FLIGHT} for case in cases.values())

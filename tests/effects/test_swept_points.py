@@ -1,0 +1,59 @@
+"""Scenes without points of their own: what their images show takes the place of random points."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from heatsplat.contracts import SceneData, View, ViewSet
+from heatsplat.datamodules.points import random_points, told_random
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.datamodules.synthetic_scene.presets import PRESETS
+from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.effects.catalogue import decide
+from heatsplat.effects.swept_points import swept_points, with_swept_points
+
+
+def without_points(name: str) -> SceneData:
+    scene = Synthetic(scene=name, size="tiny").scene
+    points = random_points([frame.camera.viewmat.double().numpy() for frame in scene.train.frames], 5000, 0)
+    notes = scene.notes | told_random(len(points), "")
+    return replace(scene, points=torch.from_numpy(points).float(), point_colors=None, notes=notes)
+
+
+def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile():
+    points = swept_points(without_points("cooling"))
+    on_surface, _ = Scene(PRESETS["cooling"]).nearest(points)
+    away = (on_surface - points).norm(dim=1)  # in metres, from 2.2 m and at 64 pixels a pixel is 3 cm
+    assert len(points) > 300 and away.median() < 0.03 and away.quantile(0.8) < 0.06
+
+
+def test_a_scene_with_points_keeps_them():
+    scene = Synthetic(scene="static", size="tiny").scene
+    assert with_swept_points(scene) is scene
+
+
+@pytest.mark.parametrize(
+    ("name", "effects"), [("static", set()), ("cooling", {"relaxation"}), ("drifting", {"frame_offset"})]
+)
+def test_effects_are_told_as_with_points_of_the_scene(name, effects):
+    verdicts = decide(without_points(name))
+    assert {effect for effect, verdict in verdicts.items() if verdict.on} == effects
+    assert all(verdicts[effect].told for effect in effects)
+
+
+def test_nothing_is_told_where_images_show_no_texture():
+    scene = without_points("cooling")
+
+    def flat(views: ViewSet) -> ViewSet:
+        def decode(position: int) -> View:
+            return replace(views[position], thermal=torch.full_like(views[position].thermal, 0.5))
+
+        return ViewSet(views.frames, decode)
+
+    bare = replace(scene, train=flat(scene.train))
+    assert len(swept_points(bare)) == 0
+    verdicts = decide(bare)
+    assert not any(verdict.on for verdict in verdicts.values())
+    for effect in ("relaxation", "frame_offset", "vignetting"):
+        assert not verdicts[effect].told and "too little texture" in verdicts[effect].reason
