@@ -270,9 +270,8 @@ class Scene:
 
     def truth(self, points: Tensor, times_s: Tensor) -> Tensor:
         """Temperatures [n, F] of the surface nearest to each of ``points`` [n, 3] at ``times_s`` [F], in °C."""
-        if self._asked is None or not torch.equal(
-            points, self._asked[0]
-        ):  # of the same points one asks for many moments
+        # Of the same points one asks for many moments.
+        if self._asked is None or not torch.equal(points, self._asked[0]):
             self._asked = points.clone(), self.heat_at(*self.nearest(points))
         return self.celsius(self._asked[1], times_s.to("cpu", torch.float64).reshape(-1))
 

@@ -27,9 +27,7 @@ COEFFICIENTS = 4_800_000  # up to so many numbers of 16 bits
 MOST_CURVES = 192  # but no more than these
 FEW_TIMES = 65  # the same of models for which
 WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
-RECALLED = (
-    4  # times as many under weather: a moment goes on from what was marched before, in place of all of the record
-)
+RECALLED = 4  # times as many under weather, where a moment goes on from what was marched before
 TABLE = 257  # entries of a table of temperatures
 CHUNK = 16384  # points whose truth is asked for at once
 
