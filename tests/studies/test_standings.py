@@ -102,7 +102,9 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
         assert [entries[name].rank for name in ("3dgs", "etgs", "theirs")] == [(3, 3), (2, 2), (1, 1)]
         assert [entries[name].seeds for name in ("3dgs", "etgs", "theirs")] == [2, 2, 1]
     text = (then / "leaderboard.md").read_text()
-    assert "Seconds of later runs are multiplied by 0.33" in text and "| `theirs` | 0.24 | 1 | 99 |" in text
+    assert (
+        "Seconds of later runs are multiplied by 0.33 (equal steps)" in text and "| `theirs` | 0.24 | 1 | 99 |" in text
+    )
     pictures = read_page(then / "leaderboard.html", board(root, **asked))["scenes"][0]["pictures"]
     assert all(set(shown[which]) == {"3dgs", "etgs", "theirs"} for shown in pictures for which in ("renders", "errors"))
 

@@ -38,28 +38,31 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
     return content
 
 
-def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[str, Any]) -> float | None:
-    """Lets what a page tells stand where a board's folders have fewer seeds; the factor that makes their seconds its.
+def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[str, Any]) -> dict[str, float]:
+    """Lets what a page tells stand where a board's folders have fewer seeds; track -> the factor that makes their seconds its.
 
-    Machines differ. Where runs of the reference are in the folders and on the page, the seconds of all folders' runs are
-    multiplied by what the reference took there over what it took here (geometric mean over scenes and tracks); None where no
-    such pair is, and seconds stay as they are.
+    Machines differ. Where runs of the reference in a track are in the folders and on the page, the seconds of all the folders'
+    runs in it are multiplied by what the reference took there over what it took here (geometric mean over scenes). Without such
+    a pair they stay as they are.
     """
     told = {place_of(one): one for one in told_by(content)}
-    pairs = [
-        (told[key]["cost"]["seconds"], entry.cost("seconds"))
-        for key, entry in places.items()
-        if key in told and key[0] == content["reference"]
-    ]
-    logs = [math.log(there / here) for there, here in pairs if there and here]
-    factor = math.exp(statistics.fmean(logs)) if logs else None
-    if factor is not None:
-        for entry in places.values():
-            entry.scale_seconds(factor)
+    factors = {}
+    for track in dict.fromkeys(key[2] for key in told):
+        own = [entry for key, entry in places.items() if key[2] == track]
+        pairs = [
+            (told[entry.place]["cost"]["seconds"], entry.cost("seconds"))
+            for entry in own
+            if entry.method == content["reference"] and entry.place in told
+        ]
+        logs = [math.log(there / here) for there, here in pairs if there and here]
+        if logs:
+            factors[track] = math.exp(statistics.fmean(logs))
+            for entry in own:
+                entry.scale_seconds(factors[track])
     for key, one in told.items():
         if key in places and one["seeds"] > places[key].seeds:
             places[key].take(one)
-    return factor
+    return factors
 
 
 def told_by(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -88,14 +91,12 @@ def pictures_of(contents: Iterable[Mapping[str, Any]], scene: str, view: str) ->
     return None
 
 
-def sentence(factors: Sequence[float | None]) -> str:
+def sentence(factors: Sequence[Mapping[str, float]]) -> str:
     """What was taken from pages, and by how much the seconds of later runs were scaled, for the table."""
-    scaled = [factor for factor in factors if factor is not None]
     if not factors:
         return ""
+    scaled = " and ".join(f"{factor:.2f} (equal {track})" for found in factors for track, factor in found.items())
     text = "What no later run has as many seeds of stands as an earlier page had it."
     if scaled:
-        text += (
-            f" Seconds of later runs are multiplied by {scaled[0]:.2f}, so that the reference takes what it took there."
-        )
+        text += f" Seconds of later runs are multiplied by {scaled}, so that the reference takes what it took there."
     return text

@@ -54,6 +54,11 @@ class Entry:
     rank: tuple[int, int] | None = None
 
     @property
+    def place(self) -> tuple[str, str, str]:
+        """Method, scene and track."""
+        return self.method, self.scene, self.track
+
+    @property
     def seeds(self) -> int:
         """How many seeds have results."""
         return len(self.scores) if self.told is None else int(self.told["seeds"])
