@@ -60,8 +60,8 @@ def run(
         output_dir: of the study; files, prepared scenes and runs lie in it.
         prepare, train: paths of prepare.py and train.py.
         cases: name -> a recording that is written as a camera would (scene, frames, width, height, and the rest of
-            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings and train:
-            further overrides of prepare.py and train.py.
+            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings, search and
+            train: further overrides of prepare.py, of its search for cameras alone, and of train.py.
         overrides: of train.py; None: nothing is trained.
         threads: CPU threads of training; None is all cores.
 
@@ -74,7 +74,7 @@ def run(
         place = output_dir / name
         files, truth = _given(case, place)
         settings = case.get("settings", ())
-        spent = prepared(prepare, [f"source={files}", *settings], place / "found")
+        spent = prepared(prepare, [f"source={files}", *settings, *case.get("search", ())], place / "found")
         found = read_model(place / "found")
         errors = compared(found, truth)
         cameras.append(_row(name, len(list((place / "found" / "images").glob("*.tiff"))), errors, spent))
@@ -155,7 +155,7 @@ def _peak_mib(process: int) -> float:
 
 def _given(case: Mapping[str, Any], place: Path) -> tuple[Path, Truth]:
     """Folder of a case's files, and their true cameras."""
-    case = {key: value for key, value in case.items() if key not in ("settings", "train")}
+    case = {key: value for key, value in case.items() if key not in ("settings", "search", "train")}
     if "files" in case:
         model = read_model(Path(case["model"]))
         stems = [PurePath(name).stem for name in model.names]

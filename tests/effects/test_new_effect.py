@@ -71,6 +71,8 @@ def test_a_file_adds_an_effect(tilt):
 
 
 class SimpleLook:
+    blind = False
+
     class scene:
         metadata = frozenset()
 
