@@ -105,10 +105,8 @@ class LearnedValues(pl.Callback):
         weights = (module.splats.opacities[0].detach() * sizes).double().cpu().numpy()
         off: dict[str, Tensor] = {}
         if self.deviations:
-            with (
-                torch.inference_mode(False),
-                torch.no_grad(),
-            ):  # a test allows no gradient, of which deviations are made
+            # A test allows no gradient, of which deviations are made.
+            with torch.inference_mode(False), torch.no_grad():
                 off = Uncertainty(module).of_attributes(frame)
         rows = []
         for name, values in told.items():

@@ -10,9 +10,7 @@ from heatsplat.doctor.checks.drift import frame_levels
 
 MIN_POINTS, MIN_FRAMES = 40, 5
 GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
-ROUGH = (
-    0.4  # leaps in spreads of the gains: 1.2 where they have no order in time, 0.13 to 0.16 where mist comes and goes
-)
+ROUGH = 0.4  # leaps in spreads of the gains: 1.2 where they have no order in time, 0.13 to 0.16 where mist drifts
 EXPLAINED = 0.5  # share of what levels leave that gains have to explain
 ALIKE = 0.8  # correlation of what two halves of the points tell of the gains; a pane changes only what it mirrors
 FULL, MOST = 0.012, 0.9  # how near black and white frames reach that the camera stretched, and the share of such frames
@@ -56,11 +54,9 @@ def _gains(material: Material) -> float | None:
     own = known - known.nanmean(dim=0)
     kept = used.sum(0) >= MIN_POINTS // 2
     own, points = own[:, kept], points[:, kept]
-    times = (
-        None
-        if material.times_s is None
-        else torch.tensor(material.times_s, dtype=own.dtype)[list(material.chosen)][kept]
-    )
+    times = material.times_s
+    if times is not None:
+        times = torch.tensor(times, dtype=own.dtype)[list(material.chosen)][kept]
     gain = _gain(own, points)
     left, after = (own - points).abs().nanmedian(), (own - gain * points).abs().nanmedian()
     if len(gain) < MIN_FRAMES or float(after) > (1.0 - EXPLAINED) * float(left):

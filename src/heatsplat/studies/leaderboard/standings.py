@@ -227,7 +227,8 @@ def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
 
 def usual_spread(entries: Sequence[Entry], score: str) -> float | None:
     """Standard deviation over seeds as a share of the mean: root mean square over all that have several; None for none."""
-    shares = [one.deviation(score) / one.mean(score) for one in entries if one.seeds > 1 and (one.mean(score) or 0) > 0]
+    known = [(one.deviation(score), one.mean(score)) for one in entries]
+    shares = [deviation / mean for deviation, mean in known if deviation is not None and mean > 0]
     return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
 
 
