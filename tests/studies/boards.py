@@ -14,7 +14,7 @@ PROTOCOL = yaml.safe_load((Path(__file__).parents[2] / "conf" / "protocol" / "th
 VIEWS = ("near_00003", "times_00007", "times_00008")
 ASKED = {
     "protocol": PROTOCOL, "root": None, "methods": None, "scenes": None, "tracks": ["steps"], "seeds": [0, 1],
-    "clock": "cpu_seconds", "submissions": [], "earlier": [], "document": None, "page": None, "train": True,
+    "clock": "cpu_seconds", "submissions": [], "earlier": None, "document": None, "page": None, "train": True,
     "note": "On a busy machine.",
 }  # fmt: skip
 

@@ -28,8 +28,8 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
     for seed in (0, 1):
         run_of(then, "etgs", "cooling", seed, 0.5, seconds=30.0)
     page = first / "leaderboard.html"
-    write_leaderboard(then, board(root, **asked, earlier=[str(page)]))
-    for sweep, own in ((then, [str(page)]), (tmp_path / "none", [str(then / "leaderboard.html")])):
+    write_leaderboard(then, board(root, **asked, earlier=str(page)))
+    for sweep, own in ((then, str(page)), (tmp_path / "none", str(then / "leaderboard.html"))):
         sweep.mkdir(exist_ok=True)  # the page of a merged table tells the same once more
         found = standings(sweep, board(root, **asked, earlier=own))
         entries = {one.method: one for one in found.entries}
@@ -48,4 +48,4 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
     for text, message in (("<html>", "no page of a leaderboard"), (page.read_text().replace("tiny", "demo"), "sizes")):
         (tmp_path / "other.html").write_text(text)
         with pytest.raises(SceneError, match=message):
-            standings(then, board(root, **asked, earlier=[str(tmp_path / "other.html")]))
+            standings(then, board(root, **asked, earlier=str(tmp_path / "other.html")))

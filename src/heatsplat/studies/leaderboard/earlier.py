@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,23 +80,16 @@ def handed_in(one: Mapping[str, Any]) -> bool:
     return not one["command"].startswith("method=")
 
 
-def pictures_of(contents: Iterable[Mapping[str, Any]], scene: str, view: str) -> Mapping[str, Any] | None:
-    """Renders and errors of a view that a page shows, as it has them; None where none shows it."""
-    for content in contents:
-        for one in content["scenes"]:
-            if one["name"] == scene:
-                for shown in one["pictures"]:
-                    if shown["view"] == view:
-                        return shown
-    return None
+def pictures_of(content: Mapping[str, Any] | None, scene: str, view: str) -> Mapping[str, Any] | None:
+    """Renders and errors of a view that a page shows, as it has them; None where it does not, or there is none."""
+    scenes = [one for one in content["scenes"] if one["name"] == scene] if content else []
+    return next((shown for one in scenes for shown in one["pictures"] if shown["view"] == view), None)
 
 
-def sentence(factors: Sequence[Mapping[str, float]]) -> str:
-    """What was taken from pages, and by how much the seconds of later runs were scaled, for the table."""
-    if not factors:
-        return ""
-    scaled = " and ".join(f"{factor:.2f} (equal {track})" for found in factors for track, factor in found.items())
+def sentence(factors: Mapping[str, float]) -> str:
+    """What was taken from a page, and by how much the seconds of later runs were scaled, for the table."""
     text = "What no later run has as many seeds of stands as an earlier page had it."
+    scaled = " and ".join(f"{factor:.2f} (equal {track})" for track, factor in factors.items())
     if scaled:
         text += f" Seconds of later runs are multiplied by {scaled}, so that the reference takes what it took there."
     return text

@@ -103,7 +103,7 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
         low, high = (float(value) for value in np.nanpercentile(exact, (0.1, 99.9)))
         renders = {entry.method: image for entry in own if (image := _render(entry, name)) is not None}
         errors = {method: image - exact for method, image in renders.items()}
-        earlier = pictures_of(found.pages, scene, name) or {"renders": {}, "errors": {}}
+        earlier = pictures_of(found.page, scene, name) or {"renders": {}, "errors": {}}
         limit = float(np.nanpercentile(np.abs(np.stack(list(errors.values()))), 98)) if errors else 1.0
         limit = earlier.get("limit", limit)
         kept = [entry.method for entry in own if entry.method not in renders and entry.method in earlier["renders"]]

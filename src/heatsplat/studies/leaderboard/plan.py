@@ -22,7 +22,7 @@ class Board:
         methods, scenes, tracks, seeds: names, in the order of the table.
         clock: the cost that counts as seconds, of ``metrics.json``.
         submissions: folders of renders of other code, scored beside.
-        earlier: pages of leaderboards, whose entries stand where the folder has fewer seeds.
+        earlier: page of a leaderboard, whose entries stand where the folder has fewer seeds; None for none.
         document, page: where the table and the page go besides the folder of the sweep; None for nowhere.
         train: False to write what is there and run nothing.
         note: on the conditions of the runs, for the table and the page.
@@ -36,7 +36,7 @@ class Board:
     seeds: Sequence[int]
     clock: str = "train_seconds"
     submissions: Sequence[Path] = ()
-    earlier: Sequence[Path] = ()
+    earlier: Path | None = None
     document: Path | None = None
     page: Path | None = None
     train: bool = True
@@ -124,6 +124,6 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str]) -> Board:
     return Board(
         protocol, root, **chosen, seeds=list(asked["seeds"] or protocol["seeds"]), clock=asked["clock"],
         submissions=[Path(text).expanduser() for text in asked["submissions"]],
-        earlier=[Path(text).expanduser() for text in asked["earlier"]],
+        earlier=path(asked["earlier"]),
         document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
     )  # fmt: skip

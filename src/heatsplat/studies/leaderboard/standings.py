@@ -119,17 +119,17 @@ class Standings:
 
     Args:
         entries: in the order of its scenes and methods, submissions last; ranked within scene and track.
-        pages: contents of the earlier pages that stand where no run does.
+        page: contents of the earlier page that stands where no run does; None without one.
         note: what was taken from them.
     """
 
     entries: list[Entry]
-    pages: list[Mapping[str, Any]] = field(default_factory=list)
+    page: Mapping[str, Any] | None = None
     note: str = ""
 
 
 def standings(folder: Path, board: Board) -> Standings:
-    """What the runs in a folder, the submissions and earlier pages came to.
+    """What the runs in a folder, the submissions and an earlier page came to.
 
     Raises:
         SceneError: a page is not one of this board, or a submission is none.
@@ -146,12 +146,13 @@ def standings(folder: Path, board: Board) -> Standings:
             entry.costs.append(dict(score.cost))
             entry.folders.append(submission)
             entry.commands.append([str(told.get("code", "a submission"))])
-    pages = [read_page(path, board) for path in board.earlier]
-    for page in pages:
+    page, note = None, ""
+    if board.earlier is not None:
+        page = read_page(board.earlier, board)
         for key in (place_of(one) for one in told_by(page) if handed_in(one)):
             if key[1] in board.scenes and key[2] in board.tracks:
                 places.setdefault(key, Entry(*key))
-    factors = [add_earlier(places, page) for page in pages]
+        note = sentence(add_earlier(places, page))
     entries = list(places.values())
     first = board.protocol["scores"][0]
     higher = DEFINITIONS[first].better == "higher"
@@ -164,7 +165,7 @@ def standings(folder: Path, board: Board) -> Standings:
             means, errors = [one.mean(first) for one in ranked], [standard_error(one, first, usual) for one in ranked]
             for entry, rank in zip(ranked, ranks(means, errors, higher), strict=True):
                 entry.rank = rank
-    return Standings(entries, pages, sentence(factors))
+    return Standings(entries, page, note)
 
 
 def _entries(board: Board) -> list[Entry]:
