@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from heatsplat.composition import CONF, build, composed, plain, run_of
+from heatsplat.training.machine import prepare_machine
 
 log = logging.getLogger("heatsplat")
 
@@ -171,7 +172,7 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
     @functools.wraps(work)
     def job(config: DictConfig) -> Any:
         from heatsplat.io.results import FAILED, METRICS_FILE  # here, for they bring torch
-        from heatsplat.runs.folder import OccupiedError, locked
+        from heatsplat.runs.lock import OccupiedError, locked
 
         hydra_config = HydraConfig.get()
         output_dir = Path(hydra_config.runtime.output_dir)
@@ -246,7 +247,6 @@ def check_first(ckpt: str) -> None:
 def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     """Measures the test views of a checkpoint. Returns the test PSNR."""
     from heatsplat.runs.run import build_trainer, load
-    from heatsplat.training.session import prepare_machine
 
     prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
@@ -265,7 +265,6 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.io.video import CODECS, encoder
     from heatsplat.runs.run import UNSEEN, load
     from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
-    from heatsplat.training.session import prepare_machine
     from heatsplat.uncertainty import Uncertainty
 
     check_option("unseen", config["unseen"], UNSEEN, SceneError)
@@ -301,7 +300,6 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.contracts import SceneError
     from heatsplat.runs.levels import write_levels
     from heatsplat.runs.run import load
-    from heatsplat.training.session import prepare_machine
 
     if HydraConfig.get().runtime.choices.merge == "none":
         raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
@@ -317,7 +315,6 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
 def view(config: dict[str, Any], output_dir: Path) -> None:
     """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
     from heatsplat.runs.run import load
-    from heatsplat.training.session import prepare_machine
     from heatsplat.viewer.page import FILE, write_viewer
 
     prepare_machine(config["threads"])
@@ -339,7 +336,6 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.contracts import SceneError
     from heatsplat.export.files import write_files
     from heatsplat.runs.run import load
-    from heatsplat.training.session import prepare_machine
 
     if config.get("what") is None:
         raise SceneError(f"which format? Give what=..., one of {', '.join(_options('what'))}")
@@ -361,7 +357,6 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
         SceneError: none is chosen, or it is one of the benchmarks, which are not installed.
     """
     from heatsplat.contracts import SceneError
-    from heatsplat.training.session import prepare_machine
 
     if config["study"] is None:
         there = sorted(path.stem for path in Path(CONF, "study").glob("*.yaml"))
@@ -381,7 +376,6 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
 def prepare(config: dict[str, Any], output_dir: Path) -> None:
     """Makes a scene that trains of a camera's files, or corrects a trained scene pixel by pixel (correct=scene)."""
     from heatsplat.contracts import SceneError
-    from heatsplat.training.session import prepare_machine
 
     if config["check"] is not None:
         prepare_machine(config["threads"])

@@ -11,8 +11,7 @@ from test_checkpoint_files import disk_of
 
 from heatsplat import composition
 from heatsplat.contracts import SceneError
-from heatsplat.runs import folder as folders
-from heatsplat.runs import run
+from heatsplat.runs import lock, run
 from heatsplat.training.checkpoints import load_checkpoint
 
 SHORT = (
@@ -127,6 +126,6 @@ def test_a_damaged_checkpoint_is_passed_over(config, whole, tmp_path, caplog):
 
 
 def test_a_second_process_in_the_folder_is_sent_away(config, tmp_path):
-    with folders.locked(tmp_path), pytest.raises(SceneError, match="under way"):
+    with lock.locked(tmp_path), pytest.raises(SceneError, match="under way"):
         run.train(config, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]

@@ -32,7 +32,7 @@ from heatsplat.io.results import RunResults
 from heatsplat.runs import run
 from heatsplat.studies import finished
 from heatsplat.training.checkpoints import load_checkpoint
-from heatsplat.training.session import prepare_machine
+from heatsplat.training.machine import prepare_machine
 
 QUIET = ("test=false", "callbacks.progress.enabled=false", "threads=1")
 

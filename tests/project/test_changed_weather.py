@@ -55,7 +55,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
     monkeypatch.setattr(run, "build", lambda settings: data)
     monkeypatch.setattr(run, "restore", lambda *_: None)
-    monkeypatch.setattr("heatsplat.training.session.prepare_machine", lambda threads: None)
+    monkeypatch.setattr("heatsplat.cli.prepare_machine", lambda threads: None)
     options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", "unseen=keep", *overrides)
     inspect.unwrap(cli.render)(compose(options, "render"), folder)
     return seen, data.scene

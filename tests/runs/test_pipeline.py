@@ -1,8 +1,5 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 from running import TINY
@@ -11,7 +8,7 @@ import heatsplat
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
-from heatsplat.runs.folder import OccupiedError, locked
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences
 from heatsplat.training.checkpoints import load_checkpoint
 
@@ -86,18 +83,3 @@ def test_what_the_machine_lacks_is_told_before_data_are_read(monkeypatch):
         checked(heatsplat.compose(["method=etgs", "trainer.accelerator=cuda"]))
     with pytest.raises((SceneError, ImportError), match="gsplat"):
         checked(heatsplat.compose(["method=etgs", "renderer=gsplat"]))
-
-
-def test_a_folder_is_one_process_s_until_that_ends_however_it_does(tmp_path):
-    hold = "import sys, time; from heatsplat.runs.folder import locked\nfrom pathlib import Path\n"
-    hold += "with locked(Path(sys.argv[1])): print('in', flush=True); time.sleep(600)"
-    other = subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    try:
-        assert other.stdout.readline() == "in\n"
-        with pytest.raises(OccupiedError, match=f"under way .process {other.pid} on "), locked(tmp_path):
-            pass
-    finally:
-        other.kill()
-        other.wait()
-    with locked(tmp_path):
-        pass

@@ -17,8 +17,9 @@ from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.geometry.projection import look_at
 from heatsplat.runs.run import build_callbacks
 from heatsplat.training.checkpoints import load_checkpoint
+from heatsplat.training.machine import prepare_machine
 from heatsplat.training.rng import generator_for
-from heatsplat.training.session import fit, prepare_machine
+from heatsplat.training.session import fit
 
 WIDTH, HEIGHT, FRAMES, POINTS, STEPS = 24, 20, 6, 80, 300
 SPAN_S = 1000.0

@@ -12,7 +12,7 @@ from extreme_inputs import SPAN_S, STEPS, camera, checkpoints, everywhere, plain
 from helpers import ALL_METHODS
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
-from heatsplat.training.session import prepare_machine
+from heatsplat.training.machine import prepare_machine
 
 pytestmark = pytest.mark.slow  # until every method has passed on an idle machine; 60 runs of about a second
 

@@ -6,9 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from heatsplat import composition
-from heatsplat.training import machine, session
+from heatsplat.kernels import scheduling
+from heatsplat.training import machine
 
 SRC = Path(__file__).resolve().parents[2] / "src"
 
@@ -18,9 +20,9 @@ def test_a_run_takes_the_cores_of_its_job_and_not_those_of_the_node(monkeypatch,
     taken = []
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {4, 5, 6}, raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(session, "use_threads", taken.append)
-    monkeypatch.setattr(session.torch, "set_num_threads", taken.append)
-    session.prepare_machine(asked)
+    monkeypatch.setattr(scheduling, "use_threads", taken.append)
+    monkeypatch.setattr(torch, "set_num_threads", taken.append)
+    machine.prepare_machine(asked)
     assert taken == [expected, expected]
 
 

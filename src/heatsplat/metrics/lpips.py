@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-import torchmetrics
 from torch import Tensor, nn
 
 from heatsplat.metrics.valid import valid_pixels
@@ -120,7 +120,8 @@ class Lpips(nn.Module):
             )
         except RuntimeError as error:
             raise LpipsUnavailable(f"LPIPS({net}): the weights are not those of the net: {error}") from error
-        folder = Path(torchmetrics.__file__).parent / "functional" / "image" / "lpips_models"
+        (package,) = find_spec("torchmetrics").submodule_search_locations  # loading it takes seconds
+        folder = Path(package) / "functional" / "image" / "lpips_models"
         # The heads were saved on a GPU: without map_location they do not load on a machine that has none.
         heads = torch.load(folder / f"{net}.pth", map_location="cpu", weights_only=True)
         self.heads = nn.ParameterList(heads[f"lin{i}.model.1.weight"] for i in range(len(TAPS[net])))

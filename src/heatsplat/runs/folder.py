@@ -1,55 +1,14 @@
-"""A run's folder: one process writes into it, and its results stay those of one configuration."""
+"""A run's folder: its results stay those of one configuration."""
 
 from __future__ import annotations
 
-import os
-import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.checks import checked
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import checkpoints_in, differences, stored_config
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-LOCK_FILE = ".lock"
-
-
-class OccupiedError(SceneError):
-    """The folder belongs to another run, and nothing was changed in it."""
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes out of a run's folder. The system lets go of it when the process ends, however it does.
-
-    Raises:
-        OccupiedError: another process is in it, with its number.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if fcntl is None:
-        yield
-        return
-    with open(folder / LOCK_FILE, "a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            raise OccupiedError(
-                f"{folder} is the folder of a run that is under way ({file.read().strip() or 'of another process'}): wait for "
-                "it, stop it, or give another folder with hydra.run.dir"
-            ) from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
-        yield
 
 
 def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:

@@ -24,15 +24,17 @@ from heatsplat.geometry.coverage import Sighting, covered, surface_depth
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
-from heatsplat.runs.folder import locked, results_in
+from heatsplat.runs.folder import results_in
+from heatsplat.runs.lock import locked
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
 from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.loop import lean
+from heatsplat.training.machine import prepare_machine
 from heatsplat.training.module import SplatTraining
-from heatsplat.training.session import fit, prepare_machine, restore, without_idle_hooks
+from heatsplat.training.session import fit, restore, without_idle_hooks
 
 log = logging.getLogger("heatsplat")
 

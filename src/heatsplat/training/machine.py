@@ -2,9 +2,41 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
+
+# Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
+# folder, SLURM where a run was started by hand, and loaders that cannot resume (ours takes the step from the trainer, so
+# a resumed run sees the right views).
+NOISE = (
+    r".*does not have many workers.*",
+    r".*LeafSpec.*",
+    r".*`isinstance\(treespec.*",
+    r".*Checkpoint directory.*",
+    r".*transfer_batch_to.*",
+    r".*smaller than the logging interval.*",
+    r".*dirpath has changed.*",
+    r".*dataloader is not resumable.*",
+    r".*`srun` command is available.*",
+)
 
 
 def cores() -> int:
     """CPU cores that this process may use: on a cluster those of the job, not those of the node."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def prepare_machine(threads: int | None) -> None:
+    """Fixes the number of CPU threads (None: the cores that it may use) and quietens messages that no user can act on."""
+    import torch  # here, for it is heavy, as kernels are
+
+    from heatsplat.kernels.scheduling import use_threads
+
+    threads = threads or cores()
+    # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
+    use_threads(threads)
+    torch.set_num_threads(threads)
+    for pattern in NOISE:
+        warnings.filterwarnings("ignore", message=pattern)
+    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)

@@ -5,47 +5,17 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-import warnings
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import pytorch_lightning as pl
-import torch
 from pytorch_lightning.profilers import PassThroughProfiler
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
-from heatsplat.kernels.scheduling import use_threads
-from heatsplat.training.machine import cores
 from heatsplat.training.module import SplatTraining
 
 log = logging.getLogger("heatsplat")
-
-# Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
-# folder, SLURM where a run was started by hand, and loaders that cannot resume (ours takes the step from the trainer, so
-# a resumed run sees the right views).
-NOISE = (
-    r".*does not have many workers.*",
-    r".*LeafSpec.*",
-    r".*`isinstance\(treespec.*",
-    r".*Checkpoint directory.*",
-    r".*transfer_batch_to.*",
-    r".*smaller than the logging interval.*",
-    r".*dirpath has changed.*",
-    r".*dataloader is not resumable.*",
-    r".*`srun` command is available.*",
-)
-
-
-def prepare_machine(threads: int | None) -> None:
-    """Fixes the number of CPU threads (None: the cores that it may use) and quietens messages that no user can act on."""
-    threads = threads or cores()
-    # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
-    use_threads(threads)
-    torch.set_num_threads(threads)
-    for pattern in NOISE:
-        warnings.filterwarnings("ignore", message=pattern)
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
 
 
 class Unprofiled(PassThroughProfiler):
