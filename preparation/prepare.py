@@ -14,6 +14,7 @@ from rich.progress import track
 from heatsplat.contracts import SceneError
 from heatsplat.preparation import report
 from heatsplat.preparation.conditions import Given, Uncertainty
+from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
@@ -78,8 +79,12 @@ def prepare(
         Path(table).expanduser() if table else None,
         table_columns or {},
     )
-    sections = [doctor(folder, reading)] if doctor else []
     found = read_recording(folder, reading)
+    if len(devices := devices_of(found.frames)) > 1:
+        log.warning(
+            "%d thermal cameras, each with a lens and dead pixels of its own: %s", len(devices), listed(devices)
+        )
+    sections = [doctor(folder, reading)] if doctor else []
     frames = [given.settled(frame) for frame in found.frames]
     writer = Writer(target, uncertain, keep_counts)
     writer.check(frames)

@@ -18,6 +18,7 @@ from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.writer import QUANTILES, rows
 
@@ -75,11 +76,13 @@ def counted(number: int, what: str) -> str:
 
 def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
     """What was read."""
-    cameras = sorted(
-        {" ".join(filter(None, (f.camera.make, f.camera.model, f.camera.serial))) or "unknown" for f in frames}
-    )
-    sizes = sorted({"x".join(map(str, r["size"])) for r in records})
-    lines = [f"- {counted(len(frames), 'frame')} of {', '.join(sizes)} pixels, camera {', '.join(cameras)}"]
+    devices = devices_of(frames)
+    lines = [f"- {counted(len(frames), 'frame')}, camera {devices[0].label}"]
+    if len(devices) > 1:
+        lines = [
+            f"- {counted(len(frames), 'frame')} of {len(devices)} cameras, each with a lens and dead pixels of its own:"
+        ]
+        lines += [f"    - {d.label}: {counted(len(d.frames), 'frame')}, such as {d.frames[0].name}" for d in devices]
     timed = [f.time for f in frames if f.time is not None]
     if timed:
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"

@@ -43,7 +43,11 @@ def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_a
     page = prepare(str(source), target, **PLAIN, poses=poses)
     assert page == target / "report.md"
     text = page.read_text()
-    assert "9 frames of 40x32 pixels" in text and "## Radiometry" in text and text.rstrip().endswith("9 of 9")
+    assert (
+        "9 frames, camera FLIR Test Cam 640 S123, 40x32 pixels" in text
+        and "## Radiometry" in text
+        and text.rstrip().endswith("9 of 9")
+    )
     module = Colmap(root=str(target))
     module.setup()
     views = [*module.scene.train, *module.scene.test]

@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, View, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, View, evenly_spread
 from heatsplat.effects.observations import Tracks, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
@@ -17,6 +17,7 @@ from heatsplat.physics.noise import noise_of, quantum_of
 # Frames that are looked at: enough to find what is common, and cheap beside a training.
 MAX_FRAMES = 32
 NAMED = 3  # frames that a finding names
+FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class Material:
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         views: the views of ``images``, for tracks; empty without cameras.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
+        lenses: for every frame, the number of the camera that took it; empty where one took all.
     """
 
     names: Sequence[str]
@@ -73,6 +75,7 @@ class Material:
     clipped: float | None = None
     views: Sequence[View] = ()
     answers: Tensor | None = None
+    lenses: Sequence[int] = ()
 
     @cached_property
     def noise(self) -> float:
@@ -156,7 +159,18 @@ def material_of(scene: SceneData) -> Material:
         clipped=scene.notes.get("clipped_fraction"),
         views=views,
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
+        lenses=_lenses(frames),
     )
+
+
+def _lenses(frames: Sequence[Frame]) -> list[int]:
+    """Which camera took each frame, by its intrinsics; where these are nearly as many as frames they tell none apart."""
+    numbers: dict[object, int] = {}
+    found = [
+        numbers.setdefault((c.width, c.height, *c.K.flatten().tolist()), len(numbers))
+        for c in (frame.camera for frame in frames)
+    ]
+    return found if 1 < len(numbers) <= len(frames) / FRAMES_PER_LENS else []
 
 
 def some(names: Sequence[str]) -> str:
