@@ -93,7 +93,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         if kind == "sealed" and not greys_known:
             raise SceneError(
                 f"{path} is a thermal picture of DJI whose temperatures cannot be read: its sensor values are counts, or not "
-                f"there; {dji.CONVERT}. bounds_c=[min,max] takes the pictures as greys between these °C"
+                f"there (if it was cut short, copy it again); {dji.CONVERT}. bounds_c=[min,max] takes the pictures as greys "
+                "between these °C"
             )
         kinds.setdefault("colour" if kind == "sealed" else kind, []).append(path)
     if "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
@@ -141,6 +142,8 @@ def _kind(path: Path) -> str:
     try:
         with Image.open(path) as image:
             mode = image.mode
+    except PermissionError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
     except Exception as error:  # Pillow raises whatever a damaged file leads to
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
     if mode.startswith("I"):

@@ -242,8 +242,9 @@ class Search:
     def finish(self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> Section:
         """Writes the model of the thermal frames and says what became of every frame."""
         kept = {image.name: image for image in model.images.values() if image.has_pose and image.name in self.name_of}
-        # Of a camera that stands still noise places a few frames somewhere.
-        if len(kept) < 3 or len(kept) < len(self.frames) / 2 and self._stands_still():
+        # Of a camera that stands still noise places a few frames somewhere, and cameras that see no point stand anywhere.
+        seen = model.num_points3D()
+        if len(kept) < 3 or not seen or len(kept) < len(self.frames) / 2 and self._stands_still():
             raise SceneError(self._nothing())
         placed_by_photos = settle_rig(model, self.name_of) if self.options.by == "rgb" else None
         written = thermal_only(model, self.name_of, placed_by_photos)

@@ -90,8 +90,23 @@ def test_a_few_frames_of_a_camera_that_stands_still_are_no_cameras(tmp_path):
         cv2.imwrite(str(path), picture)
     placed = [SimpleNamespace(name=copy, has_pose=True) for copy in list(search.copy_of.values())[:4]]
     with pytest.raises(SceneError, match="the image does not move"):
-        search.finish(SimpleNamespace(images=dict(enumerate(placed))), [])
+        search.finish(SimpleNamespace(images=dict(enumerate(placed)), num_points3D=lambda: 9), [])
     assert not (tmp_path / "sparse").exists()
+
+
+def test_cameras_that_see_no_point_are_none(tmp_path):
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i, picture in enumerate(np.random.default_rng(0).normal(0.0, 40.0, (3, 128, 160)).astype(np.float32)):
+        (tmp_path / "images" / f"{i}.tiff").touch()
+        smooth = cv2.GaussianBlur(picture, (0, 0), 4)
+        frames.append(Frame(f"{i}", Path(f"{i}.tiff"), 0, lambda smooth=smooth: smooth))
+    search = Search(FindPoses(Sift()), frames, tmp_path)
+    search.copies()
+    search.find_features()
+    placed = {i: SimpleNamespace(name=copy, has_pose=True) for i, copy in enumerate(search.name_of)}
+    with pytest.raises(SceneError, match="no cameras could be found: frames have .* features"):
+        search.finish(SimpleNamespace(images=placed, num_points3D=lambda: 0), [])
 
 
 @pytest.mark.slow

@@ -142,3 +142,9 @@ def test_the_command_prepares_and_goes_on(tmp_path):
     record = json.loads((tmp_path / "scene" / "images" / "1.json").read_text())
     assert record["conditions"]["emissivity"] == {"value": 0.9, "from": "given", "standard_uncertainty": 0.02}
     assert "give the folder" in succeeds([*command[:1], "source=files"], tmp_path, 1)
+    stop = ["+poses._target_=signal.raise_signal", "+poses._args_=[2]"]
+    said = succeeds([*command, *stop], tmp_path, 130)
+    assert "and the same command goes on" in said and "Traceback" not in said
+    (tmp_path / "scene.txt").touch()
+    said = succeeds([*command[:2], "target=scene.txt"], tmp_path, 1)
+    assert "File exists: 'scene.txt'" in said and "Traceback" not in said
