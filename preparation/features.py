@@ -86,8 +86,9 @@ class Aliked(Features):
             raise ImportError("poses/features=aliked needs kornia 0.9 or newer: pip install -U kornia") from error
         if missing := [name for name in WEIGHTS if not (_weights_folder() / name).is_file()]:
             raise SceneError(
-                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {_weights_folder()} (from "
-                "the releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses/features=sift"
+                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {_weights_folder()} "
+                f"({WEIGHTS[0]} from models/ of Shiaoming/ALIKED, {WEIGHTS[1]} from the releases of cvg/LightGlue, both on "
+                "GitHub), or use poses/features=sift"
             )
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
