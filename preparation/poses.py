@@ -15,17 +15,19 @@ import cv2  # before pycolmap: formats/colmap.py says why
 import numpy as np
 import pycolmap
 import torch
+from rich import get_console
 from rich.progress import Progress, track
 
-from heatsplat.contracts import SceneError, check_option, evenly_spread
+from heatsplat.contracts import SceneError, check_numbers, check_option, evenly_spread
 from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.datamodules.formats.lens import MODELS
 from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
-from heatsplat.preparation.features import Features
+from heatsplat.preparation.features import Features, check_positive
 from heatsplat.preparation.frame import Frame, instant
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
@@ -87,6 +89,15 @@ class FindPoses:
     def __post_init__(self) -> None:
         check_option("poses.by", self.by, SOURCES, SceneError)
         check_option("poses.refine_focal", self.refine_focal, ("auto", True, False), SceneError)
+        check_option("poses.video", self.video, (None, True, False), SceneError)
+        check_option("poses.camera_model", self.camera_model, MODELS, SceneError)
+        for name in ("focal_px", "pixel_um", "overlap", "clip"):
+            if name != "focal_px" or self.focal_px is not None:
+                check_positive(f"poses.{name}", getattr(self, name))
+        check_numbers("poses.all_pairs", self.all_pairs, error=SceneError)
+        check_numbers("poses.gps_sd_m", self.gps_sd_m, 2, SceneError)
+        for value in self.gps_sd_m:
+            check_positive("poses.gps_sd_m", value)
 
     def __call__(self, frames: list[Frame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns what was found, what was not, and why.
@@ -229,7 +240,7 @@ class Search:
         folder = self.work / "models"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        with Progress(transient=True) as bar:
+        with Progress(transient=True, disable=not get_console().is_terminal) as bar:
             task = bar.add_task("placing cameras", total=len(self.frames))
             models = pycolmap.incremental_mapping(
                 self.database, self.work / "images", folder, options, next_image_callback=lambda: bar.advance(task)
@@ -612,4 +623,4 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
-    return iter(track(items, what, transient=True)) if items else iter(())
+    return iter(track(items, what, transient=True, disable=not get_console().is_terminal)) if items else iter(())

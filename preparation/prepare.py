@@ -69,7 +69,8 @@ def prepare(
     """
     folder = Path(source).expanduser().resolve()
     if not folder.is_dir():
-        raise SceneError(f"source={source}: there is no such folder")
+        what = "this is a file; give the folder that it lies in" if folder.is_file() else "there is no such folder"
+        raise SceneError(f"source={source}: {what}")
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = Given(**conditions), Uncertainty(**uncertainty)
@@ -80,6 +81,8 @@ def prepare(
         table_columns or {},
     )
     found = read_recording(folder, reading)
+    for note in found.notes:
+        log.info("%s", note)
     if len(devices := devices_of(found.frames)) > 1:
         log.warning(
             "%d thermal cameras, each with a lens and dead pixels of its own: %s", len(devices), listed(devices)

@@ -138,11 +138,31 @@ def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
     assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.02])
+def test_normals_on_which_views_disagree_are_doubted(tmp_path, tilt):
+    y, x = DEPTH.isfinite().nonzero().unbind(1)
+    local = (
+        torch.stack([(x + 0.5 - 20.0) / 38.0, (y + 0.5 - 16.0) / 38.0, torch.ones(len(x))], 1) * DEPTH[y, x][:, None]
+    )
+    shown = scene()
+    shown.points = ((local - CAMERA.viewmat[:3, 3]) @ CAMERA.viewmat[:3, :3]).float()
+    columns = torch.arange(40, dtype=torch.float64) - 20.0
+
+    def depth_of(frame):  # of the middle view every wall is turned about the upright
+        return DEPTH / (1.0 + tilt * columns) if frame.name == "1.tiff" else DEPTH
+
+    page = correct_scene(shown, depth_of, [], tmp_path, Given(emissivity=0.9), BandResponse(), 1.5, METRES)
+    assert ("angles are not settled" in page.read_text()) == (tilt > 0)
+    assert "% of the pixels have no known angle" in page.read_text()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"metres": None}, "correct.metres_per_unit"),
+        ({"metres": -4}, "correct.metres_per_unit must be above 0"),
         ({"index": 0.9}, "correct.refractive_index must be above 1"),
+        ({"index": "glass"}, "correct.refractive_index must be a number, got glass"),
         ({"thermal_range": None}, "floor has no temperatures"),
         ({"depth": torch.full((32, 40), torch.inf)}, "shows no surface"),
     ],

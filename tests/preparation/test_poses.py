@@ -147,3 +147,27 @@ def test_photos_place_the_thermal_camera_that_is_turned_against_the_visible_one(
     assert float(errors.similarity.scale) == pytest.approx(1.0, abs=0.02)
     turned = float(torch.tensor(field.rgb_turn_deg).norm())
     assert said.values["thermal_from_rgb"]["degrees"] == pytest.approx(turned, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"focal_px": -5}, "poses.focal_px must be above 0, got -5"),
+        ({"overlap": 0}, "poses.overlap"),
+        ({"clip": "much"}, "poses.clip must be a number"),
+        ({"gps_sd_m": 2.0}, "poses.gps_sd_m must be a list of 2 numbers"),
+        ({"gps_sd_m": [2.0, 0.0]}, "poses.gps_sd_m must be above 0"),
+        ({"all_pairs": "few"}, "poses.all_pairs"),
+        ({"camera_model": "RADIALL"}, "poses.camera_model must be one of SIMPLE_PINHOLE"),
+        ({"video": "yes"}, "poses.video"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_before_any_work(wrong, said):
+    with pytest.raises(SceneError, match=said):
+        FindPoses(Sift(), **wrong)
+
+
+def test_features_that_cannot_be_found_are_refused():
+    for wrong in ({"most": 0}, {"ratio": "x"}, {"peak": -1.0}):
+        with pytest.raises(SceneError, match=f"poses.features.{next(iter(wrong))}"):
+            Sift(**wrong)

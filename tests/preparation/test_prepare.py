@@ -79,6 +79,12 @@ def test_a_target_within_the_source_is_refused(tmp_path):
             prepare(str(source), target, **PLAIN)
 
 
+def test_a_source_that_is_a_file_is_told_what_to_give(tmp_path):
+    (tmp_path / "a.seq").touch()
+    with pytest.raises(SceneError, match="a.seq: this is a file; give the folder that it lies in"):
+        prepare(str(tmp_path / "a.seq"), tmp_path / "scene", **PLAIN)
+
+
 def test_a_source_that_is_not_there_is_named(tmp_path):
     with pytest.raises(SceneError, match="source=.*nowhere: there is no such folder"):
         prepare(str(tmp_path / "nowhere"), tmp_path / "scene", **PLAIN)
