@@ -71,7 +71,7 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
-    if not posed:
+    if not posed and all(one.check != "still" for one in found):
         lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
 
