@@ -18,7 +18,7 @@ from heatsplat.physics.noise import noise_of, quantum_of
 # Frames that are looked at: enough to find what is common, and cheap beside a training.
 MAX_FRAMES = 32
 NAMED = 3  # frames that a finding names
-# Correlation from which two images are one: 0.998 in 24 frames from a tripod; where cameras move no recording has 0.9 in all frames.
+# Correlation from which two images are one: 0.998 from a tripod; where cameras move no recording has 0.9 in all frames.
 SAME = 0.95
 MAX_PIXELS = 1500  # of a camera that stands still
 FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
