@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.physics.radiometry import LIMITS, Conditions
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.frame import Frame
@@ -43,7 +43,10 @@ class Given:
     def __post_init__(self) -> None:
         for name, (condition, scale, offset) in UNITS.items():
             value, (low, high) = getattr(self, name), LIMITS[condition]
-            if value is not None and not low <= scale * value + offset <= high:
+            if value is None:
+                continue
+            check_numbers(f"conditions.{name}", value, error=SceneError)
+            if not low <= scale * value + offset <= high:
                 least, most = (low - offset) / scale, (high - offset) / scale
                 raise SceneError(f"conditions.{name}={value} must lie between {least:g} and {most:g}")
 
@@ -89,6 +92,7 @@ class Uncertainty:
 
     def __post_init__(self) -> None:
         for f in fields(self):
+            check_numbers(f"uncertainty.{f.name}", getattr(self, f.name), error=SceneError)
             if not getattr(self, f.name) >= 0:
                 raise SceneError(f"uncertainty.{f.name} must not be negative, got {getattr(self, f.name)}")
 

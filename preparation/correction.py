@@ -11,6 +11,7 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,13 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, SceneError, View
+from heatsplat.contracts import Camera, SceneData, SceneError, View, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import stem_of
-from heatsplat.geometry.sight_lines import cosines, distances
+from heatsplat.geometry.sight_lines import cosines, distances, normals
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
 from heatsplat.io.results import write_atomically
@@ -55,6 +56,8 @@ log = logging.getLogger(__name__)
 PLACED = [field.name for kind in (Position, Attitude) for field in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
+ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
+TURNED, FEW_POINTS = 15.0, 30  # degrees by which views may disagree on normals (ours), and points that tell it
 APART = (
     0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
 )
@@ -124,6 +127,7 @@ def correct(
     band_um: Sequence[float],
     refractive_index: float | None,
     metres_per_unit: float | None,
+    downscale: float | None = 1.0,
     trust: Sequence[str] = (),
 ) -> Path:
     """Corrects the images of a trained scene pixel by pixel and returns the path of a report on what that changed.
@@ -139,12 +143,13 @@ def correct(
         band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
         refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
         metres_per_unit: scale of the world; None takes the scene's.
+        downscale: factor by which images shrink first, whatever the run was trained at; None is what it was trained at.
         trust: classes of yours that the checkpoint may name.
 
     Raises:
         SceneError: the scene has no temperatures or no scale, or the conditions leave nothing to correct.
     """
-    trained = load(ckpt, trust=trust)
+    trained = load(ckpt, data={"downscale": downscale}, trust=trust)
     root = Path(trained.config["data"]["root"] or ".")
     folders = [root, root / str(trained.config["data"].get("scene"))]
     return correct_scene(
@@ -179,18 +184,25 @@ def correct_scene(
             "the scale of the scene is not known, and the air between camera and surface counts in metres: give "
             "correct.metres_per_unit (poses with GPS have 1)"
         )
+    check_numbers("correct.metres_per_unit", metres_per_unit, error=SceneError)
+    if not metres_per_unit > 0:
+        raise SceneError(f"correct.metres_per_unit must be above 0, got {metres_per_unit}")
+    if index is not None:
+        check_numbers("correct.refractive_index", index, error=SceneError)
     if index is not None and not index > 1:
         raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
-    if doubt := _doubt(views, depth_of, scene.points):
+    doubts = [_doubt(views, depth_of, scene.points), "" if index is None else _unsettled(views, depth_of, scene.points)]
+    for doubt in filter(None, doubts):
         log.warning("%s", doubt)
     changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
-    rows, cameras, shown, known_of = [], {}, None, _told(folders)
+    rows, cameras, shown, known_of, without = [], {}, None, _told(folders), []
     low, high = np.inf, -np.inf
     for number, view in enumerate(track(views, "correcting")):
         own, done = preparation_of(view.frame.name, folders)
         wanted = given.conditions(done)
+        assumed = given.air_c is None and done.distance_m == 0
         if wanted.distance_m == 0:
             wanted = replace(wanted, distance_m=far)
         celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].double())
@@ -200,6 +212,7 @@ def correct_scene(
         found = corrected(celsius, view.camera, depth, metres_per_unit, own or response, done, wanted, index)
         changes["distance"].append(_known(found.distance_only - found.one))
         changes["angle"].append(_known(found.celsius - found.distance_only))
+        without.append(found.angle_deg.isnan().double().mean())
         changes["both"].append(_known(found.celsius - found.one))
         name = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
         image = found.celsius.float().numpy()
@@ -220,7 +233,10 @@ def correct_scene(
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
     write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
     write_png(target / "report" / "correction.png", _picture(shown))
-    section = _section(changes, far, wanted, index, len(views), doubt)
+    if assumed:
+        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
+        log.warning("%s", doubts[-1])
+    section = _section(changes, far, wanted, index, float(torch.stack(without).mean()), len(views), doubts)
     page = write_report(target, [section], f"corrected pixel by pixel by the trained scene {scene.name}")
     log.info("%s", page.with_suffix(".html"))
     return page
@@ -231,11 +247,9 @@ def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
     found = []
     for view in _few(views):
         camera, depth = view.camera, depth_of(view.frame)
-        local = points.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
-        local = local[local[:, 2] > 0]
-        x, y = ((local @ camera.K.double().T)[:, :2] / local[:, 2:]).floor().long().unbind(1)
-        within = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        found.append(depth[y[within], x[within]] / local[within, 2])
+        at, within = _pixels(camera, points)
+        far = points[within].double() @ camera.viewmat[2, :3].double() + camera.viewmat[2, 3].double()
+        found.append(depth[at[:, 1], at[:, 0]] / far)
     ratios = torch.cat(found)
     ratios = ratios[ratios.isfinite()]
     off = float(ratios.median()) - 1.0 if len(ratios) else 0.0
@@ -245,6 +259,38 @@ def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
         f"The trained surfaces lie {100 * abs(off):.0f} % {'farther' if off > 0 else 'nearer'} than the points that the "
         "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)"
     )
+
+
+def _unsettled(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
+    """What to say where views disagree on the normals of the same points; empty where they do not."""
+    seen = []
+    for view in _few(views):
+        camera = view.camera
+        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth_of(view.frame))
+        at, within = _pixels(camera, points)
+        own = torch.full((len(points), 3), torch.nan, dtype=torch.float64)
+        own[within] = found[at[:, 1], at[:, 0]] @ turn
+        seen.append(own)
+    cosine = torch.cat([(one * other).sum(-1) for one, other in pairwise(seen)] or [torch.zeros(0)])
+    cosine = cosine[cosine.isfinite()]
+    if len(cosine) < FEW_POINTS:
+        return "Too few points show their normals to two views: angles cannot be checked"
+    apart = float(torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0))).median())
+    if apart <= TURNED:
+        return ""
+    return (
+        f"Two views see the normal of the same point {apart:.0f}° apart (median): angles are not settled, and what they change "
+        "is mostly wrong; train longer, or leave correct.refractive_index out"
+    )
+
+
+def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (column, row) [n, 2] of the points that lie in an image, and which these are, [P] bool."""
+    local = points.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+    ahead = local[:, 2] > 0
+    at = ((local @ camera.K.double().T)[:, :2] / local[:, 2:].where(ahead[:, None], torch.ones(()))).floor()
+    within = ahead & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
+    return at[within].long(), within
 
 
 def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
@@ -328,9 +374,15 @@ def _picture(found: Corrected) -> np.ndarray:
 
 
 def _section(
-    changes: Mapping[str, list[np.ndarray]], far: float, c: Conditions, index: float | None, count: int, doubt: str
+    changes: Mapping[str, list[np.ndarray]],
+    far: float,
+    c: Conditions,
+    index: float | None,
+    without: float,
+    count: int,
+    doubts: Sequence[str],
 ) -> Section:
-    """What a distance (and an angle, where it counts) for each pixel changed, in °C."""
+    """What a distance (and an angle, where it counts) for each pixel changed, in °C; a share ``without`` has no angle."""
     names = {"distance": "distance of each pixel"}
     if index is not None:
         names |= {"angle": "angle of each pixel", "both": "both"}
@@ -345,11 +397,16 @@ def _section(
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [
-        *([f"**{doubt}.**", ""] if doubt else []),
+        *(line for doubt in doubts if doubt for line in (f"**{doubt}.**", "")),
         f"{count} images, against one distance of {float(c.distance_m):.1f} m for all pixels (the scene's median is {far:.1f} m) "
         f"and an emissivity of {float(c.emissivity):g} at every angle. Air {float(c.air_k) - KELVIN_AT_0_C:.1f} °C, "
         f"{100 * float(c.humidity):.0f} %, reflected {float(c.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
-        + (f"refractive index {index:g}." if index is not None else "no angle."),
+        + (
+            f"refractive index {index:g}; {100 * without:.0f} % of the pixels have no known angle (edges, and what is too "
+            "rough for a plane) and keep the emissivity along the normal."
+            if index is not None
+            else "no angle."
+        ),
         "",
         *markdown_table(["change in °C", "mean of its size", *(f"{p} %" for p in PERCENT)], table, "lrrrrrr"),
         "",

@@ -18,6 +18,7 @@ from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
+from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import Frame, instant
 from heatsplat.preparation.frames import Reading, read_recording, taken_at, zone_of
 from heatsplat.preparation.meaning import Meaning
@@ -53,7 +54,7 @@ def check(
     """
     rows = Path(table).expanduser() if table else None
     reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
-    found = examine(material_in(Path(folder).expanduser(), downscale, reading))
+    found = examined(materials_in(Path(folder).expanduser(), downscale, reading))
     show(found, str(folder))
     path = (target or Path()) / FINDINGS_FILE
     write_findings(found, path)
@@ -63,25 +64,44 @@ def check(
 
 def section(folder: Path, reading: Reading | None = None) -> Section:
     """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
-    material = material_in(folder, 1.0, reading)
-    found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in examine(material)]
+    materials = materials_in(folder, 1.0, reading)
+    posed, found = any(material.cameras is not None for material in materials.values()), examined(materials)
+    if not posed:
+        found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
-    if material.cameras is None:
+    if not posed and all(one.check != "still" for one in found):
         lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
 
 
-def material_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> Material:
-    """What there is to look at in a folder. Raises SceneError where it holds neither scene nor recording."""
+def materials_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> dict[str, Material]:
+    """What there is to look at in a folder: a scene, called "", or the files of each thermal camera by its label.
+
+    Raises:
+        SceneError: the folder holds neither scene nor recording.
+    """
     if not folder.is_dir():
         raise SceneError(f"check={folder}: there is no such folder")
     if find_model(folder) is not None:
-        return material_of(_colmap(folder, downscale))
+        return {"": material_of(_colmap(folder, downscale))}
     if find_transforms(folder):
-        return material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)
-    return _recorded(folder, reading or Reading())
+        return {"": material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)}
+    reading = reading or Reading()
+    return {
+        device.label: _recorded(device, reading.zone) for device in devices_of(read_recording(folder, reading).frames)
+    }
+
+
+def examined(materials: Mapping[str, Material]) -> list[Finding]:
+    """What is wrong with any of them, the most costly first; where there are several it is said of which."""
+    found = [
+        replace(one, what=f"{label}: {one.what}") if len(materials) > 1 else one
+        for label, material in materials.items()
+        for one in examine(material)
+    ]
+    return sorted(found, key=lambda one: -one.cost)
 
 
 def _colmap(folder: Path, downscale: float) -> SceneData:
@@ -92,21 +112,20 @@ def _colmap(folder: Path, downscale: float) -> SceneData:
     return Colmap(root=str(folder), raw=raw, rgb=rgb, time_csv=times, downscale=downscale).scene
 
 
-def _recorded(folder: Path, reading: Reading) -> Material:
-    """A camera's files, without poses."""
-    frames = read_recording(folder, reading).frames
+def _recorded(device: Device, zone: str | None) -> Material:
+    """The files of a thermal camera, without poses."""
+    frames = device.frames
     chosen = evenly_spread(len(frames), MAX_FRAMES)
     images = [frames[i].pixels() for i in chosen]
-    kept = [k for k, image in enumerate(images) if image.shape == images[0].shape]
     known = all(frame.calibration is not None for frame in frames)
     times = [None if frame.time is None else instant(frame.time) for frame in frames]
     return Material(
         names=[frame.name for frame in frames],
         times_s=None if any(time is None for time in times) else times,
-        chosen=[chosen[k] for k in kept],
-        images=torch.from_numpy(np.stack([images[k] for k in kept])).double(),
+        chosen=chosen,
+        images=torch.from_numpy(np.stack(images)).double(),
         unit_k=1.0 if known else None,
-        rgb_times_s=_photo_times(frames, reading.zone),
+        rgb_times_s=_photo_times(frames, zone),
     )
 
 

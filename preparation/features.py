@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 DESCRIPTOR = 128  # numbers of a descriptor of ALIKED
@@ -47,6 +47,10 @@ class Sift(Features):
     most: int = 4096
     peak: float = 0.003
     ratio: float = 0.85
+
+    def __post_init__(self) -> None:
+        for name in ("most", "peak", "ratio"):
+            check_positive(f"poses.features.{name}", getattr(self, name))
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
         options = pycolmap.FeatureExtractionOptions(num_threads=1)
@@ -80,14 +84,16 @@ class Aliked(Features):
 
     def __post_init__(self) -> None:
         """Says before any work is done what is missing: SceneError for weights, ImportError for an old kornia."""
+        check_positive("poses.features.most", self.most)
         try:
             from kornia.feature import ALIKED, LightGlue  # noqa: F401
         except ImportError as error:
             raise ImportError("poses/features=aliked needs kornia 0.9 or newer: pip install -U kornia") from error
         if missing := [name for name in WEIGHTS if not (_weights_folder() / name).is_file()]:
             raise SceneError(
-                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {_weights_folder()} (from "
-                "the releases of Shiaoming/ALIKED and cvg/LightGlue on GitHub), or use poses/features=sift"
+                f"ALIKED and LightGlue need their weights on disk: put {' and '.join(missing)} into {_weights_folder()} "
+                f"({WEIGHTS[0]} from models/ of Shiaoming/ALIKED, {WEIGHTS[1]} from the releases of cvg/LightGlue, both on "
+                "GitHub), or use poses/features=sift"
             )
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
@@ -143,6 +149,13 @@ class Aliked(Features):
         one, other = (_weights_folder() / name for name in WEIGHTS)
         detector = ALIKED("aliked-n16", max_num_keypoints=self.most)
         return _filled(detector, one), _filled(LightGlue(None, input_dim=DESCRIPTOR, weights=None), other)
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raises SceneError where a setting is no number above 0."""
+    check_numbers(name, value, error=SceneError)
+    if not value > 0:
+        raise SceneError(f"{name} must be above 0, got {value}")
 
 
 def _weights_folder() -> Path:

@@ -66,6 +66,7 @@ class Frame:
         sources: where each of the conditions comes from: "file", "given", or nothing for those that change nothing.
         time: when it was taken; without a zone where the file has none, None where it has no time.
         camera, position, attitude: what the file says of them.
+        size: width and height of its pixels; None where only they tell.
         rgb: photo that belongs to it, or None.
         picture: returns the bytes of the photo inside the file, or None where it has none.
     """
@@ -81,6 +82,7 @@ class Frame:
     camera: CameraInfo = CameraInfo()
     position: Position | None = None
     attitude: Attitude | None = None
+    size: tuple[int, int] | None = None
     rgb: Path | None = None
     picture: Callable[[], bytes] | None = field(default=None, repr=False)
 

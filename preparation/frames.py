@@ -23,6 +23,7 @@ from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, stem_of
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
+from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position, instant
 from heatsplat.preparation.meaning import Meaning
 
@@ -92,7 +93,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         if kind == "sealed" and not greys_known:
             raise SceneError(
                 f"{path} is a thermal picture of DJI whose temperatures cannot be read: its sensor values are counts, or not "
-                f"there; {dji.CONVERT}. bounds_c=[min,max] takes the pictures as greys between these °C"
+                f"there (if it was cut short, copy it again); {dji.CONVERT}. bounds_c=[min,max] takes the pictures as greys "
+                "between these °C"
             )
         kinds.setdefault("colour" if kind == "sealed" else kind, []).append(path)
     if "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
@@ -140,6 +142,8 @@ def _kind(path: Path) -> str:
     try:
         with Image.open(path) as image:
             mode = image.mode
+    except PermissionError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
     except Exception as error:  # Pillow raises whatever a damaged file leads to
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
     if mode.startswith("I"):
@@ -165,18 +169,34 @@ def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, not
         for path in paths:
             yield from _radiometric(path, folder, reading, notes)
         return
-    sample = read_image(paths[0])
-    if kind == "grey":
-        calibration, note = reading.meaning.of_greys(folder)
-    elif kind == "counts":
-        calibration, note = reading.meaning.of_counts(sample, paths[0])
-    else:
-        calibration, note = reading.meaning.of_floats(sample, paths[0])
-    notes.append(note)
+    found = []
     for path in paths:
         details, camera = _of_exif(read_bytes(path))
+        with Image.open(path) as image:
+            size = image.size
         load = partial(_grey if kind == "grey" else read_image, path)
-        yield Frame(_name(path, folder), path, 0, load, calibration, camera=camera, **details)
+        found.append(Frame(_name(path, folder), path, 0, load, camera=camera, size=size, **details))
+    devices, calibrations = devices_of(found), {}
+    for device in devices:
+        sample = device.frames[0]
+        try:
+            if kind == "grey":
+                calibration, note = reading.meaning.of_greys(folder)
+            elif kind == "counts":
+                calibration, note = reading.meaning.of_counts(sample.load(), sample.path)
+            else:
+                calibration, note = reading.meaning.of_floats(sample.load(), sample.path)
+        except SceneError as error:
+            if len(devices) == 1:
+                raise
+            raise SceneError(
+                f"{error} These are {len(devices)} cameras: {listed(devices)}. Where their numbers mean different things, put "
+                "each into a folder of its own and prepare those"
+            ) from error
+        if note not in notes:
+            notes.append(note)
+        calibrations |= dict.fromkeys((frame.path for frame in device.frames), calibration)
+    yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
 
 
 def _grey(path: Path) -> np.ndarray:
@@ -256,6 +276,7 @@ def _of_flir(
             found.field_of_view_deg,
             found.frame_rate_hz,
         ),
+        size=record.size(),
         picture=(lambda: again().picture() or b"") if record.picture() else None,
         **details,
     )
@@ -266,6 +287,7 @@ def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
         raise SceneError(f"counts.planck are constants of FLIR's cameras; {path} is of DJI and holds kelvin")
     stated, xmp = dji.parameters_in(data), dji.xmp_in(data)
     details, camera = _of_exif(data)
+    height, width = dji.array_of(data).shape
 
     def number(key: str) -> float | None:
         try:
@@ -296,6 +318,7 @@ def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
         conditions=Conditions(**stated),
         sources=dict.fromkeys(stated, "file"),
         camera=replace(camera, serial=xmp.get("CameraSerialNumber") or camera.serial),
+        size=(width, height),
         **details,
     )
 

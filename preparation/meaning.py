@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.radiometric import Calibration
@@ -55,13 +55,18 @@ class Meaning:
     band_um: Sequence[float] = (7.5, 14.0)
 
     def __post_init__(self) -> None:
-        if self.planck is not None and len(self.planck) != 5:
-            raise SceneError(f"counts.planck needs the five numbers [R1,B,F,O,R2], got {list(self.planck)}")
+        for name, value, count in (
+            ("counts.planck=[R1,B,F,O,R2]", self.planck, 5),
+            ("counts.scale", self.scale, None),
+            ("counts.offset_c", self.offset_c, None),
+            ("bounds_c=[min,max]", self.bounds_c, 2),
+            ("band_um", self.band_um, 2),
+        ):
+            if value is not None:
+                check_numbers(name, value, count, SceneError)
         if self.scale is not None and not self.scale > 0:
             raise SceneError(f"counts.scale must be positive (°C per count), got {self.scale}")
-        if self.bounds_c is not None and len(self.bounds_c) != 2:
-            raise SceneError(f"bounds_c needs two values [min, max] in °C, got {list(self.bounds_c)}")
-        if len(self.band_um) != 2 or not 0 < self.band_um[0] < self.band_um[1]:
+        if not 0 < self.band_um[0] < self.band_um[1]:
             raise SceneError(f"band_um needs two rising wavelengths in µm, got {list(self.band_um)}")
 
     def check_use(self, kind: str, what: str) -> None:

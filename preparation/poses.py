@@ -15,16 +15,19 @@ import cv2  # before pycolmap: formats/colmap.py says why
 import numpy as np
 import pycolmap
 import torch
+from rich import get_console
 from rich.progress import Progress, track
 
-from heatsplat.contracts import SceneError, check_option, evenly_spread
+from heatsplat.contracts import SceneError, check_numbers, check_option, evenly_spread
 from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.datamodules.formats.lens import MODELS
 from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
-from heatsplat.preparation.features import Features
+from heatsplat.preparation.devices import Device, devices_of, listed
+from heatsplat.preparation.features import Features, check_positive
 from heatsplat.preparation.frame import Frame, instant
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
@@ -55,8 +58,10 @@ class FindPoses:
         features: what finds and matches features.
         camera_model: of COLMAP, for each camera: SIMPLE_RADIAL, RADIAL, OPENCV, ...
         focal_px: focal length of the thermal camera in pixels; None for what the files say, or a guess that is refined.
+            Where a recording has several thermal cameras each has a lens of its own.
         pixel_um: pitch of the detector's pixels in µm, for files that say a focal length in mm.
-        refine_focal: "auto" where the files say nothing, True or False. Flat ground from straight above does not tell it.
+        refine_focal: "auto" where the files of a camera say nothing, True or False. Flat ground from straight above does not
+            tell it.
         video: frames follow each other: only neighbours in time (and in space, by GPS) are matched. None: where there are
             more than ``all_pairs``.
         all_pairs: number of frames up to which all pairs are matched.
@@ -84,6 +89,15 @@ class FindPoses:
     def __post_init__(self) -> None:
         check_option("poses.by", self.by, SOURCES, SceneError)
         check_option("poses.refine_focal", self.refine_focal, ("auto", True, False), SceneError)
+        check_option("poses.video", self.video, (None, True, False), SceneError)
+        check_option("poses.camera_model", self.camera_model, MODELS, SceneError)
+        for name in ("focal_px", "pixel_um", "overlap", "clip"):
+            if name != "focal_px" or self.focal_px is not None:
+                check_positive(f"poses.{name}", getattr(self, name))
+        check_numbers("poses.all_pairs", self.all_pairs, error=SceneError)
+        check_numbers("poses.gps_sd_m", self.gps_sd_m, 2, SceneError)
+        for value in self.gps_sd_m:
+            check_positive("poses.gps_sd_m", value)
 
     def __call__(self, frames: list[Frame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns what was found, what was not, and why.
@@ -111,6 +125,9 @@ class Search:
             raise SceneError(
                 f"{counted(len(frames), 'frame')} cannot tell where cameras stood; three or more that overlap are needed"
             )
+        self.devices = devices_of(frames)
+        self._check_devices()
+        self.device_of = {frame.name: i for i, device in enumerate(self.devices) for frame in device.frames}
         index = ImageIndex(target / "images")
         self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
         if options.by == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
@@ -136,8 +153,9 @@ class Search:
         images = self.work / "images"
         todo = [name for name in self.frames if not (images / self.copy_of[name]).is_file()]
         if todo:
-            stretch = Stretch([frame.pixels for frame in self.frames.values()], self.options.clip)
+            stretches = [Stretch([f.pixels for f in device.frames], self.options.clip) for device in self.devices]
             for name in _progress(todo, "stretching"):
+                stretch = stretches[self.device_of[self.frames[name].name]]
                 _write_png(images / self.copy_of[name], stretch(self.frames[name].pixels()))
         if self.options.by == "rgb":
             for name in _progress(list(self.frames), "copying photos"):
@@ -147,10 +165,8 @@ class Search:
 
     def find_features(self) -> None:
         """Features of all copies, in the database."""
-        cameras = {"thermal/": self._thermal_focal()}
         names = list(self.name_of)
         if self.options.by == "rgb":
-            cameras["rgb/"] = None
             names += [self._photo(name) for name in self.frames]
         reader = pycolmap.ImageReaderOptions(camera_model=self.options.camera_model)
         missing = set(names)
@@ -166,7 +182,7 @@ class Search:
         if not todo:
             return
         with pycolmap.Database.open(self.database) as database:
-            self._set_cameras(database, cameras)
+            self._set_focal_lengths(database)
             self._write_priors(database)
             if self.options.by == "rgb":
                 cameras = [
@@ -213,7 +229,8 @@ class Search:
         options.mapper.abs_pose_min_num_inliers = 15
         options.mapper.init_min_num_inliers = 50
         refine = self.options.refine_focal
-        options.ba_refine_focal_length = self._thermal_focal() is None if refine == "auto" else refine
+        unknown = any(self._focal(device) is None for device in self.devices)
+        options.ba_refine_focal_length = unknown if refine == "auto" else refine
         options.mapper.abs_pose_refine_focal_length = options.ba_refine_focal_length
         if self.options.by == "rgb":
             options.ba_refine_focal_length = True
@@ -223,7 +240,7 @@ class Search:
         folder = self.work / "models"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        with Progress(transient=True) as bar:
+        with Progress(transient=True, disable=not get_console().is_terminal) as bar:
             task = bar.add_task("placing cameras", total=len(self.frames))
             models = pycolmap.incremental_mapping(
                 self.database, self.work / "images", folder, options, next_image_callback=lambda: bar.advance(task)
@@ -236,8 +253,9 @@ class Search:
     def finish(self, model: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]) -> Section:
         """Writes the model of the thermal frames and says what became of every frame."""
         kept = {image.name: image for image in model.images.values() if image.has_pose and image.name in self.name_of}
-        # Of a camera that stands still noise places a few frames somewhere.
-        if len(kept) < 3 or len(kept) < len(self.frames) / 2 and self._stands_still():
+        # Of a camera that stands still noise places a few frames somewhere, and cameras that see no point stand anywhere.
+        seen = model.num_points3D()
+        if len(kept) < 3 or not seen or len(kept) < len(self.frames) / 2 and self._stands_still():
             raise SceneError(self._nothing())
         placed_by_photos = settle_rig(model, self.name_of) if self.options.by == "rgb" else None
         written = thermal_only(model, self.name_of, placed_by_photos)
@@ -246,13 +264,16 @@ class Search:
         write_world(self.target, None if self.origin is None else 1.0)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(list(written.images.values()))
-        camera = next(iter(kept.values())).camera
+        cameras = {self._device(copy): image.camera for copy, image in kept.items()}
         values: dict[str, Any] = {
             "registered": len(kept),
             "frames": len(self.frames),
             "points": written.num_points3D(),
             "reprojection_error_px": round(model.compute_mean_reprojection_error(), 4),
-            "camera": {"model": camera.model.name, "params": [round(float(p), 6) for p in camera.params]},
+            "cameras": {
+                self.devices[i].label: {"model": c.model.name, "params": [round(float(p), 6) for p in c.params]}
+                for i, c in sorted(cameras.items())
+            },
             "not_registered": missing,
             "metres_per_unit": None if self.origin is None else 1.0,
             "origin": None if self.origin is None else [float(x) for x in self.origin],
@@ -260,8 +281,12 @@ class Search:
         lines = [
             f"{len(kept)} of {len(self.frames)} frames found their camera; {values['points']} points, reprojection error "
             f"{values['reprojection_error_px']:.2f} px.",
-            f"Camera: {camera.model.name}, {', '.join(f'{p:.5g}' for p in camera.params)} (distortion is taken out of the "
-            "temperatures when the scene is loaded, as floating point).",
+            *(
+                f"Camera{f' {self.devices[i].label}' if len(self.devices) > 1 else ''}: {c.model.name}, "
+                f"{', '.join(f'{p:.5g}' for p in c.params)} (distortion is taken out of the temperatures when the scene is "
+                "loaded, as floating point)."
+                for i, c in sorted(cameras.items())
+            ),
         ]
         if errors is not None:
             values["gps_residual_m"] = [round(float(e), 3) for e in errors]
@@ -315,42 +340,60 @@ class Search:
     def _photo(self, name: str) -> str:
         return self.copy_of[name].replace("thermal/", "rgb/", 1)
 
-    def _thermal_focal(self) -> float | None:
-        """Focal length in pixels that the user or the files give, or None."""
-        if self.options.focal_px is not None:
-            return float(self.options.focal_px)
-        first = next(iter(self.frames.values()))
-        angle = first.camera.field_of_view_deg
-        if not angle:
-            millimetres = first.camera.focal_mm
-            return None if millimetres is None else 1000.0 * millimetres / self.options.pixel_um
-        return 0.5 * first.pixels().shape[1] / float(np.tan(np.radians(0.5 * angle)))
+    def _check_devices(self) -> None:
+        """Raises SceneError for what only one thermal camera can have."""
+        if len(self.devices) == 1:
+            return
+        alone = "Put each into a folder of its own and prepare those"
+        if self.options.by == "rgb":
+            raise SceneError(
+                f"poses=rgb finds one thermal camera by the photos of one beside it, and here are {len(self.devices)}: "
+                f"{listed(self.devices)}. {alone}, or find poses=thermal"
+            )
+        if self.options.focal_px is not None and len({self._stated_focal(device) for device in self.devices}) > 1:
+            raise SceneError(
+                f"poses.focal_px={self.options.focal_px:g} is one lens, and here are {len(self.devices)}: "
+                f"{listed(self.devices)}. {alone}"
+            )
+
+    def _focal(self, device: Device) -> float | None:
+        """Focal length in pixels of a thermal camera that the user or the files give, or None."""
+        return self._stated_focal(device) if self.options.focal_px is None else float(self.options.focal_px)
+
+    def _stated_focal(self, device: Device) -> float | None:
+        about = device.like.camera
+        if not about.field_of_view_deg:
+            return None if about.focal_mm is None else 1000.0 * about.focal_mm / self.options.pixel_um
+        return 0.5 * device.like.pixels().shape[1] / float(np.tan(np.radians(0.5 * about.field_of_view_deg)))
+
+    def _device(self, copy: str) -> int | None:
+        """Which of the thermal cameras took a copy; None for photos."""
+        return self.device_of[self.frames[self.name_of[copy]].name] if copy in self.name_of else None
 
     def _camera_of(self, copy: str) -> int:
-        """Number of the camera that copies of the same folder and size have already; -1 for none."""
+        """Number in the database of the camera that took a copy (photos of one size are of one); -1 where it has none yet."""
         if not self.database.is_file():
             return -1
-        shape = _shape(self.work / "images" / copy)
+        height, width = _shape(self.work / "images" / copy)
         with pycolmap.Database.open(self.database) as database:
-            for image in database.read_all_images():
-                if image.name.split("/")[0] == copy.split("/")[0]:
-                    camera = database.read_camera(image.camera_id)
-                    if (camera.height, camera.width) == shape:
-                        return camera.camera_id
-        return -1
+            own = {im.camera_id for im in database.read_all_images() if self._device(im.name) == self._device(copy)}
+            sized = {key: database.read_camera(key) for key in own}
+        return next((key for key, camera in sized.items() if (camera.height, camera.width) == (height, width)), -1)
 
-    def _set_cameras(self, database: pycolmap.Database, focal: dict[str, float | None]) -> None:
-        """One camera for each folder of copies, at the focal length that is known."""
-        images = database.read_all_images()
-        for prefix, length in focal.items():
-            own = [image for image in images if image.name.startswith(prefix)]
-            for camera_id in {image.camera_id for image in own}:
+    def _set_focal_lengths(self, database: pycolmap.Database) -> None:
+        """Gives thermal cameras in the database the focal lengths that are known."""
+        known = {
+            image.camera_id: self._focal(self.devices[self._device(image.name)])
+            for image in database.read_all_images()
+            if image.name in self.name_of
+        }
+        for camera_id, length in known.items():
+            if length is not None:
                 camera = database.read_camera(camera_id)
-                if length is not None:
-                    for i in camera.focal_length_idxs():
-                        camera.params[i] = length
-                    camera.has_prior_focal_length = True
-                    database.update_camera(camera)
+                for i in camera.focal_length_idxs():
+                    camera.params[i] = length
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)
 
     def _origin(self) -> np.ndarray | None:
         """Latitude, longitude and altitude of the first fix; None where GPS does not count or cannot tell frames apart."""
@@ -580,4 +623,4 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
-    return iter(track(items, what, transient=True)) if items else iter(())
+    return iter(track(items, what, transient=True, disable=not get_console().is_terminal)) if items else iter(())

@@ -14,6 +14,7 @@ from rich.progress import track
 from heatsplat.contracts import SceneError
 from heatsplat.preparation import report
 from heatsplat.preparation.conditions import Given, Uncertainty
+from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
@@ -68,7 +69,8 @@ def prepare(
     """
     folder = Path(source).expanduser().resolve()
     if not folder.is_dir():
-        raise SceneError(f"source={source}: there is no such folder")
+        what = "this is a file; give the folder that it lies in" if folder.is_file() else "there is no such folder"
+        raise SceneError(f"source={source}: {what}")
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = Given(**conditions), Uncertainty(**uncertainty)
@@ -78,8 +80,14 @@ def prepare(
         Path(table).expanduser() if table else None,
         table_columns or {},
     )
-    sections = [doctor(folder, reading)] if doctor else []
     found = read_recording(folder, reading)
+    for note in found.notes:
+        log.info("%s", note)
+    if len(devices := devices_of(found.frames)) > 1:
+        log.warning(
+            "%d thermal cameras, each with a lens and dead pixels of its own: %s", len(devices), listed(devices)
+        )
+    sections = [doctor(folder, reading)] if doctor else []
     frames = [given.settled(frame) for frame in found.frames]
     writer = Writer(target, uncertain, keep_counts)
     writer.check(frames)

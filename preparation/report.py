@@ -11,18 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from heatsplat.callbacks.page import PAGE_FILE, write_page
+from heatsplat.contracts import evenly_spread
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.writer import QUANTILES, rows
 
 REPORT = "report.md"
 BINS = 160
+SHOWN, ACROSS = 6, 3  # frames that are shown, and how many of them in a row
 LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
 LABELS = {
     "emissivity": "emissivity",
@@ -75,11 +79,13 @@ def counted(number: int, what: str) -> str:
 
 def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
     """What was read."""
-    cameras = sorted(
-        {" ".join(filter(None, (f.camera.make, f.camera.model, f.camera.serial))) or "unknown" for f in frames}
-    )
-    sizes = sorted({"x".join(map(str, r["size"])) for r in records})
-    lines = [f"- {counted(len(frames), 'frame')} of {', '.join(sizes)} pixels, camera {', '.join(cameras)}"]
+    devices = devices_of(frames)
+    lines = [f"- {counted(len(frames), 'frame')}, camera {devices[0].label}"]
+    if len(devices) > 1:
+        lines = [
+            f"- {counted(len(frames), 'frame')} of {len(devices)} cameras, each with a lens and dead pixels of its own:"
+        ]
+        lines += [f"    - {d.label}: {counted(len(d.frames), 'frame')}, such as {d.frames[0].name}" for d in devices]
     timed = [f.time for f in frames if f.time is not None]
     if timed:
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
@@ -183,7 +189,8 @@ def _doubts(frames: Sequence[Frame]) -> list[str]:
 
 
 def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> Section:
-    """Histogram of every frame, and how temperatures run over time where there are several."""
+    """A few frames, the histogram of every frame, and how temperatures run over time where there are several."""
+    shown = [frame for frame, record in zip(frames, records, strict=True) if record["quantiles"]]
     known = [(row, r["quantiles"]) for row, r in zip(rows(frames, records), records, strict=True) if r["quantiles"]]
     if not known:
         return Section("Pictures", ["No frame has a temperature."])
@@ -196,6 +203,19 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
+    save_picture(_few_frames(shown, quantiles, unit), target / "report" / "frames.png")
+    lines = [
+        f"![{counted(min(len(shown), SHOWN), 'frame')}, one scale for all](report/frames.png)",
+        "",
+        "![histogram of every frame](report/histograms.png)",
+        "",
+    ]
+    if len(known) == 1:
+        axes.stairs(100 * share[0], edges, fill=True, color="tab:red")
+        axes.set(xlabel=unit, ylabel=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}", title="Histogram")
+        axes.margins(x=0)
+        save_picture(figure, target / "report" / "histograms.png")
+        return Section("Pictures", lines)
     image = axes.imshow(
         100 * share.T,
         origin="lower",
@@ -207,10 +227,8 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     )
     figure.colorbar(image, label=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}")
     axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     save_picture(figure, target / "report" / "histograms.png")
-    lines = ["![histogram of every frame](report/histograms.png)", ""]
-    if len(known) == 1:
-        return Section("Pictures", lines)
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
@@ -234,6 +252,23 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
         "part of the scene.",
     ]
     return Section("Pictures", lines, {"median_span": float(np.ptp(middle)), "largest_step": float(jump)})
+
+
+def _few_frames(frames: Sequence[Frame], quantiles: np.ndarray, unit: str) -> Figure:
+    """Frames spread over the recording, in colours that they share, from their quantiles [n, q]."""
+    few = [frames[i] for i in evenly_spread(len(frames), SHOWN)]
+    columns = min(len(few), ACROSS)
+    lines = -(-len(few) // columns)
+    figure = Figure(figsize=(9, 2.6 * lines if lines > 1 else 4.0), layout="constrained")
+    places = np.atleast_1d(figure.subplots(lines, columns)).ravel()
+    low, high = np.percentile(quantiles[:, 1], 5), np.percentile(quantiles[:, -2], 95)
+    for place, frame in zip(places, few, strict=False):
+        image = place.imshow(frame.pixels(), cmap="inferno", vmin=low, vmax=max(high, low + 1e-6))
+        place.set_title(frame.name, fontsize=7)
+    for place in places:
+        place.set_axis_off()
+    figure.colorbar(image, ax=list(places), label=unit, shrink=0.8)
+    return figure
 
 
 def _rising(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

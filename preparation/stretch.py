@@ -50,7 +50,9 @@ class Stretch:
             if known.size:
                 few = rng.choice(known, min(known.size, SAMPLE_PIXELS // len(sample)), replace=False)
                 taken.append(few - np.median(known))
-        low, high = np.percentile(np.concatenate(taken), percentiles) if taken else (0.0, 0.0)
+        if not taken:
+            raise SceneError("no pixel of the frames has a temperature; there is nothing by which to find cameras")
+        low, high = np.percentile(np.concatenate(taken), percentiles)
         if not low < high:
             raise SceneError("the frames show one temperature throughout; there is nothing by which to find cameras")
         self.low, self.high = float(low), float(high)

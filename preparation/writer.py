@@ -30,6 +30,7 @@ from heatsplat.physics.defects import dead_pixels
 from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, measured_signal, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import Frame, instant
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
@@ -49,7 +50,9 @@ class Writer:
     def __init__(self, target: Path, uncertain: Uncertainty, keep_counts: bool) -> None:
         self.target, self.uncertain, self.keep_counts = target, uncertain, keep_counts
         self.images = target / "images"
-        self.dead: np.ndarray | None = None  # [H, W] bool, pixels of the detector that say nothing
+        self.dead: dict[
+            str, np.ndarray
+        ] = {}  # by name of a frame: [H, W] bool, pixels of its detector that say nothing
 
     def check(self, frames: Sequence[Frame]) -> None:
         """Raises SceneError where the folder holds images of another recording."""
@@ -99,12 +102,12 @@ class Writer:
     def _made_of(self, frame: Frame) -> str:
         file = frame.path.stat()
         parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
-        dead = [] if self.dead is None else np.flatnonzero(self.dead).tolist()
+        dead = np.flatnonzero(self.dead[frame.name]).tolist() if frame.name in self.dead else []
         return hashlib.sha256(json.dumps([*parts, repr(self.uncertain), dead]).encode()).hexdigest()[:32]
 
     def _record(self, frame: Frame, pixels: np.ndarray) -> dict[str, Any]:
         finite = np.isfinite(pixels)
-        known = pixels[finite if self.dead is None else finite & ~self.dead]
+        known = pixels[finite & ~self.dead[frame.name] if frame.name in self.dead else finite]
         record: dict[str, Any] = {
             "file": self.image_of(frame).name,
             "source": str(frame.path),
@@ -139,18 +142,22 @@ class Writer:
         return record
 
     def find_dead_pixels(self, frames: Sequence[Frame]) -> int:
-        """How many pixels of the detector are dead; from here on no record counts them."""
-        few = [frames[i].pixels().astype(np.float32) for i in evenly_spread(len(frames), DEAD_FRAMES)]
-        if all(pixels.shape == few[0].shape for pixels in few):
+        """How many pixels of the detector (of each camera's) are dead; from here on no record counts them."""
+        count = 0
+        for device in devices_of(frames):
+            own = device.frames
+            few = [own[i].pixels().astype(np.float32) for i in evenly_spread(len(own), DEAD_FRAMES)]
             dead = dead_pixels(torch.from_numpy(np.stack(few))).numpy()
-            self.dead = dead if dead.any() else None
-        return 0 if self.dead is None else int(self.dead.sum())
+            if dead.any():
+                self.dead |= dict.fromkeys((frame.name for frame in own), dead)
+                count += int(dead.sum())
+        return count
 
     def write_masks(self, frames: Sequence[Frame]) -> None:
         """Leaves dead pixels out of every image: masks/ (white counts)."""
-        if self.dead is not None:
-            mask = cv2.imencode(".png", np.where(self.dead, 0, 255).astype(np.uint8))[1]
-            for frame in frames:
+        for frame in frames:
+            if frame.name in self.dead:
+                mask = cv2.imencode(".png", np.where(self.dead[frame.name], 0, 255).astype(np.uint8))[1]
                 self._replace(self.target / "masks" / f"{self.image_of(frame).name}.png", mask)
 
     def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:

@@ -45,6 +45,7 @@ class Field:
         drift_k: what the level rises by from frame to frame, until the shutter closes.
         frames_per_shutter: frames between two shutters.
         dead_pixels: number of pixels that always show the same.
+        model: of the thermal camera.
         rgb: whether a second, visible camera records beside.
         rgb_offset_m: where the visible camera stands, in the axes of the thermal one (right, down, forward).
         rgb_turn_deg: by how much it is turned against it, about the same axes.
@@ -57,6 +58,7 @@ class Field:
     drift_k: float = 0.0
     frames_per_shutter: int = 12
     dead_pixels: int = 0
+    model: str = "Thermal 12"
     rgb: bool = False
     rgb_offset_m: tuple[float, float, float] = (-0.03, 0.01, 0.0)
     rgb_turn_deg: tuple[float, float, float] = (0.4, -0.7, 0.3)
@@ -78,7 +80,7 @@ def write_camera(recording: Recording, folder: Path, field: Field = Field(), see
     for frame, time_s in enumerate(recording.times_s):
         counts = np.rint((celsius[frame] + KELVIN_AT_0_C) * COUNTS_PER_KELVIN).astype(np.uint16)
         when = field.start + timedelta(seconds=float(time_s))
-        about = _exif(when, "Thermal 12", focal_mm, None if positions is None else positions[frame])
+        about = _exif(when, field.model, focal_mm, None if positions is None else positions[frame])
         _saved(Image.fromarray(counts), folder / "thermal" / f"frame_{frame:04d}_T.tiff", exif=about)
     if not field.rgb:
         return

@@ -68,8 +68,9 @@ def stoppable() -> Iterator[None]:
             signal.signal(number, listener)
 
 
-# What a disk says that is full or may not be written to: the message names the file, and no traceback helps.
-NO_PLACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES}
+# What a disk says that is full, may not be written to, or has a file where a folder is to be: the message names it, and no
+# traceback helps.
+NO_PLACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EEXIST, errno.ENOTDIR}
 
 EXAMPLES = {
     "train": (
@@ -384,4 +385,8 @@ def prepare(config: dict[str, Any], output_dir: Path) -> None:
     if config["target"] is None or (config["source"] is None and config.get("correct") is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
     prepare_machine(config["threads"])
-    build(config.get("correct") or config["preparation"], target=output_dir)
+    try:
+        build(config.get("correct") or config["preparation"], target=output_dir)
+    except KeyboardInterrupt:
+        log.warning("stopped; what is done lies in %s, and the same command goes on", output_dir)
+        sys.exit(128 + signal.SIGINT)

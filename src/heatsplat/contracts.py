@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,16 @@ def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueE
     """Raises ``error``, with the values that are known, where an option has another one."""
     if value not in known:
         raise error(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+
+
+def check_numbers(name: str, value: Any, count: int | None = None, error: type[ValueError] = ValueError) -> None:
+    """Raises ``error`` where a setting is no finite number, or with ``count`` no list of so many."""
+    listed = isinstance(value, Sequence) and not isinstance(value, str)
+    numbers = value if listed else [value]
+    known = all(isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in numbers)
+    if not known or (count is None) == listed or (listed and len(numbers) != count):
+        wanted = "a number" if count is None else f"a list of {count} numbers"
+        raise error(f"{name} must be {wanted}, got {list(value) if listed else value}")
 
 
 @dataclass(frozen=True)

@@ -11,3 +11,10 @@ def test_clocks_that_run_back_repeats_and_gaps_are_found():
     assert "times" in checks(replace(clean(), times_s=[t if i < 8 else t - 55 for i, t in enumerate(times)]))
     assert "times" in checks(replace(clean(), times_s=[t if i < 8 else t + 500 for i, t in enumerate(times)]))
     assert "times" in checks(replace(clean(), times_s=[t - t % 20 for t in times]))
+
+
+def test_a_second_camera_that_began_earlier_is_no_clock_that_runs_back():
+    count = len(clean().names)
+    of_two = replace(clean(), times_s=[10.0 * i if i < 8 else 10.0 * i - 75 for i in range(count)])
+    assert "times" in checks(of_two)
+    assert "times" not in checks(replace(of_two, lenses=[int(i >= 8) for i in range(count)]))

@@ -22,6 +22,18 @@ def test_dead_pixels_are_found_beside_each_other_too_and_edges_that_move_are_non
     assert found[5, 6] and found[5, 7] and found[20, 11] and int(found.sum()) == 3
 
 
+def test_smooth_slopes_on_which_pixels_are_their_own_median_are_no_dead_pixels():
+    generator = torch.Generator().manual_seed(0)
+    waves = torch.fft.fft2(torch.randn(512, 512, generator=generator))
+    rate = torch.fft.fftfreq(512)
+    waves *= torch.exp(-700.0 * (rate[:, None] ** 2 + rate[None] ** 2))
+    scene = torch.fft.ifft2(waves).real
+    shown = [torch.roll(4.0 * scene / scene.std(), (61 * f, 83 * f), (0, 1)) for f in range(8)]
+    images = torch.stack(shown) + 0.05 * torch.randn(8, 512, 512, generator=generator)
+    images[:, 40, 50] += 5.0
+    assert dead_pixels((100 * images).round() / 100).nonzero().tolist() == [[40, 50]]  # as a camera stores them
+
+
 def test_few_frames_say_nothing():
     assert not dead_pixels(recording(3)).any()
 

@@ -29,6 +29,8 @@ def test_what_is_given_goes_before_what_the_file_says():
         ({"emissivity": 95}, "conditions.emissivity=95"),
         ({"humidity_percent": 120}, "conditions.humidity_percent=120 must lie between 0 and 100"),
         ({"air_c": -300}, "conditions.air_c"),
+        ({"emissivity": "shiny"}, "conditions.emissivity must be a number, got shiny"),
+        ({"distance_m": [1, 2]}, r"conditions.distance_m must be a number, got \[1, 2\]"),
     ],
 )
 def test_what_cannot_be_is_refused(wrong, said):
@@ -46,5 +48,6 @@ def test_uncertainties_come_in_the_units_of_the_conditions():
     assert found["distance_m"] == 1.0 and found["humidity"] == 0.05 and found["camera"] == 1.0
     assert found["window_transmission"] == found["window_k"] == 0  # there is none
     assert Uncertainty().standard(Conditions(window_transmission=0.9))["window_k"] == 3.0
-    with pytest.raises(SceneError, match="uncertainty.air_c"):
-        Uncertainty(air_c=-1.0)
+    for wrong in (-1.0, "little", float("nan")):
+        with pytest.raises(SceneError, match="uncertainty.air_c"):
+            Uncertainty(air_c=wrong)

@@ -12,6 +12,7 @@ from recordings import write_flir
 
 from heatsplat.contracts import Camera, Frame, SceneError, ThermalRange, View
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.geometry.projection import look_at
 from heatsplat.geometry.sight_lines import cosines, distances, rays
 from heatsplat.io.tiff import read_temperature
 from heatsplat.physics.radiometry import (
@@ -23,7 +24,7 @@ from heatsplat.physics.radiometry import (
     surface_temperature,
 )
 from heatsplat.preparation.conditions import Given
-from heatsplat.preparation.correction import correct_scene, corrected, preparation_of
+from heatsplat.preparation.correction import _unsettled, correct_scene, corrected, preparation_of
 from heatsplat.preparation.prepare import prepare
 
 CAMERA = Camera(
@@ -138,11 +139,46 @@ def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
     assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
 
 
+def test_cameras_that_are_turned_against_each_other_agree_on_the_normals_of_a_floor():
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    eyes = torch.tensor([[0.0, -8.0, 6.0], [2.0, 0.0, 9.0], [9.0, 6.0, 4.0]], dtype=torch.float64)
+    poses = [look_at(eye, 0.0 * up, up) for eye in eyes]
+    views = [View(Frame(f"{i}", i, replace(CAMERA, viewmat=pose))) for i, pose in enumerate(poses)]
+
+    def floor(frame):  # z = 0
+        along = rays(frame.camera) @ frame.camera.viewmat[:3, :3].double()
+        return (-frame.camera.center[2] / along[..., 2]).where(along[..., 2] < 0, torch.inf)
+
+    spots = 2.0 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 1.0
+    assert _unsettled(views, floor, spots * torch.tensor([1.0, 1.0, 0.0])) == ""
+    assert "Too few points" in _unsettled(views, floor, spots[:5])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.02])
+def test_normals_on_which_views_disagree_are_doubted(tmp_path, tilt):
+    y, x = DEPTH.isfinite().nonzero().unbind(1)
+    local = (
+        torch.stack([(x + 0.5 - 20.0) / 38.0, (y + 0.5 - 16.0) / 38.0, torch.ones(len(x))], 1) * DEPTH[y, x][:, None]
+    )
+    shown = scene()
+    shown.points = ((local - CAMERA.viewmat[:3, 3]) @ CAMERA.viewmat[:3, :3]).float()
+    columns = torch.arange(40, dtype=torch.float64) - 20.0
+
+    def depth_of(frame):  # of the middle view every wall is turned about the upright
+        return DEPTH / (1.0 + tilt * columns) if frame.name == "1.tiff" else DEPTH
+
+    page = correct_scene(shown, depth_of, [], tmp_path, Given(emissivity=0.9), BandResponse(), 1.5, METRES)
+    assert ("angles are not settled" in page.read_text()) == (tilt > 0)
+    assert "% of the pixels have no known angle" in page.read_text()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"metres": None}, "correct.metres_per_unit"),
+        ({"metres": -4}, "correct.metres_per_unit must be above 0"),
         ({"index": 0.9}, "correct.refractive_index must be above 1"),
+        ({"index": "glass"}, "correct.refractive_index must be a number, got glass"),
         ({"thermal_range": None}, "floor has no temperatures"),
         ({"depth": torch.full((32, 40), torch.inf)}, "shows no surface"),
     ],

@@ -170,6 +170,17 @@ def test_pictures_of_dji_without_temperatures_are_refused_with_what_to_run_unles
     np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.6)  # of a JPEG
 
 
+def test_a_file_that_may_not_be_read_is_not_called_corrupt(tmp_path, monkeypatch):
+    write_images(tmp_path, {"a.tiff": FLOATS})
+
+    def refuses(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("heatsplat.preparation.frames.Image.open", refuses)
+    with pytest.raises(SceneError, match=r"a\.tiff cannot be read: Permission denied"):
+        read_frames(tmp_path)
+
+
 def test_greys_that_were_stored_as_colours_are_greys(tmp_path):
     grey = (FLOATS * 5).astype(np.uint8)
     write_images(tmp_path, {"a.png": cv2.merge([grey, grey, grey])})

@@ -90,8 +90,23 @@ def test_a_few_frames_of_a_camera_that_stands_still_are_no_cameras(tmp_path):
         cv2.imwrite(str(path), picture)
     placed = [SimpleNamespace(name=copy, has_pose=True) for copy in list(search.copy_of.values())[:4]]
     with pytest.raises(SceneError, match="the image does not move"):
-        search.finish(SimpleNamespace(images=dict(enumerate(placed))), [])
+        search.finish(SimpleNamespace(images=dict(enumerate(placed)), num_points3D=lambda: 9), [])
     assert not (tmp_path / "sparse").exists()
+
+
+def test_cameras_that_see_no_point_are_none(tmp_path):
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i, picture in enumerate(np.random.default_rng(0).normal(0.0, 40.0, (3, 128, 160)).astype(np.float32)):
+        (tmp_path / "images" / f"{i}.tiff").touch()
+        smooth = cv2.GaussianBlur(picture, (0, 0), 4)
+        frames.append(Frame(f"{i}", Path(f"{i}.tiff"), 0, lambda smooth=smooth: smooth))
+    search = Search(FindPoses(Sift()), frames, tmp_path)
+    search.copies()
+    search.find_features()
+    placed = {i: SimpleNamespace(name=copy, has_pose=True) for i, copy in enumerate(search.name_of)}
+    with pytest.raises(SceneError, match="no cameras could be found: frames have .* features"):
+        search.finish(SimpleNamespace(images=placed, num_points3D=lambda: 0), [])
 
 
 @pytest.mark.slow
@@ -132,3 +147,27 @@ def test_photos_place_the_thermal_camera_that_is_turned_against_the_visible_one(
     assert float(errors.similarity.scale) == pytest.approx(1.0, abs=0.02)
     turned = float(torch.tensor(field.rgb_turn_deg).norm())
     assert said.values["thermal_from_rgb"]["degrees"] == pytest.approx(turned, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"focal_px": -5}, "poses.focal_px must be above 0, got -5"),
+        ({"overlap": 0}, "poses.overlap"),
+        ({"clip": "much"}, "poses.clip must be a number"),
+        ({"gps_sd_m": 2.0}, "poses.gps_sd_m must be a list of 2 numbers"),
+        ({"gps_sd_m": [2.0, 0.0]}, "poses.gps_sd_m must be above 0"),
+        ({"all_pairs": "few"}, "poses.all_pairs"),
+        ({"camera_model": "RADIALL"}, "poses.camera_model must be one of SIMPLE_PINHOLE"),
+        ({"video": "yes"}, "poses.video"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_before_any_work(wrong, said):
+    with pytest.raises(SceneError, match=said):
+        FindPoses(Sift(), **wrong)
+
+
+def test_features_that_cannot_be_found_are_refused():
+    for wrong in ({"most": 0}, {"ratio": "x"}, {"peak": -1.0}):
+        with pytest.raises(SceneError, match=f"poses.features.{next(iter(wrong))}"):
+            Sift(**wrong)

@@ -50,7 +50,7 @@ def test_pictures_show_steps_that_all_pixels_share(tmp_path):
     records = prepared(frames, tmp_path / "scene")
     section = report.pictures(tmp_path / "scene", frames, records)
     assert section.values["largest_step"] == pytest.approx(3.0, abs=1e-3)
-    for name in ("histograms", "over_time"):
+    for name in ("frames", "histograms", "over_time"):
         picture = cv2.imread(str(tmp_path / "scene" / "report" / f"{name}.png"))
         assert picture.shape[0] > 300 and picture.std() > 10
         assert f"report/{name}.png" in "\n".join(section.lines)
@@ -61,8 +61,9 @@ def test_greys_have_no_radiometry(tmp_path):
     records = prepared(frames, tmp_path / "scene")
     assert report.radiometry(frames, records, Uncertainty()) is None
     assert "greys" not in "\n".join(report.recording(frames, records, []).lines)
-    assert report.pictures(tmp_path / "scene", frames, records).lines[:1] == [
-        "![histogram of every frame](report/histograms.png)"
+    assert report.pictures(tmp_path / "scene", frames, records).lines[:3:2] == [
+        "![1 frame, one scale for all](report/frames.png)",
+        "![histogram of every frame](report/histograms.png)",
     ]
     assert not (tmp_path / "scene" / "report" / "over_time.png").exists()  # of one frame
 

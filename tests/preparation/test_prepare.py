@@ -43,7 +43,11 @@ def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_a
     page = prepare(str(source), target, **PLAIN, poses=poses)
     assert page == target / "report.md"
     text = page.read_text()
-    assert "9 frames of 40x32 pixels" in text and "## Radiometry" in text and text.rstrip().endswith("9 of 9")
+    assert (
+        "9 frames, camera FLIR Test Cam 640 S123, 40x32 pixels" in text
+        and "## Radiometry" in text
+        and text.rstrip().endswith("9 of 9")
+    )
     module = Colmap(root=str(target))
     module.setup()
     views = [*module.scene.train, *module.scene.test]
@@ -73,6 +77,12 @@ def test_a_target_within_the_source_is_refused(tmp_path):
     for target in (source, source / "scene"):
         with pytest.raises(SceneError, match="give a folder outside of it"):
             prepare(str(source), target, **PLAIN)
+
+
+def test_a_source_that_is_a_file_is_told_what_to_give(tmp_path):
+    (tmp_path / "a.seq").touch()
+    with pytest.raises(SceneError, match="a.seq: this is a file; give the folder that it lies in"):
+        prepare(str(tmp_path / "a.seq"), tmp_path / "scene", **PLAIN)
 
 
 def test_a_source_that_is_not_there_is_named(tmp_path):
@@ -138,3 +148,9 @@ def test_the_command_prepares_and_goes_on(tmp_path):
     record = json.loads((tmp_path / "scene" / "images" / "1.json").read_text())
     assert record["conditions"]["emissivity"] == {"value": 0.9, "from": "given", "standard_uncertainty": 0.02}
     assert "give the folder" in succeeds([*command[:1], "source=files"], tmp_path, 1)
+    stop = ["+poses._target_=signal.raise_signal", "+poses._args_=[2]"]
+    said = succeeds([*command, *stop], tmp_path, 130)
+    assert "and the same command goes on" in said and "Traceback" not in said
+    (tmp_path / "scene.txt").touch()
+    said = succeeds([*command[:2], "target=scene.txt"], tmp_path, 1)
+    assert "File exists: 'scene.txt'" in said and "Traceback" not in said

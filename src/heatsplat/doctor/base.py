@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, View, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, View, evenly_spread
 from heatsplat.effects.observations import Tracks, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
@@ -17,6 +18,10 @@ from heatsplat.physics.noise import noise_of, quantum_of
 # Frames that are looked at: enough to find what is common, and cheap beside a training.
 MAX_FRAMES = 32
 NAMED = 3  # frames that a finding names
+# Correlation from which two images are one: 0.998 from a tripod; where cameras move no recording has 0.9 in all frames.
+SAME = 0.95
+MAX_PIXELS = 1500  # of a camera that stands still
+FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ class Material:
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         views: the views of ``images``, for tracks; empty without cameras.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
+        lenses: for every frame, the number of the camera that took it; empty where one took all.
     """
 
     names: Sequence[str]
@@ -73,6 +79,7 @@ class Material:
     clipped: float | None = None
     views: Sequence[View] = ()
     answers: Tensor | None = None
+    lenses: Sequence[int] = ()
 
     @cached_property
     def noise(self) -> float:
@@ -94,6 +101,40 @@ class Material:
         if self.cameras is None or self.points is None or not len(self.points):
             return None
         return tracks_of(self.points.double(), list(self.views), self.images, self.noise)
+
+    @cached_property
+    def followed(self) -> tuple[Tensor, Tensor] | None:
+        """What points of the scene show in every frame, [P, F], and the weight of each: along tracks, or, of a camera without
+        poses that stands still, at pixels of a grid. None where neither is known."""
+        if self.tracks is not None:
+            return self.tracks.values, self.tracks.weights
+        if self.cameras is not None or not self.still:
+            return None
+        every = max(1, math.ceil(math.sqrt(self.images[0].numel() / MAX_PIXELS)))
+        counts = self.images.isfinite() if self.masks is None else self.images.isfinite() & self.masks
+        values, weights = (x[:, every // 2 :: every, every // 2 :: every].flatten(1).T for x in (self.images, counts))
+        return values.nan_to_num(), weights.double()
+
+    @cached_property
+    def still(self) -> bool:
+        """Whether every frame shows what the middle one shows, but for its level, noise and gain."""
+        middle = len(self.images) // 2
+        return all(self._alike(f, middle) > SAME for f in range(len(self.images)) if f != middle)
+
+    def _alike(self, frame: int, other: int) -> float:
+        """Correlation of two images, without what noise takes of it; 0 where one shows nothing beside noise."""
+        pair = self.images[[frame, other]]
+        counts = pair.isfinite().all(0)
+        if self.masks is not None:
+            counts = counts & self.masks[frame] & self.masks[other]
+        values = pair[:, counts]
+        if values.shape[1] < 2:
+            return 0.0
+        shown = values - values.mean(1, keepdim=True)
+        size = shown.square().mean(1) - self.noise**2
+        if not bool((size > self.noise**2).all()):
+            return 0.0
+        return float((shown[0] * shown[1]).mean() / size.prod().sqrt())
 
     def known(self, frame: int) -> Tensor:
         """Values [n] of the pixels of a frame that count."""
@@ -156,7 +197,18 @@ def material_of(scene: SceneData) -> Material:
         clipped=scene.notes.get("clipped_fraction"),
         views=views,
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
+        lenses=_lenses(frames),
     )
+
+
+def _lenses(frames: Sequence[Frame]) -> list[int]:
+    """Which camera took each frame, by its intrinsics; where these are nearly as many as frames they tell none apart."""
+    numbers: dict[object, int] = {}
+    found = [
+        numbers.setdefault((c.width, c.height, *c.K.flatten().tolist()), len(numbers))
+        for c in (frame.camera for frame in frames)
+    ]
+    return found if 1 < len(numbers) <= len(frames) / FRAMES_PER_LENS else []
 
 
 def some(names: Sequence[str]) -> str:

@@ -29,7 +29,14 @@ def distances(camera: Camera, depth: Tensor) -> Tensor:
 
 
 def cosines(camera: Camera, depth: Tensor) -> Tensor:
-    """Cosine [H, W] of the angle between the line of sight and the surface's normal, in [0, 1]; NaN where it is not known.
+    """Cosine [H, W] of the angle between the line of sight and the surface's normal, in [0, 1]; NaN where it is not known
+    (``normals``)."""
+    sight = rays(camera)
+    return (normals(camera, depth) * sight).sum(-1).div(sight.norm(dim=-1)).clamp(0.0, 1.0)
+
+
+def normals(camera: Camera, depth: Tensor) -> Tensor:
+    """Normals [H, W, 3] of length 1 in the camera's frame, away from it, float64; NaN where they are not known.
 
     One over the depth is linear over the image of a plane, 1/z = n r for the plane n x = 1 and the ray r of a pixel; so the
     normal n is fitted to it by least squares over a window. Where the window has an edge or an open pixel it is not known.
@@ -37,7 +44,7 @@ def cosines(camera: Camera, depth: Tensor) -> Tensor:
     Args:
         depth: [H, W] camera z, infinite where there is no surface.
     """
-    found = torch.full(depth.shape, torch.nan, dtype=torch.float64)
+    found = torch.full((*depth.shape, 3), torch.nan, dtype=torch.float64)
     reach = max(LEAST, min(depth.shape) // REACH)
     if min(depth.shape) <= 2 * reach:
         return found
@@ -59,8 +66,7 @@ def cosines(camera: Camera, depth: Tensor) -> Tensor:
     # Slopes by X and Y of the ray (X, Y, 1), and what is left for the 1.
     normal = torch.stack([right * camera.K[0, 0], down * camera.K[1, 1], mean], dim=-1).double()
     normal[..., 2] -= (normal[..., :2] * sight[..., :2]).sum(-1)
-    cosine = mean / (normal.norm(dim=-1) * sight.norm(dim=-1))
     whole = sums(inverse.gt(0).double(), ones, ones) > count - 0.5
     known = whole & (rest.clamp(min=0.0).sqrt() < BREAK * mean)
-    found[inner] = torch.where(known, cosine.clamp(0.0, 1.0), torch.nan)
+    found[inner] = (normal / normal.norm(dim=-1, keepdim=True)).where(known[..., None], torch.nan)
     return found

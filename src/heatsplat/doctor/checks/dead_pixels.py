@@ -11,10 +11,12 @@ ENOUGH = 2  # a lone one may be a speck of the scene
 
 
 def find(material: Material) -> list[Finding]:
-    few = evenly_spread(len(material.images), FRAMES)
+    lens = [material.lenses[i] for i in material.chosen] if material.lenses else [0] * len(material.images)
+    own = [f for f, number in enumerate(lens) if number == lens[0]]  # of one detector
+    few = [own[i] for i in evenly_spread(len(own), FRAMES)]
     dead = dead_pixels(material.images[few].float())
     if material.masks is not None:
-        dead &= material.masks.any(0)
+        dead &= material.masks[few].any(0)
     count = int(dead.sum())
     if count < ENOUGH:
         return []

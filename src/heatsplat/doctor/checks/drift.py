@@ -7,7 +7,6 @@ from torch import Tensor
 
 from heatsplat.doctor.base import Check, Finding, Material, some
 from heatsplat.doctor.courses import beside_courses
-from heatsplat.effects.observations import Tracks
 
 MIN_POINTS, MIN_FRAMES = 40, 5
 LEAST, LEAST_BESIDE = 3.0, 2.0  # times the noise of a pixel: of levels as they are, and beside each point's own course
@@ -25,12 +24,12 @@ JUMP = 3.0  # times the usual step between frames
 
 
 def find(material: Material) -> list[Finding]:
-    tracks = material.tracks
-    if tracks is None or len(tracks.points) < MIN_POINTS or len(material.images) < MIN_FRAMES:
+    followed = material.followed
+    if followed is None or len(followed[0]) < MIN_POINTS or len(material.images) < MIN_FRAMES:
         return []
-    looks = [(*beside_courses(tracks.values, tracks.weights, material), _leap_beside)]
+    looks = [(*beside_courses(*followed, material), _leap_beside)]
     if material.answers is None:  # under one weather surfaces rise and fall in common
-        looks.append((tracks.values, tracks.weights, _in_common))
+        looks.append((*followed, _in_common))
     for values, weights, drifts in looks:
         levels = frame_levels(values, weights)
         before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
@@ -66,7 +65,7 @@ def frame_levels(values: Tensor, weights: Tensor) -> Tensor:
 def _leap_beside(material: Material, values: Tensor, weights: Tensor, levels: Tensor) -> bool:
     """Whether all halves of the points leap alike beside their own courses."""
     return float(_leaps(levels).std()) > LEAST_BESIDE * material.noise and all(
-        _same(_leaps(one), _leaps(other), *BESIDE) for one, other in _halves(material.tracks, values, weights)
+        _same(_leaps(one), _leaps(other), *BESIDE) for one, other in _halves(material.followed[0], values, weights)
     )
 
 
@@ -74,7 +73,7 @@ def _in_common(material: Material, values: Tensor, weights: Tensor, levels: Tens
     """Whether points that change most and points that change least, warm ones and cold ones tell of the same levels."""
     if float(levels.std()) < LEAST * material.noise:
         return False
-    halves = _halves(material.tracks, values, weights)
+    halves = _halves(material.followed[0], values, weights)
     # Frames at uneven times leap along a smooth course, too.
     rough = float(_leaps(levels).std()) > LEAST * material.noise and _rough(material, levels) > LEAST * material.noise
     return (rough and all(_same(_leaps(one), _leaps(other), *LEAPS) for one, other in halves)) or all(
@@ -87,12 +86,12 @@ def _rough(material: Material, levels: Tensor) -> float:
     return float(beside_courses(levels[None], torch.ones_like(levels)[None], material)[0].std())
 
 
-def _halves(tracks: Tracks, values: Tensor, weights: Tensor) -> list[list[Tensor]]:
-    """Levels [F] by the points that change more and less than others, and by warm ones and cold ones."""
+def _halves(shown: Tensor, values: Tensor, weights: Tensor) -> list[list[Tensor]]:
+    """Levels [F] by the points that change more and less than others in what they show, and by warm ones and cold ones."""
     used = weights > 0
     some, count = used.any(1), used.sum(1).clamp_min(1)
-    mean = (tracks.values * used).sum(1) / count
-    change = (((tracks.values - mean[:, None]) * used).square().sum(1) / count).sqrt()
+    mean = (shown * used).sum(1) / count
+    change = (((shown - mean[:, None]) * used).square().sum(1) / count).sqrt()
     halves = []
     for order in (change, mean):
         upper = order > order[some].median()

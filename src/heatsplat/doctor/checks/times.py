@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 
 from heatsplat.doctor.base import Check, Finding, Material, some
@@ -14,8 +16,13 @@ def find(material: Material) -> list[Finding]:
         return []
     times = torch.tensor([float(t) for t in material.times_s], dtype=torch.float64)
     found = []
-    by_name = sorted(range(len(times)), key=lambda i: material.names[i])
-    back = [material.names[by_name[i + 1]] for i, step in enumerate(times[by_name].diff().tolist()) if step < 0]
+    lens = material.lenses or [0] * len(times)
+    by_name = sorted(range(len(times)), key=lambda i: (lens[i], material.names[i]))  # each camera has names of its own
+    back = [
+        material.names[after]
+        for before, after in pairwise(by_name)
+        if lens[before] == lens[after] and times[after] < times[before]
+    ]
     if 0 < len(back) < 0.2 * len(times):
         found.append(
             Finding(
