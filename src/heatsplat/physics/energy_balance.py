@@ -339,10 +339,8 @@ class Climate:
         """Temperature x at a moment of the record by the full balance, [n], marched from its beginning.
 
         Raises:
-            ValueError: the bodies have two nodes, no end or heat from within, which only ``linear_temperature`` knows.
+            ValueError: the bodies have no end, which only ``linear_temperature`` knows.
         """
         if self.semi_infinite:
-            raise ValueError(
-                "bodies without an end or heated from within are solved about a mean only: use linear_temperature"
-            )
+            raise ValueError("bodies without an end are solved about a mean only: use linear_temperature")
         return marching.temperature(self, surface, time_s)
