@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any
@@ -314,9 +314,13 @@ class EnergyBalance(ThermalModel):
             if surface.inner is not None:
                 values["heat_loss_w_m2"] = exchange * surface.inner
                 if self.indoor_c is not None:
-                    mean_c = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
-                    values["u_value_w_m2_k"] = u_value(values["heat_loss_w_m2"], self.indoor_c, mean_c)
-        return values
+                    values["mean_surface_c"] = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
+        return values | self.quotients(values)
+
+    def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        if "mean_surface_c" not in told:
+            return {}
+        return {"u_value_w_m2_k": u_value(told["heat_loss_w_m2"], self.indoor_c, told["mean_surface_c"])}
 
     def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
         """Convection that is given, which is known to ``convection_error``."""
