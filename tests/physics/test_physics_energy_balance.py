@@ -191,12 +191,19 @@ BEHIND = {  # what surfaces may have behind them
     "core": {"core": CORES},
     "heat": {"inner": WITHIN},
     "core and heat": {"core": CORES, "inner": WITHIN},
+    "room": {"inner": WITHIN},
+    "core and room": {"core": CORES, "inner": WITHIN},
 }
+ROOM_K = 6.0  # above the mean air; it lets out what surfaces take of it, -1 K stays as it is
+
+
+def among(climate: Climate, name: str) -> Climate:
+    return Climate(replace(climate.drivers, room=ROOM_K)) if "room" in name else climate
 
 
 @pytest.mark.parametrize("name", BEHIND)
 def test_what_lies_behind_surfaces_is_that_of_a_stiff_solver(climate, name):
-    surface = bodies(wind=True)._replace(**BEHIND[name])
+    climate, surface = among(climate, name), bodies(wind=True)._replace(**BEHIND[name])
     full = course(climate.stepped_temperature, surface)
     assert (full - solved(climate.drivers, surface, MOMENTS)).abs().max() < 1e-3
     linear = course(climate.linear_temperature, surface)
@@ -230,7 +237,7 @@ def test_a_core_that_hardly_couples_or_follows_at_once_is_no_core(climate):
 @pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
 @pytest.mark.parametrize("name", BEHIND)
 def test_derivatives_are_those_of_the_values_with_what_lies_behind(climate, name, solution):
-    surface, at = bodies(wind=True)._replace(**BEHIND[name]), 40_000.0
+    climate, surface, at = among(climate, name), bodies(wind=True)._replace(**BEHIND[name]), 40_000.0
     values = marching.parameters(surface)
     leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
     getattr(climate, solution)(marching.with_parameters(surface, leaves), at).sum().backward()
@@ -254,6 +261,19 @@ def test_the_sun_on_bodies_without_an_end_is_what_their_table_makes_of_the_same_
     truth = course(level.linear_temperature, surface._replace(normals=None))
     assert truth.max() > 20
     assert (course(beams.linear_temperature, surface) - truth).abs().max() < 0.2  # K, of 60 K in full sun
+
+
+@pytest.mark.parametrize("semi_infinite", [False, True])
+def test_a_room_warms_cold_surfaces_more_and_its_mean_heat_is_that_of_the_mean_surface(climate, semi_infinite):
+    constant, there = (Climate(replace(climate.drivers, room=room), semi_infinite) for room in (None, ROOM_K))
+    surface = bodies(wind=True)._replace(inner=WITHIN)
+    lost, mean = there.mean_heat_from_within(surface), there.mean_temperature(surface)
+    lets = WITHIN > 0
+    torch.testing.assert_close(lost[lets], (WITHIN * (1 - mean / ROOM_K))[lets])
+    torch.testing.assert_close(lost[~lets], WITHIN[~lets])
+    as_constant = constant.mean_temperature(surface._replace(inner=lost))
+    torch.testing.assert_close(as_constant, mean, atol=1e-4, rtol=0)
+    assert constant.mean_heat_from_within(surface) is surface.inner
 
 
 @pytest.mark.parametrize("semi_infinite", [False, True])

@@ -62,9 +62,10 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     light = view * given.light.numpy()[:, None] + (given.beams @ surface.normals.T).clamp(min=0).numpy()
     sky = view * given.sky.numpy()[:, None] + (1 - view) * given.around.numpy()[:, None]
     forcing, air = sun * light + share * sky, given.air.numpy()
+    count, leak = len(rate), np.zeros(len(rate))
     if surface.inner is not None:
         forcing = forcing + surface.inner.numpy()
-    count = len(rate)
+        leak = np.maximum(surface.inner.numpy() / given.room, 0.0) if given.room else leak
     mu, kappa = np.zeros(count), np.zeros(count)
     if surface.core is not None:
         mu, kappa = surface.core.log_rate.exp().numpy(), surface.core.coupling.numpy()
@@ -88,7 +89,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
 
         def slope(t, state, now=now):
             x, y = state[:count], state[count:]
-            a, b, f = now(air, t), now(anomaly, t), now(forcing, t) + kappa * (y - x)
+            a, b, f = now(air, t), now(anomaly, t), now(forcing, t) + kappa * (y - x) - leak * x
             if mean is None:
                 taken = f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x)
             else:
@@ -99,7 +100,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
 
         def jacobian(t, state, now=now):
             gusts, about_x = (now(anomaly, t), state[:count]) if mean is None else (calm, mean)
-            own = (1 - share) * (1 + wind * gusts) + share * (1 + about_x / reference) ** 3 + kappa
+            own = (1 - share) * (1 + wind * gusts) + share * (1 + about_x / reference) ** 3 + kappa + leak
             return np.block([[np.diag(-rate * own), np.diag(rate * kappa)], [np.diag(mu), np.diag(-mu)]])
 
         step = (end - begin) / 4

@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
+from heatsplat.physics.units import celsius
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import NORMALS, Query, Seeds
 from heatsplat.thermal.energy_balance import EnergyBalance
@@ -317,16 +318,26 @@ def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
     assert all((splats[name].grad != 0).all() for name in ("inner_rise", "log_rate"))
     told = model.attributes(splats, Query(time_s=0.0))
     exchange = told["convection_w_m2_k"] / (1 - told["radiation_share"])
-    torch.testing.assert_close(told["heat_loss_w_m2"], 2 * exchange)
+    lets_through = (
+        2 * exchange / (40.0 - celsius(model.reference_k).float())
+    )  # 2 K where a surface is as warm as the mean air
+    torch.testing.assert_close(told["heat_loss_w_m2"], lets_through * (40.0 - told["mean_surface_c"]))
+    torch.testing.assert_close(told["u_value_w_m2_k"], lets_through / (1 + 0.04 * lets_through))
     torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())
     assert (told["u_value_w_m2_k"] > 0.5).all() and not {"time_constant_h", "areal_heat_capacity_kj_m2_k"} & set(told)
     assert "u_value_w_m2_k" not in plain.attributes(without, Query(time_s=0.0))
+    constant, _ = ready(semi_infinite=True, inner=True)
+    told = constant.attributes(splats, Query(time_s=0.0))
+    torch.testing.assert_close(told["heat_loss_w_m2"], 2 * exchange)
+    assert "u_value_w_m2_k" not in told
+    with pytest.raises(SceneError, match="is the mean temperature of the air outside .* leave indoor_c out"):
+        ready(inner=True, indoor_c=round(celsius(model.reference_k).item(), 1))
 
 
 @pytest.mark.parametrize("solution", ["linear", "corrected"])
 def test_a_core_heat_from_within_and_a_known_exchange_go_with_either_solution(solution):
     """Emitted, looked at and learned: all numbers get a gradient, and looking finds what training does."""
-    model, splats = ready(solution=solution, nodes=2, inner=True, exchange=[5.0, 2.5], indoor_c=20.0, shadows=True)
+    model, splats = ready(solution=solution, nodes=2, inner=True, exchange=[5.0, 2.5], indoor_c=60.0, shadows=True)
     trained = {"initial_state", "log_rate", "raw_sun", "inner_rise", "initial_core", "log_core_rate", "log_coupling"}
     assert trained <= set(splats.names) and "sun_seen" in splats
     assert not {"raw_share", "raw_wind"} & set(splats.names)

@@ -40,7 +40,7 @@ class Balance:
         oriented: with normals; without them surfaces lie level.
         shaded: with the share of the beam that reaches them.
         grounded: with light that the ground reflects.
-        heated: with heat f from within.
+        heated: with heat f from within, constant or from a room.
         cored: with a core behind the surface.
         sensitive: derivatives come with values.
     """
@@ -278,7 +278,9 @@ def _forgetting(balance, going, now, decay):
 
 
 @inline
-def _march_group(group, balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
+def _march_group(
+    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found
+):
     """``march`` of LANES Gaussians."""
     count = rows.shape[0]
     body = np.empty((parameters.shape[1], LANES), parameters.dtype)
@@ -298,7 +300,7 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
     one = nothing + 1.0
     r = exp(load_vector(body, LOG_RATE))
     p, g, v, f, nx, ny, nz = nothing, nothing, nothing, one, nothing, nothing, nothing
-    y, inner, slower, coupling = nothing, nothing, nothing, nothing
+    y, inner, leak, slower, coupling = nothing, nothing, nothing, nothing, nothing
     if radiates(balance):
         p = load_vector(body, share_column(balance))
     if sunny(balance):
@@ -307,6 +309,7 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
         v = load_vector(body, wind_column(balance))
     if heated(balance):
         inner = load_vector(body, inner_column(balance))
+        leak = maximum(inner * indoors, 0.0)
     if cored(balance):
         column = core_column(balance)
         y, coupling = load_vector(body, column), exp(load_vector(body, column + 2))
@@ -344,6 +347,8 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
             sky_1 = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
             sky_d = drivers[AROUND, k + 1] + f * (drivers[SKY, k + 1] - drivers[AROUND, k + 1]) - sky_1
             sky_d = ending * sky_d
+        if heated(balance):
+            fastest = fastest + leak
         if sunny(balance):
             sun_1, sun_d = f * drivers[LIGHT, k], f * drivers[LIGHT, k + 1]
             if grounded(balance):
@@ -383,7 +388,7 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
                 w, steep = power(x, inverse)
                 slope, force, ahead = slope + p * steep, force + p * (sky - w), ahead + p * (sky_2 - w)
             if heated(balance):
-                force, ahead = force + inner, ahead + inner
+                slope, force, ahead = slope + leak, force + inner - leak * x, ahead + inner - leak * x
             decay, phi, second, third = _functions(balance, slope, rh, slower, coupling)
             follows = slower * (x - y)
             if cored(balance):
@@ -414,7 +419,7 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
                 if sunny(balance):
                     change = change + g * sun_2
                 if heated(balance):
-                    change = change + inner
+                    change = change + inner - leak * new
                 before, after = (rh * (phi[0] - second[0]), nothing), (rh * second[0], nothing)
                 if cored(balance):
                     exchanged = coupling * (new - new_y)
@@ -448,7 +453,12 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
                         gust, gust_2 = (1.0 - p) * gust, (1.0 - p) * gust_2
                     d_wind = _carried(balance, going, d_wind, decay, before, gust, after, gust_2)
                 if heated(balance):
-                    d_inner = _carried(balance, going, d_inner, decay, before, one, after, one)
+                    lets_out = inner * indoors >= 0.0
+                    warms, warms_2 = (
+                        select(lets_out, one - indoors * x, one),
+                        select(lets_out, one - indoors * new, one),
+                    )
+                    d_inner = _carried(balance, going, d_inner, decay, before, warms, after, warms_2)
             x, y = select(going, new, x), select(going, new_y, y)
             passed = later
         if not aside:
@@ -484,11 +494,11 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
 
 
 @kernel
-def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
+def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found):
     """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
-    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x)) + f + κ (y - x)] and dy/dt = μ (x - y), with w from ``power``, c =
-    (1 - p) (1 + v wind_anomaly), G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky + (1 - a) around.
+    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x)) + f - max(f i, 0) x + κ (y - x)] and dy/dt = μ (x - y), with w from
+    ``power``, c = (1 - p) (1 + v wind_anomaly), G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky + (1 - a) around.
     Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal
     substeps, as many as the surface is fast. Lanes are Gaussians; what is found of one depends neither on the others nor on
     the other moments.
@@ -505,6 +515,7 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
         times: [T] float64 samples.
         drivers: [9, T] float64.
         reference: R in kelvin.
+        indoors: i in 1/K, of 1 over the temperature of the room behind, above the reference; 0 where f is constant.
         moments: [F] float64, increasing, within the samples from ``first`` on.
         found: [F, N, 1] filled with x, [F, N, 2] with x and y; or, of a balance that is sensitive, [F, N, 1 + Q] with x and its
             derivatives by the parameters before the normal.
@@ -512,5 +523,5 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
     parallel_for(
         _march_group,
         (rows.shape[0] + LANES - 1) // LANES,
-        (balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found),
+        (balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found),
     )

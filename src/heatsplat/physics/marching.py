@@ -103,6 +103,7 @@ def march(
             climate.drivers.times_s.numpy(),
             climate.rows.numpy(),
             climate.drivers.reference_k,
+            0.0 if climate.drivers.room is None else 1.0 / climate.drivers.room,
             moments.numpy(),
             here.numpy(),
         )

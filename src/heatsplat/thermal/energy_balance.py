@@ -19,7 +19,7 @@ from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, S
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.walls import CONVECTION, u_value
+from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
@@ -71,7 +71,8 @@ class EnergyBalance(ThermalModel):
 
     Bodies without an end (``semi_infinite``) are massive walls and ground that the record does not heat through: one number
     in the place of the rate, a = (H/b)², tells their effusivity b. ``inner`` adds a constant heat from within, q/H for each
-    Gaussian, such as a heated room behind a wall: heat that is lost, and with ``indoor_c`` a U-value.
+    Gaussian. With ``indoor_c`` it comes of a room of this temperature, as much as the wall between lets through: then q/H is
+    that of a surface as warm as the mean air, and tells a U-value.
 
     Identifiable: α/C and h/C, and e/C by night, with the state at the start of the record where it is still remembered
     when images begin; the share of wind in h where the wind changes while surface and air differ. Not identifiable: the
@@ -108,7 +109,8 @@ class EnergyBalance(ThermalModel):
             the convention of building physics, 4 and 4.
         convection_error: relative standard deviation of convection that is given, for intervals of what is learned; 0 takes it
             for exact.
-        indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
+        indoor_c: temperature of the rooms behind walls in °C: heat from within comes of them by a constant conductance, which
+            tells a U-value in ``attributes``. None: heat from within is constant, and there is no U-value.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
         shadows: whether what stands in the way of the sun casts shadows (``Query.exposure``).
@@ -312,7 +314,7 @@ class EnergyBalance(ThermalModel):
             if self._sunlit:
                 values["absorptivity"] = exchange * surface.sun / 1000.0
             if surface.inner is not None:
-                values["heat_loss_w_m2"] = exchange * surface.inner
+                values["heat_loss_w_m2"] = exchange * self.climate.mean_heat_from_within(surface)
                 if self.indoor_c is not None:
                     values["mean_surface_c"] = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
         return values | self.quotients(values)
@@ -440,8 +442,9 @@ class EnergyBalance(ThermalModel):
         if self._convection is not None:
             effects["convection"]["given"] = "{:g} + {:g} v W/(m² K) in wind v".format(*self._convection)
         if self.inner:
-            effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
-        parts: dict[str, Any] = {}
+            warm = "constant" if self.indoor_c is None else f"of rooms at {self.indoor_c:g} °C"
+            effects["convection"]["from_within"] = f"{warm}, q/H of each Gaussian"
+        parts: dict[str, Any] = {"room": self._room()}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
         if up is not None:
             self._surroundings(weather, up, parts, effects)
@@ -474,6 +477,18 @@ class EnergyBalance(ThermalModel):
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
         return drivers, effects
+
+    def _room(self) -> float | None:
+        """Temperature behind walls above the reference."""
+        if self.indoor_c is None:
+            return None
+        air_c = celsius(self.reference_k).item()
+        if abs(self.indoor_c - air_c) < LEAST_K:
+            raise SceneError(
+                f"indoor_c={self.indoor_c:g} is the mean temperature of the air outside ({air_c:.1f} °C) within {LEAST_K:g} K: "
+                "nothing then tells what walls let through; leave indoor_c out"
+            )
+        return self.indoor_c - air_c
 
     def _surroundings(self, weather: Weather, up: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> None:
         """Adds what comes of the scene's own geometry to the drivers, and tells the effects of it."""
