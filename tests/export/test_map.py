@@ -65,6 +65,28 @@ def test_attributes_that_few_of_a_pixel_lack_are_those_of_the_others(two_plates,
     assert np.isfinite(unknown[0]) and np.isnan(unknown[1])
 
 
+def test_a_quotient_is_that_of_what_a_pixel_mixes(two_plates, tmp_path, monkeypatch):
+    """Not the mean of what each of two Gaussians would have alone."""
+    seen = two_plates.seen
+    seen = replace(
+        seen,
+        means=torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.0]]),
+        opacities=torch.tensor([0.5, 0.99]),
+        attributes={
+            "loss": torch.tensor([10.0, 30.0]), "driven": torch.tensor([1.0, 2.0]), "u": torch.tensor([10.0, 15.0])
+        },
+    )  # fmt: skip
+    moment = moments(two_plates.module, seen, 600.0)[0]
+    monkeypatch.setattr(moment.module.thermal, "quotients", lambda told: {"u": told["loss"] / told["driven"]})
+    Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep").write(moment, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as found:
+        places = place_of(moment.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(seen.means).tolist()
+        ((_, loss, driven, u),) = found.sample([places[1][:2]])
+    assert u == pytest.approx(loss / driven, rel=1e-5)
+    front = (driven - 2.0) / (1.0 - 2.0)  # share of the one before the other
+    assert 0.3 < front < 0.7 and abs(u - (front * 10.0 + (1 - front) * 15.0)) > 0.2
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -49,7 +49,8 @@ def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Driv
 
 
 def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None) -> torch.Tensor:
-    """Temperatures x [n, F] of surfaces with normals at moments [F] by Radau, one interval of the record at a time.
+    """Temperatures x [n, F] of surfaces with normals, and what is behind them, at moments [F] by Radau, one interval of the
+    record at a time.
 
     Args:
         about: temperatures [n] about which T⁴ and wind are linearised; None solves the full balance.
@@ -61,6 +62,13 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     light = view * given.light.numpy()[:, None] + (given.beams @ surface.normals.T).clamp(min=0).numpy()
     sky = view * given.sky.numpy()[:, None] + (1 - view) * given.around.numpy()[:, None]
     forcing, air = sun * light + share * sky, given.air.numpy()
+    count, leak = len(rate), np.zeros(len(rate))
+    if surface.inner is not None:
+        forcing = forcing + surface.inner.numpy()
+        leak = np.maximum(surface.inner.numpy() / given.room, 0.0) if given.room else leak
+    mu, kappa = np.zeros(count), np.zeros(count)
+    if surface.core is not None:
+        mu, kappa = surface.core.log_rate.exp().numpy(), surface.core.coupling.numpy()
     anomaly = np.zeros_like(air) if given.wind_anomaly is None else given.wind_anomaly.numpy()
     calm = np.trapezoid(anomaly, times) / (times[-1] - times[0])
     mean = None if about is None else about.numpy()
@@ -69,8 +77,9 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
         return ((reference + x) ** 4 - reference**4) / (4 * reference**3)
 
     ends = np.unique(np.concatenate((times, moments.numpy())))
-    x = surface.start.numpy().copy()
-    found = {ends[0]: x}
+    behind = surface.start if surface.core is None else surface.core.start
+    state = np.concatenate((surface.start.numpy(), behind.numpy()))
+    found = {ends[0]: state[:count]}
     for begin, end in zip(ends[:-1], ends[1:], strict=True):
         k = min(np.searchsorted(times, begin, side="right") - 1, len(times) - 2)
 
@@ -78,21 +87,24 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             part = (t - times[k]) / (times[k + 1] - times[k])
             return series[k] * (1 - part) + series[k + 1] * part
 
-        def slope(t, x, now=now):
-            a, b, f = now(air, t), now(anomaly, t), now(forcing, t)
+        def slope(t, state, now=now):
+            x, y = state[:count], state[count:]
+            a, b, f = now(air, t), now(anomaly, t), now(forcing, t) + kappa * (y - x) - leak * x
             if mean is None:
-                return rate * (f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x))
-            steep = (1 + mean / reference) ** 3
-            convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
-            return rate * (f + (1 - share) * convected - share * (radiated(mean) + steep * (x - mean)))
+                taken = f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x)
+            else:
+                steep = (1 + mean / reference) ** 3
+                convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
+                taken = f + (1 - share) * convected - share * (radiated(mean) + steep * (x - mean))
+            return np.concatenate((rate * taken, mu * (x - y)))
 
-        def jacobian(t, x, now=now):
-            if mean is None:
-                steep = (1 + x / reference) ** 3
-                return np.diag(-rate * ((1 - share) * (1 + wind * now(anomaly, t)) + share * steep))
-            return np.diag(-rate * ((1 - share) * (1 + wind * calm) + share * (1 + mean / reference) ** 3))
+        def jacobian(t, state, now=now):
+            gusts, about_x = (now(anomaly, t), state[:count]) if mean is None else (calm, mean)
+            own = (1 - share) * (1 + wind * gusts) + share * (1 + about_x / reference) ** 3 + kappa + leak
+            return np.block([[np.diag(-rate * own), np.diag(rate * kappa)], [np.diag(mu), np.diag(-mu)]])
 
         step = (end - begin) / 4
-        x = solve_ivp(slope, (begin, end), x, "Radau", rtol=1e-7, atol=1e-6, jac=jacobian, first_step=step).y[:, -1]
-        found[end] = x
+        options = {"rtol": 1e-7, "atol": 1e-6, "jac": jacobian, "first_step": step}
+        state = solve_ivp(slope, (begin, end), state, "Radau", **options).y[:, -1]
+        found[end] = state[:count]
     return torch.tensor(np.stack([found[t] for t in moments.numpy()], axis=1))

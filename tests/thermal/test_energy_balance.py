@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
+from heatsplat.physics.units import celsius
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import NORMALS, Query, Seeds
 from heatsplat.thermal.energy_balance import EnergyBalance
@@ -249,12 +250,24 @@ def test_a_night_only_record_works_without_sun():
         ({"normals": "up"}, "normals must be one of seen, level, got 'up'"),
         ({"clip": "soft"}, "clip must be one of"),
         ({"nodes": 3}, "nodes must be one of 1, 2, got '3'"),
-        ({"nodes": 2, "solution": "corrected"}, "nodes=2 is solved about a mean only: give solution=linear"),
-        ({"inner": True, "solution": "corrected"}, "inner is solved about a mean only: give solution=linear"),
+        (
+            {"semi_infinite": True, "solution": "corrected"},
+            "bodies without an end are solved about a mean only: give solution",
+        ),
         ({"nodes": 2, "semi_infinite": True}, "no end or two nodes, not both"),
         ({"convection_error": 1.0}, "convection_error must lie in"),
         ({"exchange": "table"}, "exchange must be one of learned, iso_6946"),
         ({"exchange": "iso_6946", "sky": None}, "exchange=iso_6946 is that with sky and wind"),
+        ({"exchange": [5.0, 2.5], "wind": False}, r"exchange=\[5.0, 2.5\] is that with sky and wind"),
+        (
+            {"exchange": 5.0},
+            r"convection of still air in W/\(m² K\), above 0, with what each m/s of wind adds .* got 5.0",
+        ),
+        ({"exchange": [5.0]}, r"such as \[5.0,2.5\]; got \[5.0\]"),
+        ({"exchange": [0.0, 4.0]}, "above 0"),
+        ({"exchange": [5.0, -1.0]}, "exchange must be learned, iso_6946, or"),
+        ({"exchange": [5.0, math.nan]}, "exchange must be learned, iso_6946, or"),
+        ({"exchange": [5.0, 2500.0]}, "both up to 100"),
         ({"indoor_c": 20.0}, "indoor_c tells nothing without heat from within: give inner=true"),
         ({"albedo": 1.0}, r"albedo must lie in \(0, 1\), or be null"),
         ({"shadows": True, "sun": False}, "give sun=true, normals=seen"),
@@ -305,10 +318,61 @@ def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
     assert all((splats[name].grad != 0).all() for name in ("inner_rise", "log_rate"))
     told = model.attributes(splats, Query(time_s=0.0))
     exchange = told["convection_w_m2_k"] / (1 - told["radiation_share"])
-    torch.testing.assert_close(told["heat_loss_w_m2"], 2 * exchange)
+    lets_through = (
+        2 * exchange / (40.0 - celsius(model.reference_k).float())
+    )  # 2 K where a surface is as warm as the mean air
+    torch.testing.assert_close(told["heat_loss_w_m2"], lets_through * (40.0 - told["mean_surface_c"]))
+    torch.testing.assert_close(told["u_value_w_m2_k"], lets_through / (1 + 0.04 * lets_through))
     torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())
     assert (told["u_value_w_m2_k"] > 0.5).all() and not {"time_constant_h", "areal_heat_capacity_kj_m2_k"} & set(told)
     assert "u_value_w_m2_k" not in plain.attributes(without, Query(time_s=0.0))
+    constant, _ = ready(semi_infinite=True, inner=True)
+    told = constant.attributes(splats, Query(time_s=0.0))
+    torch.testing.assert_close(told["heat_loss_w_m2"], 2 * exchange)
+    assert "u_value_w_m2_k" not in told
+    with pytest.raises(SceneError, match="is the mean temperature of the air outside .* leave indoor_c out"):
+        ready(inner=True, indoor_c=round(celsius(model.reference_k).item(), 1))
+
+
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_a_core_heat_from_within_and_a_known_exchange_go_with_either_solution(solution):
+    """Emitted, looked at and learned: all numbers get a gradient, and looking finds what training does."""
+    model, splats = ready(solution=solution, nodes=2, inner=True, exchange=[5.0, 2.5], indoor_c=60.0, shadows=True)
+    trained = {"initial_state", "log_rate", "raw_sun", "inner_rise", "initial_core", "log_core_rate", "log_coupling"}
+    assert trained <= set(splats.names) and "sun_seen" in splats
+    assert not {"raw_share", "raw_wind"} & set(splats.names)
+    assert ("marched_at" in splats) == (solution == "corrected")
+    with torch.no_grad():
+        splats["inner_rise"].fill_(2.0 / 60.0)
+        splats["log_coupling"].fill_(math.log(3.0))
+        looked = model.temperature(splats, 12 * HOUR)  # a training frame
+        splats["inner_rise"].fill_(0.0)
+        assert ((looked - model.temperature(splats, 12 * HOUR)) > 0.3).all()  # another scene, not what was kept
+        splats["inner_rise"].fill_(2.0 / 60.0)
+    shown = model.features(splats, Query(time_s=12 * HOUR))
+    torch.testing.assert_close(shown[:, 0] * 60 + 273.15, looked, atol=2e-3, rtol=0)
+    shown.sum().backward()
+    for name in trained:
+        assert (splats[name].grad != 0).all(), name
+    between = model.temperature(splats, 12.3 * HOUR)  # no frame: marched for itself
+    with torch.no_grad():
+        torch.testing.assert_close(model.temperature(splats, 12.3 * HOUR), between, atol=2e-3, rtol=0)
+        with model.doubts()["convection"]():  # not the course that was kept for the exchange as given
+            assert ((model.temperature(splats, 12.3 * HOUR) - between).abs() > 0.02).all()
+        torch.testing.assert_close(model.temperature(splats, 12.3 * HOUR), between, atol=2e-3, rtol=0)
+
+
+def test_what_is_mixed_has_the_quotient_of_means_and_not_the_mean_of_quotients():
+    model, splats = ready(inner=True, indoor_c=40.0)
+    with torch.no_grad():
+        splats["inner_rise"].copy_(torch.linspace(0.5, 4.0, 6) / 60.0)
+    told = model.attributes(splats, Query(time_s=0.0))
+    mixed = {name: values.mean() for name, values in told.items()}
+    found = model.quotients(mixed)["u_value_w_m2_k"]
+    loss, driving = mixed["heat_loss_w_m2"], 40.0 - mixed["mean_surface_c"]
+    torch.testing.assert_close(found, loss / (driving + 0.04 * loss))
+    assert (found - mixed["u_value_w_m2_k"]).abs() > 1e-3
+    assert not ready(inner=True)[0].quotients({"heat_loss_w_m2": loss})
 
 
 def test_an_exchange_by_convention_is_not_learned():
@@ -324,3 +388,19 @@ def test_an_exchange_by_convention_is_not_learned():
     assert not ready()[0].doubts() and not ready(exchange="iso_6946", convection_error=0.0)[0].doubts()
     with pytest.raises(SceneError, match="exchange=iso_6946 needs wind_m_s"):
         ready(scene(weather(wind_m_s=None)), exchange="iso_6946")
+
+
+def test_convection_that_was_measured_is_what_the_balance_has():
+    model, splats = ready(exchange=[5.0, 2.5], emissivity=0.9)
+    told, wind = model.attributes(splats, Query(time_s=0.0)), model.mean_wind.item()
+    torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 5 + 2.5 * wind), rtol=1e-5, atol=0)
+    torch.testing.assert_close(told["wind_share"], torch.full((6,), 2.5 * wind / (5 + 2.5 * wind)), rtol=1e-5, atol=0)
+    assert model.effects()["convection"]["given"] == "5 + 2.5 v W/(m² K) in wind v"
+    assert model.doubts() and not ready(exchange=[5.0, 2.5], convection_error=0.0)[0].doubts()
+    by_name, splats = ready(exchange="iso_6946")
+    same = ready(exchange=[4, 4])[0]
+    torch.testing.assert_close(same.temperature(splats, 9 * HOUR), by_name.temperature(splats, 9 * HOUR))
+    calm, splats = ready(scene(weather(wind_m_s=None)), exchange=[8.0, 0.0])  # asks for no wind
+    told = calm.attributes(splats, Query(time_s=0.0))
+    torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 8.0))
+    assert "wind_share" not in told

@@ -15,7 +15,7 @@ import numpy as np
 from heatsplat.kernels.compilation import inline, kernel
 from heatsplat.kernels.compile_time import compile_time, constant
 from heatsplat.kernels.scheduling import parallel_for
-from heatsplat.kernels.simd import LANES, bits, exp, floor, load_vector, maximum, minimum, select, store_vector
+from heatsplat.kernels.simd import LANES, bits, exp, floor, load_vector, maximum, minimum, select, sqrt, store_vector
 
 BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
@@ -40,6 +40,8 @@ class Balance:
         oriented: with normals; without them surfaces lie level.
         shaded: with the share of the beam that reaches them.
         grounded: with light that the ground reflects.
+        heated: with heat f from within, constant or from a room.
+        cored: with a core behind the surface.
         sensitive: derivatives come with values.
     """
 
@@ -49,6 +51,8 @@ class Balance:
     oriented: bool
     shaded: bool
     grounded: bool
+    heated: bool
+    cored: bool
     sensitive: bool
 
     @property
@@ -67,16 +71,28 @@ class Balance:
         return self.sun_column + self.sunny
 
     @property
-    def normal_column(self) -> int:
-        """First of the three columns of the unit normal, behind which comes f, the share of sky in what a surface sees."""
+    def inner_column(self) -> int:
+        """Column of f."""
         return self.wind_column + self.windy
+
+    @property
+    def core_column(self) -> int:
+        """First of the three columns of the core: y at the start, log μ and log κ."""
+        return self.inner_column + self.heated
+
+    @property
+    def normal_column(self) -> int:
+        """First of the three columns of the unit normal, behind which comes the share of sky in what a surface sees."""
+        return self.core_column + 3 * self.cored
 
 
 radiates, sunny = constant("radiates"), constant("sunny")
 windy, oriented, sensitive = constant("windy"), constant("oriented"), constant("sensitive")
 shaded, grounded = constant("shaded"), constant("grounded")
+heated, cored = constant("heated"), constant("cored")
 share_column, sun_column = constant("share_column"), constant("sun_column")
-wind_column, normal_column = constant("wind_column"), constant("normal_column")
+wind_column, inner_column = constant("wind_column"), constant("inner_column")
+core_column, normal_column = constant("core_column"), constant("normal_column")
 
 
 @inline
@@ -191,7 +207,80 @@ def weights_of_lanes(y):
 
 
 @inline
-def _march_group(group, balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
+def _bent(balance, second, third, wind_d, air_d, x_d, p, steep, w_d):
+    """What a substep adds for products of wind and air, of wind and x, and for T⁴, by changes over the substep."""
+    rest, bent = x_d * 0.0, 2.0 * third
+    if windy(balance):
+        rest = wind_d * (air_d * (bent - second) - x_d * (bent - 0.5 * second))
+    if radiates(balance):
+        rest = rest + bent * p * (steep * x_d - w_d)
+    return rest
+
+
+@inline
+def _of_both(fast, slow, own, toward, back):
+    """A function of the balance's matrix by its values at both decays: what surface and core get of the surface's, then of the
+    core's."""
+    apart = slow - fast
+    return slow - own * apart, back * apart, toward * apart, fast + own * apart
+
+
+@inline
+def _functions(balance, stiffness, rh, slower, coupling):
+    """e^-M, φ1, φ2 and φ3 of a substep, each as four numbers (``_of_both``); of bodies of one node the first alone counts.
+
+    M in units of ``rh`` is [[s + κ, -κ], [-m, m]] with stiffness s and m = μ / r, whose eigenvalues are real and positive.
+    """
+    nothing = stiffness * 0.0
+    if cored(balance):
+        leaving = stiffness + coupling
+        coupled, following = coupling / leaving, slower / leaving
+        root = sqrt((1.0 - following) * (1.0 - following) + 4.0 * following * coupled)
+        own = 0.5 * (1.0 - following + root) / root
+        fast = 0.5 * (1.0 + following + root)
+        quick, late = weights_of_lanes(fast * leaving * rh), weights_of_lanes(stiffness * rh * following / fast)
+        toward, back = coupled / root, following / root
+        return (
+            _of_both(quick[0], late[0], own, toward, back),
+            _of_both(quick[1], late[1], own, toward, back),
+            _of_both(quick[2], late[2], own, toward, back),
+            _of_both(quick[3], late[3], own, toward, back),
+        )
+    decay, phi, second, third = weights_of_lanes(stiffness * rh)
+    return (
+        (decay, nothing, nothing, nothing),
+        (phi, nothing, nothing, nothing),
+        (second, nothing, nothing, nothing),
+        (third, nothing, nothing, nothing),
+    )
+
+
+@inline
+def _carried(balance, going, now, decay, before, first, after, last):
+    """Derivatives of surface and core after a substep that drives them by ``first`` at its beginning and ``last`` at its end."""
+    surface, core = decay[0] * now[0] + before[0] * first + after[0] * last, now[1]
+    if cored(balance):
+        surface = surface + decay[2] * now[1]
+        core = select(going, decay[1] * now[0] + decay[3] * now[1] + before[1] * first + after[1] * last, core)
+    return select(going, surface, now[0]), core
+
+
+@inline
+def _forgetting(balance, going, now, decay):
+    """Derivatives by a start after a substep. Nothing of it is left long before digits run out; what is below them is slow to
+    compute with."""
+    surface, core = select(now[0] > FORGOTTEN, now[0], 0.0), now[1]
+    left = decay[0] * surface
+    if cored(balance):
+        core = select(core > FORGOTTEN, core, 0.0)
+        left, core = left + decay[2] * core, select(going, decay[1] * surface + decay[3] * core, core)
+    return select(going, left, now[0]), core
+
+
+@inline
+def _march_group(
+    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found
+):
     """``march`` of LANES Gaussians."""
     count = rows.shape[0]
     body = np.empty((parameters.shape[1], LANES), parameters.dtype)
@@ -211,17 +300,27 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
     one = nothing + 1.0
     r = exp(load_vector(body, LOG_RATE))
     p, g, v, f, nx, ny, nz = nothing, nothing, nothing, one, nothing, nothing, nothing
+    y, inner, leak, slower, coupling = nothing, nothing, nothing, nothing, nothing
     if radiates(balance):
         p = load_vector(body, share_column(balance))
     if sunny(balance):
         g = load_vector(body, sun_column(balance))
     if windy(balance):
         v = load_vector(body, wind_column(balance))
+    if heated(balance):
+        inner = load_vector(body, inner_column(balance))
+        leak = maximum(inner * indoors, 0.0)
+    if cored(balance):
+        column = core_column(balance)
+        y, coupling = load_vector(body, column), exp(load_vector(body, column + 2))
+        slower = exp(load_vector(body, column + 1) - load_vector(body, LOG_RATE))
     if oriented(balance):
         column = normal_column(balance)
         f = load_vector(body, column + 3)
         nx, ny, nz = load_vector(body, column), load_vector(body, column + 1), load_vector(body, column + 2)
-    d_start, d_rate, d_share, d_sun, d_wind = one, nothing, nothing, nothing, nothing
+    still = nothing, nothing
+    d_start, d_rate, d_share, d_sun, d_wind = (one, nothing), still, still, still, still
+    d_inner, d_core, d_slower, d_coupling = still, (nothing, one), still, still
     k, moment, inverse = first, 0, 1.0 / reference
     while moment < moments.shape[0]:
         # To the end of the interval; to a moment within it on the way, after which the state is that of before.
@@ -231,7 +330,7 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
         if aside:
             ending = (moments[moment] - times[k]) / interval
         seconds = interval * ending
-        kept, kept_start, kept_rate, kept_share, kept_sun, kept_wind = x, d_start, d_rate, d_share, d_sun, d_wind
+        kept = x, y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling
         # Drivers at its beginning, and what they change until its end.
         air_1, air_d = drivers[AIR, k], ending * (drivers[AIR, k + 1] - drivers[AIR, k])
         wind_1, wind_d, sky_1, sky_d, sun_1, sun_d = 0.0, 0.0, nothing, nothing, nothing, nothing
@@ -248,6 +347,8 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
             sky_1 = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
             sky_d = drivers[AROUND, k + 1] + f * (drivers[SKY, k + 1] - drivers[AROUND, k + 1]) - sky_1
             sky_d = ending * sky_d
+        if heated(balance):
+            fastest = fastest + leak
         if sunny(balance):
             sun_1, sun_d = f * drivers[LIGHT, k], f * drivers[LIGHT, k + 1]
             if grounded(balance):
@@ -286,18 +387,28 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
                 sky, sky_2 = sky_1 + passed * sky_d, sky_1 + later * sky_d
                 w, steep = power(x, inverse)
                 slope, force, ahead = slope + p * steep, force + p * (sky - w), ahead + p * (sky_2 - w)
-            decay, phi, second, third = weights_of_lanes(slope * rh)
-            new = x + rh * (phi * force + second * (ahead - force))
+            if heated(balance):
+                slope, force, ahead = slope + leak, force + inner - leak * x, ahead + inner - leak * x
+            decay, phi, second, third = _functions(balance, slope, rh, slower, coupling)
+            follows = slower * (x - y)
+            if cored(balance):
+                force, ahead = force - coupling * (x - y), ahead - coupling * (x - y)
+            new, new_y = x + rh * (phi[0] * force + second[0] * (ahead - force)), y
+            if cored(balance):
+                new = new + rh * phi[2] * follows
+                new_y = y + rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
             w_2 = w
             if windy(balance) or radiates(balance):
                 # What is not linear in time or in x: the products of wind and air, and of wind and x, and T⁴.
-                rest, bent = nothing, 2.0 * third
-                if windy(balance):
-                    rest = (c_2 - c) * ((air_2 - air) * (bent - second) - (new - x) * (bent - 0.5 * second))
+                linear, w_2 = new, w
                 if radiates(balance):
                     w_2, _ = power(new, inverse)
-                    rest = rest + bent * p * (steep * (new - x) - (w_2 - w))
-                new = new + rh * rest
+                new = new + rh * _bent(
+                    balance, second[0], third[0], c_2 - c, air_2 - air, linear - x, p, steep, w_2 - w
+                )
+                if cored(balance):
+                    rest = _bent(balance, second[1], third[1], c_2 - c, air_2 - air, linear - x, p, steep, w_2 - w)
+                    new_y = new_y + rh * rest
             if sensitive(balance):
                 # The linearised balance, along the trajectory from its beginning to its end. Decays at the slope of its
                 # beginning, which takes 0.2 % from what derivatives are, and no second exponential.
@@ -307,38 +418,71 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
                     change = change + p * (sky_2 - w_2)
                 if sunny(balance):
                     change = change + g * sun_2
-                before, after = rh * (phi - second), rh * second
-                d_rate = select(going, decay * d_rate + before * force + after * change, d_rate)
-                # Nothing of the start is left long before digits run out; what is below them is slow to compute with.
-                d_start = select(going, select(d_start > FORGOTTEN, decay * d_start, 0.0), d_start)
+                if heated(balance):
+                    change = change + inner - leak * new
+                before, after = (rh * (phi[0] - second[0]), nothing), (rh * second[0], nothing)
+                if cored(balance):
+                    exchanged = coupling * (new - new_y)
+                    change = change - exchanged
+                    before, after = (before[0], rh * (phi[1] - second[1])), (after[0], rh * second[1])
+                    sooner, later_on = (
+                        (rh * (phi[2] - second[2]), rh * (phi[3] - second[3])),
+                        (rh * second[2], rh * second[3]),
+                    )
+                    d_core = _forgetting(balance, going, d_core, decay)
+                    d_slower = _carried(
+                        balance, going, d_slower, decay, sooner, follows, later_on, slower * (new - new_y)
+                    )
+                    d_coupling = _carried(
+                        balance, going, d_coupling, decay, before, -coupling * (x - y), after, -exchanged
+                    )
+                d_rate = _carried(balance, going, d_rate, decay, before, force, after, change)
+                d_start = _forgetting(balance, going, d_start, decay)
                 if radiates(balance):
                     calm, calm_2 = air - x, air_2 - new
                     if windy(balance):
                         calm, calm_2 = calm * (1.0 + v * wind), calm_2 * (1.0 + v * wind_2)
-                    lean = before * (sky - w - calm) + after * (sky_2 - w_2 - calm_2)
-                    d_share = select(going, decay * d_share + lean, d_share)
+                    d_share = _carried(
+                        balance, going, d_share, decay, before, sky - w - calm, after, sky_2 - w_2 - calm_2
+                    )
                 if sunny(balance):
-                    d_sun = select(going, decay * d_sun + before * sun + after * sun_2, d_sun)
+                    d_sun = _carried(balance, going, d_sun, decay, before, sun, after, sun_2)
                 if windy(balance):
-                    gust = before * wind * (air - x) + after * wind_2 * (air_2 - new)
+                    gust, gust_2 = wind * (air - x), wind_2 * (air_2 - new)
                     if radiates(balance):
-                        gust = (1.0 - p) * gust
-                    d_wind = select(going, decay * d_wind + gust, d_wind)
-            x = select(going, new, x)
+                        gust, gust_2 = (1.0 - p) * gust, (1.0 - p) * gust_2
+                    d_wind = _carried(balance, going, d_wind, decay, before, gust, after, gust_2)
+                if heated(balance):
+                    lets_out = inner * indoors >= 0.0
+                    warms, warms_2 = (
+                        select(lets_out, one - indoors * x, one),
+                        select(lets_out, one - indoors * new, one),
+                    )
+                    d_inner = _carried(balance, going, d_inner, decay, before, warms, after, warms_2)
+            x, y = select(going, new, x), select(going, new_y, y)
             passed = later
         if not aside:
             k += 1
             continue
         store_vector(told, 0, x)
         if sensitive(balance):
-            store_vector(told, 1 + START, d_start)
-            store_vector(told, 1 + LOG_RATE, d_rate)
+            store_vector(told, 1 + START, d_start[0])
+            store_vector(told, 1 + LOG_RATE, d_rate[0])
             if radiates(balance):
-                store_vector(told, 1 + share_column(balance), d_share)
+                store_vector(told, 1 + share_column(balance), d_share[0])
             if sunny(balance):
-                store_vector(told, 1 + sun_column(balance), d_sun)
+                store_vector(told, 1 + sun_column(balance), d_sun[0])
             if windy(balance):
-                store_vector(told, 1 + wind_column(balance), d_wind)
+                store_vector(told, 1 + wind_column(balance), d_wind[0])
+            if heated(balance):
+                store_vector(told, 1 + inner_column(balance), d_inner[0])
+            if cored(balance):
+                column = 1 + core_column(balance)
+                store_vector(told, column, d_core[0])
+                store_vector(told, column + 1, d_slower[0])
+                store_vector(told, column + 2, d_coupling[0])
+        elif cored(balance):
+            store_vector(told, 1, y)
         for j in range(min(LANES, count - group * LANES)):
             for column in range(found.shape[2]):
                 found[moment, rows[group * LANES + j], column] = told[column, j]
@@ -346,20 +490,21 @@ def _march_group(group, balance, first, parameters, seen, slots, rows, times, dr
         if ending == 1.0:
             k += 1
         else:
-            x, d_start, d_rate, d_share, d_sun, d_wind = kept, kept_start, kept_rate, kept_share, kept_sun, kept_wind
+            x, y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling = kept
 
 
 @kernel
-def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found):
+def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found):
     """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
-    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x))] with w from ``power``, c = (1 - p) (1 + v wind_anomaly), G = f light +
-    (1 - f) ground + V max(n · beam, 0) and s = f sky + (1 - f) around. Exponential Rosenbrock steps of third order
-    (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal substeps, as many as the body is fast. Lanes
-    are Gaussians; what is found of one depends neither on the others nor on the other moments.
+    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x)) + f - max(f i, 0) x + κ (y - x)] and dy/dt = μ (x - y), with w from
+    ``power``, c = (1 - p) (1 + v wind_anomaly), G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky + (1 - a) around.
+    Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal
+    substeps, as many as the surface is fast. Lanes are Gaussians; what is found of one depends neither on the others nor on
+    the other moments.
 
     Args:
-        balance: the effects that there are; without an effect its terms are left out, and with f = 1 where surfaces lie
+        balance: the effects that there are; without an effect its terms are left out, and with a = 1 where surfaces lie
             level.
         first: sample from which they start.
         parameters: [n, P] x at that sample in kelvin above the reference, log r, then those of ``balance``; float32 or
@@ -370,12 +515,13 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
         times: [T] float64 samples.
         drivers: [9, T] float64.
         reference: R in kelvin.
+        indoors: i in 1/K, of 1 over the temperature of the room behind, above the reference; 0 where f is constant.
         moments: [F] float64, increasing, within the samples from ``first`` on.
-        found: [F, N, 1] filled with x; or, of a balance that is sensitive, [F, N, 1 + Q] with its derivatives by the
-            parameters before the normal behind it.
+        found: [F, N, 1] filled with x, [F, N, 2] with x and y; or, of a balance that is sensitive, [F, N, 1 + Q] with x and its
+            derivatives by the parameters before the normal.
     """
     parallel_for(
         _march_group,
         (rows.shape[0] + LANES - 1) // LANES,
-        (balance, first, parameters, seen, slots, rows, times, drivers, reference, moments, found),
+        (balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found),
     )

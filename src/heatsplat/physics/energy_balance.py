@@ -31,7 +31,10 @@ looks at the same tables, nothing is stepped.
 A body without an end (massive wall, ground) takes the heat in by its effusivity b = √(k ρ c), and a = (H / b)² in 1/s stands
 in the place of r: it follows the same drivers, through the table of ``responses.SemiInfiniteTable``.
 
-A constant heat q from within (a heated room behind a wall) adds f = q / H, in kelvin, to the drivers.
+A constant heat q from within (a heated room behind a wall) adds f = q / H, in kelvin, to the drivers. Where the temperature ρ
+of that room is known (above the reference), heat comes of it by a constant conductance instead, f (1 - x/ρ) with f what it
+is at x = 0: a light wall lets out a tenth more by night than in the mean of the day. Heat that goes the other way (ground)
+stays constant.
 
 **Convention:** kelvin above the reference, kW/m², seconds; every driver is linear between its samples.
 """
@@ -128,7 +131,7 @@ class Surface(NamedTuple):
         wind: v, or None where wind is not known.
         normals: [n, 3] unit vectors, or None for surfaces that lie level.
         core: what lies behind, or None for bodies of one node.
-        inner: f in kelvin, or None where nothing is heated from within.
+        inner: f in kelvin (at x = 0 where there is a room), or None where nothing is heated from within.
         exposure: what hides sun and sky from surfaces with normals.
     """
 
@@ -159,6 +162,7 @@ class Drivers:
         up: [3], or None where all surfaces lie level.
         ground: light that comes back from level ground, or None where it is black.
         ways: [D, 3] directions of the sun for which shadows are known, or None.
+        room: ρ of the air behind walls, not 0, or None: heat from within is constant.
     """
 
     times_s: Tensor
@@ -172,6 +176,7 @@ class Drivers:
     up: Tensor | None = None
     ground: Tensor | None = None
     ways: Tensor | None = None
+    room: float | None = None
 
 
 def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
@@ -256,6 +261,23 @@ class Climate:
         windy = 1 + surface.wind * self.wind_anomaly_mean
         return windy if calm is None else calm * windy
 
+    def _leak(self, surface: Surface) -> Tensor | None:
+        """Conductance to the room over H, [n]; None where heat from within is constant."""
+        room = self.drivers.room
+        return None if surface.inner is None or room is None else (surface.inner / room).clamp(min=0.0)
+
+    def _stiffness(self, surface: Surface) -> Tensor | None:
+        """``_convection`` with what leaks from the room; None where neither is there, and it is 1."""
+        convection, leak = self._convection(surface), self._leak(surface)
+        if leak is None:
+            return convection
+        return leak + (1.0 if convection is None else convection)
+
+    def mean_heat_from_within(self, surface: Surface) -> Tensor:
+        """Mean of the record of q / H in kelvin, [n]; of surfaces with heat from within."""
+        leak = self._leak(surface)
+        return surface.inner if leak is None else surface.inner - leak * self.mean_temperature(surface)
+
     def mean_temperature(self, surface: Surface) -> Tensor:
         """The temperature x at which the mean balance of the record is even, [n]; differentiable.
 
@@ -267,12 +289,12 @@ class Climate:
             beam = beam * seen.mean(surface.normals)
         means = self.means.to(surface.log_rate)
         if surface.share is None:
-            forced, convection = self.forcing(surface, means, beam, 0.0), self._convection(surface)
+            forced, stiffness = self.forcing(surface, means, beam, 0.0), self._stiffness(surface)
             forced = forced if surface.inner is None else forced + surface.inner
-            return forced if convection is None else forced / convection
+            return forced if stiffness is None else forced / stiffness
 
         def step(x: Tensor, surface: Surface) -> Tensor:
-            stiffness = self._convection(surface)
+            stiffness = self._stiffness(surface)
             slope = stiffness.detach() + surface.share.detach() * (1 + x.detach() / self.drivers.reference_k) ** 3
             radiated = surface.share * power_excess(x, self.drivers.reference_k)
             forced = self.forcing(surface, means, beam, 0.0)
@@ -288,7 +310,7 @@ class Climate:
 
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
-        stiffness = self._convection(surface)
+        stiffness = self._stiffness(surface)
         mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), surface.inner
         if surface.share is not None:
             steep = (1 + mean / self.drivers.reference_k) ** 3
@@ -339,10 +361,8 @@ class Climate:
         """Temperature x at a moment of the record by the full balance, [n], marched from its beginning.
 
         Raises:
-            ValueError: the bodies have two nodes, no end or heat from within, which only ``linear_temperature`` knows.
+            ValueError: the bodies have no end, which only ``linear_temperature`` knows.
         """
         if self.semi_infinite:
-            raise ValueError(
-                "bodies without an end or heated from within are solved about a mean only: use linear_temperature"
-            )
+            raise ValueError("bodies without an end are solved about a mean only: use linear_temperature")
         return marching.temperature(self, surface, time_s)

@@ -26,23 +26,35 @@ if TYPE_CHECKING:
     from heatsplat.physics.energy_balance import Climate, Surface
 
 CHANGE = 0.05  # of a parameter, in its unit below, at which a surface is marched anew
-UNITS = {"start": 40.0, "log_rate": 1.0, "share": 0.5, "sun": 40.0, "wind": 0.5}  # K, 1, 1, K m²/kW, 1
+UNITS = {
+    "start": 40.0, "log_rate": 1.0, "share": 0.5, "sun": 40.0, "wind": 0.5, "inner": 40.0,  # K, 1, 1, K m²/kW, 1, K
+    "core_start": 40.0, "core_log_rate": 1.0, "log_coupling": 1.0,  # K, 1, 1
+}  # fmt: skip
 KEPT_BYTES = 4 << 30  # of tables of all moments; what needs more is marched for every view
 COURSE_BYTES = 256 << 20  # of states at samples; what needs more keeps only some of the samples
 
 
-def learned(surface: Surface) -> Tensor:
-    """The parameters that the kernel knows derivatives by, [n, Q]; those of effects that are off have no column.
+def parameters(surface: Surface) -> dict[str, Tensor]:
+    """What the kernel knows derivatives by, [n] each, of ``UNITS`` and in their order; without those of effects that are off."""
+    found = {name: getattr(surface, name, None) for name in UNITS}
+    if surface.core is not None:
+        start, log_rate, coupling = surface.core
+        found |= {"core_start": start, "core_log_rate": log_rate, "log_coupling": coupling.log()}
+    return {name: value for name, value in found.items() if value is not None}
 
-    Raises:
-        ValueError: the bodies have two nodes or heat from within, which only ``Climate.linear_temperature`` knows.
-    """
-    if surface.core is not None or surface.inner is not None:
-        raise ValueError(
-            "bodies of two nodes or heated from within are solved about a mean only: use linear_temperature"
-        )
-    columns = [getattr(surface, name) for name in UNITS]
-    return torch.stack([column for column in columns if column is not None], dim=1)
+
+def with_parameters(surface: Surface, values: dict[str, Tensor]) -> Surface:
+    """The surface with other ``parameters``, all of them."""
+    own = {name: value for name, value in values.items() if name in surface._fields}
+    if surface.core is not None:
+        core = values["core_start"], values["core_log_rate"], values["log_coupling"].exp()
+        own["core"] = surface.core._make(core)
+    return surface._replace(**own)
+
+
+def learned(surface: Surface) -> Tensor:
+    """``parameters`` as columns, [n, Q]."""
+    return torch.stack(list(parameters(surface).values()), dim=1)
 
 
 def constants(surface: Surface, climate: Climate) -> Tensor | None:
@@ -60,18 +72,18 @@ def march(
     first: int = 0,
     into: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
-    """Temperatures x of n surfaces at moments [F] of the record, with their derivatives by ``learned`` behind: [F, n, 1 + Q].
+    """Temperatures x of n surfaces at moments [F] of the record, with their derivatives by ``parameters`` behind: [F, n, 1 + Q].
 
     Args:
         moments: [F] float64, increasing.
-        sensitive: with derivatives; otherwise [F, n, 1].
-        first: sample of the record at which surfaces have their ``start``.
+        sensitive: with derivatives; otherwise [F, n, 1], of bodies with a core [F, n, 2] with y behind.
+        first: sample of the record at which surfaces and cores have their ``start``.
         into: a table [F, N, ...] and the rows [n] of it that are filled in place of a new one.
     """
     given, rest = learned(surface).detach(), constants(surface, climate)
     order = given[:, kernels.LOG_RATE].argsort()  # neighbours take as many substeps
-    parameters = given if rest is None else torch.cat((given, rest.to(given)), dim=1)
-    width = 1 + given.shape[1] if sensitive else 1
+    columns = given if rest is None else torch.cat((given, rest.to(given)), dim=1)
+    width = 1 + given.shape[1] if sensitive else 1 + (surface.core is not None)
     table, rows = into if into is not None else (given.new_empty(len(moments), len(given), width), None)
     own = rows[order] if rows is not None else order
     here = table if table.device.type == "cpu" else table.new_empty(len(moments), len(given), width, device="cpu")
@@ -79,17 +91,19 @@ def march(
     if len(own):
         has = [value is not None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
         has += [surface.exposure.sun is not None, climate.drivers.ground is not None]
+        has += [surface.inner is not None, surface.core is not None]
         seen = given.new_empty(len(given), 0) if surface.exposure.sun is None else surface.exposure.sun.to(given)
         kernels.march(
             kernels.Balance(*has, sensitive),
             first,
-            parameters[order].cpu().contiguous().numpy(),
+            columns[order].cpu().contiguous().numpy(),
             seen[order].detach().cpu().contiguous().numpy(),
             climate.slots.numpy(),
             numbered.cpu().numpy(),
             climate.drivers.times_s.numpy(),
             climate.rows.numpy(),
             climate.drivers.reference_k,
+            0.0 if climate.drivers.room is None else 1.0 / climate.drivers.room,
             moments.numpy(),
             here.numpy(),
         )
@@ -110,10 +124,11 @@ def _first_order(found: Tensor, now: Tensor, then: Tensor) -> Tensor:
 
 
 def rows_of(surface: Surface, ids: Tensor) -> Surface:
-    """Some of n surfaces of one node."""
+    """Some of n surfaces."""
     own = {name: value[ids] for name, value in surface._asdict().items() if isinstance(value, Tensor)}
     exposure = surface.exposure._make(None if value is None else value[ids] for value in surface.exposure)
-    return surface._replace(**own, exposure=exposure)
+    core = surface.core if surface.core is None else surface.core._make(value[ids] for value in surface.core)
+    return surface._replace(**own, exposure=exposure, core=core)
 
 
 def unchanged(before: Sequence[tuple[Tensor, int]], now: Sequence[Tensor]) -> bool:
@@ -156,16 +171,16 @@ class Kept:
             self._known = torch.zeros(len(marched_at), dtype=torch.bool, device=now.device)
             self._marched_at = marched_at.detach().clone()
             self._given = [(tensor, tensor._version) for tensor in given]
-        unit = now.new_tensor([UNITS[name] for name in UNITS if getattr(surface, name) is not None])
+        names = list(parameters(surface))
+        unit = now.new_tensor([UNITS[name] for name in names])
         moved = ((now - self._marched_at[ids]).abs() > CHANGE * unit).any(1)
         for place in (marched_at, self._marched_at):
             place[ids[moved]] = now[moved]
         stale = (moved | ~self._known[ids]).nonzero()[:, 0]
         if len(stale):
             rows = ids[stale]
-            names = [name for name in UNITS if getattr(surface, name) is not None]
             columns = dict(zip(names, self._marched_at[rows].unbind(1), strict=True))
-            there = rows_of(surface, stale)._replace(**columns)
+            there = with_parameters(rows_of(surface, stale), columns)
             march(self.climate, there, self.moments_s, into=(self._table, rows))
             self._known[rows] = True
 
@@ -195,9 +210,15 @@ class Course:
 
     def __init__(self, climate: Climate, surface: Surface) -> None:
         self.climate, self.surface = climate, surface
-        samples = len(climate.drivers.times_s) * surface.start.nbytes
-        self._every = math.ceil(samples / COURSE_BYTES)
-        self._states = [surface.start]
+        state = [surface.start] if surface.core is None else [surface.start, surface.core.start]
+        self._states = [torch.stack(state, dim=1)]
+        self._every = math.ceil(len(climate.drivers.times_s) * self._states[0].nbytes / COURSE_BYTES)
+
+    def _from(self, number: int) -> Surface:
+        """The surfaces as they are at one of the states that are kept."""
+        start, *behind = self._states[number].unbind(1)
+        core = self.surface.core._replace(start=behind[0]) if behind else None
+        return self.surface._replace(start=start, core=core)
 
     def temperature(self, time_s: float, ids: Tensor | None = None) -> Tensor:
         """Temperature x at a moment of the record, of all or of the surfaces ``ids``."""
@@ -205,10 +226,9 @@ class Course:
         sample = int(torch.searchsorted(times, time_s, right=True).clamp(1, len(times) - 1)) - 1
         wanted, last = sample // self._every, len(self._states) - 1
         if wanted > last:
-            begins = self.surface._replace(start=self._states[last])
             moments = times[last * self._every :: self._every][1 : wanted - last + 1]
-            self._states += list(march(self.climate, begins, moments, False, last * self._every)[..., 0])
-        now = self.surface._replace(start=self._states[wanted])
+            self._states += list(march(self.climate, self._from(last), moments, False, last * self._every))
+        now = self._from(wanted)
         if ids is not None:
             now = rows_of(now, ids)
         moment = torch.tensor([time_s], dtype=torch.float64)

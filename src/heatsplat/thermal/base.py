@@ -193,6 +193,13 @@ class Heat(nn.Module, ABC):
         """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
         return {}
 
+    def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Those of ``attributes`` that follow from others, by name, of ``told`` of any shape.
+
+        Pixels mix Gaussians: a quotient of what they mix is not the mean of the quotients of each.
+        """
+        return {}
+
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         """What a table says of attributes that training pulls towards it, by name, each [N]; NaN where it says nothing."""
         return {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, S
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.walls import CONVECTION, u_value
+from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 SOLUTIONS = ("linear", "corrected")
 EXCHANGES = ("learned", "iso_6946")
+MOST_CONVECTION = 100.0  # W/(m² K) and W s/(m³ K): ten times what outer surfaces have
 SURFACES = ("seen", "level")
 SKIES = ("auto", *sky.LAWS)
 SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
@@ -52,7 +53,8 @@ COUPLINGS = (math.log(0.02), math.log(50.0))
 START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
-LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind")  # of bodies of one node
+LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inner_rise")
+LEARNED += ("initial_core", "log_core_rate", "log_coupling")
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
 COSTS = {"linear": 400, "corrected": 3000}
 
@@ -69,7 +71,8 @@ class EnergyBalance(ThermalModel):
 
     Bodies without an end (``semi_infinite``) are massive walls and ground that the record does not heat through: one number
     in the place of the rate, a = (H/b)², tells their effusivity b. ``inner`` adds a constant heat from within, q/H for each
-    Gaussian, such as a heated room behind a wall: heat that is lost, and with ``indoor_c`` a U-value.
+    Gaussian. With ``indoor_c`` it comes of a room of this temperature, as much as the wall between lets through: then q/H is
+    that of a surface as warm as the mean air, and tells a U-value.
 
     Identifiable: α/C and h/C, and e/C by night, with the state at the start of the record where it is still remembered
     when images begin; the share of wind in h where the wind changes while surface and air differ. Not identifiable: the
@@ -93,19 +96,21 @@ class EnergyBalance(ThermalModel):
         solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
             record; "corrected" solves the full balance along the record, for all training frames at once and anew where
             parameters have moved (heatsplat.physics.marching).
-        nodes: 1, or 2 for bodies with a core (with solution "linear").
+        nodes: 1, or 2 for bodies with a core.
         sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
             humidity and the last without), or None: nothing radiates.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
-        inner: whether there is heat from within (with solution "linear").
-        exchange: "learned" has each Gaussian find radiation's and wind's share of its exchange; "iso_6946" takes them from the
-            emissivity and the convention of building physics, 4 W/(m² K) and 4 more for each m/s of wind, which leaves
-            images to tell heat from within.
-        convection_error: relative standard deviation of that convention's convection, for intervals of what is learned; 0 takes
-            it for exact.
-        indoor_c: temperature of the air behind walls in °C, for their U-value in ``attributes``; None tells none.
+        inner: whether there is heat from within.
+        exchange: "learned" has each Gaussian find radiation's and wind's share of its exchange. Otherwise they follow from the
+            emissivity and convection that is given, which leaves images to tell heat from within: two numbers, that of still
+            air in W/(m² K) and what each m/s of the recorded wind adds in W s/(m³ K), as measured on site; or "iso_6946",
+            the convention of building physics, 4 and 4.
+        convection_error: relative standard deviation of convection that is given, for intervals of what is learned; 0 takes it
+            for exact.
+        indoor_c: temperature of the rooms behind walls in °C: heat from within comes of them by a constant conductance, which
+            tells a U-value in ``attributes``. None: heat from within is constant, and there is no U-value.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
         shadows: whether what stands in the way of the sun casts shadows (``Query.exposure``).
@@ -133,7 +138,7 @@ class EnergyBalance(ThermalModel):
         sun: bool = True,
         semi_infinite: bool = False,
         inner: bool = False,
-        exchange: str = "learned",
+        exchange: str | Sequence[float] = "learned",
         convection_error: float = 0.2,
         indoor_c: float | None = None,
         normals: str = "seen",
@@ -155,24 +160,21 @@ class EnergyBalance(ThermalModel):
             ("solution", solution, SOLUTIONS),
             ("normals", normals, SURFACES),
             ("clip", clip, CLIPS),
-            ("exchange", exchange, EXCHANGES),
             ("sky", sky, (*SKIES, None)),
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
-        by_convention = exchange != "learned"
-        for name, asked in (
-            ("nodes=2", nodes == 2),
-            ("semi_infinite", semi_infinite),
-            ("inner", inner),
-            (f"exchange={exchange}", by_convention),
-        ):
-            if asked and solution != "linear":
-                raise ValueError(f"{name} is solved about a mean only: give solution=linear, or leave it out")
+        convection = _convection(exchange)
+        if semi_infinite and solution != "linear":
+            raise ValueError(
+                "bodies without an end are solved about a mean only: give solution=linear or semi_infinite=false"
+            )
         if nodes == 2 and semi_infinite:
             raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
-        if by_convention and (sky is None or not wind):
-            raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
+        if convection is not None:
+            if sky is None or (convection[1] > 0 and not wind):
+                raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
+            wind = convection[1] > 0
         if indoor_c is not None and not inner:
             raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
         if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
@@ -188,7 +190,8 @@ class EnergyBalance(ThermalModel):
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
         self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
-        self.exchange, self.convection_error, self._convects = exchange, convection_error, 1.0
+        self.exchange, self._convection = exchange, convection
+        self.convection_error, self._convects = convection_error, 1.0
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
@@ -249,15 +252,15 @@ class EnergyBalance(ThermalModel):
         drivers = self.climate.drivers
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
-        if self.exchange != "learned":
-            return tensors if drivers.up is None else tensors | surface_normals(seeds)
-        if drivers.sky is not None:
+        if drivers.sky is not None and self._convection is None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
-        if drivers.wind_anomaly is not None:
+        if drivers.wind_anomaly is not None and self._convection is None:
             tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         if self.solution == "corrected":
-            tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), len(tensors)), 0.0)  # at none that there is
+            given = 0 if self._convection is None else 1 + self._wind  # shares of radiation and of wind
+            numbers = len(tensors) + given
+            tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), numbers), 0.0)  # at none that there is
         if drivers.up is None:
             return tensors
         if self.shadows:
@@ -311,16 +314,20 @@ class EnergyBalance(ThermalModel):
             if self._sunlit:
                 values["absorptivity"] = exchange * surface.sun / 1000.0
             if surface.inner is not None:
-                values["heat_loss_w_m2"] = exchange * surface.inner
+                values["heat_loss_w_m2"] = exchange * self.climate.mean_heat_from_within(surface)
                 if self.indoor_c is not None:
-                    mean_c = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
-                    values["u_value_w_m2_k"] = u_value(values["heat_loss_w_m2"], self.indoor_c, mean_c)
-        return values
+                    values["mean_surface_c"] = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
+        return values | self.quotients(values)
+
+    def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        if "mean_surface_c" not in told:
+            return {}
+        return {"u_value_w_m2_k": u_value(told["heat_loss_w_m2"], self.indoor_c, told["mean_surface_c"])}
 
     def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
-        """The convection of a convention, which building physics knows to a fifth."""
-        by_convention = self.exchange != "learned" and self.convection_error > 0
-        return {"convection": self._more_convection} if by_convention else {}
+        """Convection that is given, which is known to ``convection_error``."""
+        given = self._convection is not None and self.convection_error > 0
+        return {"convection": self._more_convection} if given else {}
 
     @contextmanager
     def _more_convection(self) -> Iterator[None]:
@@ -368,6 +375,7 @@ class EnergyBalance(ThermalModel):
     def _course_of(self, splats: Splats) -> Course:
         """The course of all Gaussians as they are now: that of the last view, unless something has changed since."""
         now = {name: splats[name].detach() for name in (*LEARNED, *GIVEN) if name in splats}
+        now["convects"] = torch.tensor(self._convects)
         if self._course is None or not all(torch.equal(now[name], was) for name, was in self._course[0].items()):
             course = Course(self.climate, self._surface(splats, Query()))
             self._course = {name: tensor.clone() for name, tensor in now.items()}, course
@@ -386,11 +394,12 @@ class EnergyBalance(ThermalModel):
 
         drivers = self.climate.drivers
         log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
-        if self.exchange == "learned":
+        if self._convection is None:
             share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
             wind = bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None
         else:
-            share, wind = (torch.full_like(log_rate, value) for value in self._convention())
+            share, wind = (torch.full_like(log_rate, value) for value in self._shares())
+            wind = wind if self._wind else None
         return Surface(
             start=state("initial_state"),
             log_rate=log_rate,
@@ -403,12 +412,12 @@ class EnergyBalance(ThermalModel):
             inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
         )
 
-    def _convention(self) -> tuple[float, float]:
-        """Radiation's share of the exchange at mean wind, and the wind's of convection."""
-        windy = CONVECTION[1] * self.mean_wind.item()
-        convection = (CONVECTION[0] + windy) * self._convects
+    def _shares(self) -> tuple[float, float]:
+        """Radiation's share of the exchange at mean wind, and the wind's of convection, where convection is given."""
+        still, windy = self._convection[0], self._convection[1] * self.mean_wind.item() if self._wind else 0.0
+        convection = (still + windy) * self._convects
         radiation = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
-        return radiation / (radiation + convection), windy / (CONVECTION[0] + windy)
+        return radiation / (radiation + convection), windy / (still + windy)
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -430,9 +439,12 @@ class EnergyBalance(ThermalModel):
             effects["relaxation"] = {"nodes": "surface and core"}
         if self.semi_infinite:
             effects["semi_infinite"] = {"bodies": "without an end, about their mean"}
+        if self._convection is not None:
+            effects["convection"]["given"] = "{:g} + {:g} v W/(m² K) in wind v".format(*self._convection)
         if self.inner:
-            effects["convection"]["from_within"] = "constant, q/H of each Gaussian"
-        parts: dict[str, Any] = {}
+            warm = "constant" if self.indoor_c is None else f"of rooms at {self.indoor_c:g} °C"
+            effects["convection"]["from_within"] = f"{warm}, q/H of each Gaussian"
+        parts: dict[str, Any] = {"room": self._room()}
         up, parts["light"], parts["beams"] = self._light(weather, effects)
         if up is not None:
             self._surroundings(weather, up, parts, effects)
@@ -459,12 +471,24 @@ class EnergyBalance(ThermalModel):
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
             parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
             effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
-        elif self.exchange != "learned":
+        elif self._wind and self._convection is not None:
             raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
         return drivers, effects
+
+    def _room(self) -> float | None:
+        """Temperature behind walls above the reference."""
+        if self.indoor_c is None:
+            return None
+        air_c = celsius(self.reference_k).item()
+        if abs(self.indoor_c - air_c) < LEAST_K:
+            raise SceneError(
+                f"indoor_c={self.indoor_c:g} is the mean temperature of the air outside ({air_c:.1f} °C) within {LEAST_K:g} K: "
+                "nothing then tells what walls let through; leave indoor_c out"
+            )
+        return self.indoor_c - air_c
 
     def _surroundings(self, weather: Weather, up: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> None:
         """Adds what comes of the scene's own geometry to the drivers, and tells the effects of it."""
@@ -495,6 +519,27 @@ class EnergyBalance(ThermalModel):
         if self.normals == "seen":
             effects["solar"]["left_out"] = "the direction of the sun, which the weather lacks"
         return None, weather.irradiance_w_m2 / 1000.0, None
+
+
+def _convection(exchange: str | Sequence[float]) -> tuple[float, float] | None:
+    """Convection of still air in W/(m² K) and of each m/s of wind in W s/(m³ K); None where it is learned.
+
+    Raises:
+        ValueError: ``exchange`` is no name that is known, nor two such numbers.
+    """
+    if isinstance(exchange, str):
+        check_option("exchange", exchange, EXCHANGES)
+        return CONVECTION if exchange == "iso_6946" else None
+    found = tuple(exchange) if isinstance(exchange, Sequence) else (exchange,)
+    sound = len(found) == 2 and all(
+        isinstance(value, (int, float)) and 0 <= value <= MOST_CONVECTION for value in found
+    )
+    if not sound or found[0] == 0:
+        raise ValueError(
+            "exchange must be learned, iso_6946, or convection of still air in W/(m² K), above 0, with what each m/s of wind "
+            f"adds in W s/(m³ K), both up to {MOST_CONVECTION:g}, such as [5.0,2.5]; got {exchange!r}"
+        )
+    return float(found[0]), float(found[1])
 
 
 def _live_on(model: EnergyBalance, _: Any) -> None:

@@ -156,6 +156,9 @@ class Wrapper(ThermalModel):
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         return _merged(member.attributes(splats, query) for member in self.members.values())
 
+    def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return _merged(member.quotients(told) for member in self.members.values())
+
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         return _merged(member.prior(splats) for member in self.members.values())
 

@@ -486,15 +486,16 @@ class SplatTraining(pl.LightningModule):
     def attribute_maps(self, frame: Frame) -> dict[str, Tensor]:
         """Images [H, W] of what the thermal model tells of its Gaussians (``ThermalModel.attributes``), by name.
 
-        Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality; NaN where none
-        is seen, or most have none. Empty for models that tell nothing.
+        Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality, or follows from such
+        means (``ThermalModel.quotients``); NaN where none is seen, or most have none. Empty for models that tell nothing.
         """
         told = self.attributes(frame)
         if not told:
             return {}
         output = self.composited(frame, gap_free(torch.stack(list(told.values()), dim=1)))
         maps = seen_means(output.features, output.alpha[0], len(told))
-        return dict(zip(told, maps.unbind(-1), strict=True))
+        found = dict(zip(told, maps.unbind(-1), strict=True))
+        return found | self.thermal.quotients(found)
 
     def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
         """What the camera of ``frame`` sees of values [N, C] of all rows of the splats, before black, in the first modality."""

@@ -161,16 +161,17 @@ class Map(Format):
         unit = seen.unit.replace("°", "deg ")
         unit = f" [{unit}]" if unit else ""
         bands = {f"{moment.quantity}{unit}": moment.of_blended(means[..., 0]).numpy()}
+        maps = dict(zip(told, means[..., 1:].unbind(-1), strict=True))
+        maps |= module.thermal.quotients(maps)
         intervals: dict[str, np.ndarray] = {}
         if self.uncertainty:
             frame = at_time(module.scene, Frame("map", first_free_id(module.scene), camera), moment.time_s)
             certainty = Uncertainty(module)
             deviation = certainty.deviation(frame)
             bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
-            shown = dict(zip(told, means[..., 1:].isfinite().cpu().unbind(-1), strict=True))
             for name, spread in certainty.attribute_deviations(frame).items():
-                intervals[f"{name} {DEVIATION}"] = spread.where(shown[name], torch.nan).numpy()
-        return depth, bands | {name: means[..., 1 + i].numpy() for i, name in enumerate(told)} | intervals
+                intervals[f"{name} {DEVIATION}"] = spread.where(maps[name].isfinite().cpu(), torch.nan).numpy()
+        return depth, bands | {name: values.numpy() for name, values in maps.items()} | intervals
 
 
 def _method(moment: Moment) -> str:
