@@ -42,7 +42,7 @@ class Mutation:
 
     Args:
         name: what is lost.
-        module: dotted name below heatsplat.
+        module: dotted name below heatsplat, or of datamodules and preparation.
         before: text that occurs once in the module's file.
         after: what takes its place.
         tests: what is run, as pytest takes it, until something fails.
@@ -57,7 +57,8 @@ class Mutation:
     @property
     def path(self) -> Path:
         """The file of the module."""
-        package = ROOT if self.module.startswith("datamodules.") else ROOT / "src" / "heatsplat"
+        beside = self.module.startswith(("datamodules.", "preparation."))
+        package = ROOT if beside else ROOT / "src" / "heatsplat"
         return package / Path(*self.module.split(".")).with_suffix(".py")
 
     def source(self) -> str:

@@ -92,6 +92,9 @@ class Probe(ThermalModel):
     def attributes(self, splats, query):
         return {"probed": query.rows(splats.means)[:, 0]}
 
+    def quotients(self, told):
+        return {"halved": told["probed"] / 2}
+
     def prior(self, splats):
         return {"probed": splats.means[:, 1]}
 
@@ -198,7 +201,9 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert model.regularisers(splats)["probe/term"].grad_fn is not None
     assert list(model.rows_to_drop(splats, 3)) == [DROPPED]
     ids = torch.tensor([4, 1])
-    assert torch.equal(model.attributes(splats, Query(ids, CAMERA, 5.0, 1))["probed"], splats.means[ids, 0])
+    attributes = model.attributes(splats, Query(ids, CAMERA, 5.0, 1))
+    assert torch.equal(attributes["probed"], splats.means[ids, 0])
+    assert torch.equal(model.quotients(attributes)["halved"], splats.means[ids, 0] / 2)
     assert torch.equal(model.prior(splats)["probed"], splats.means[:, 1])
     assert model.doubts()["needle"].func.__self__ is probe
     assert model.effects()["probing"] == {"how": "deep"}
