@@ -42,7 +42,7 @@ class Mutation:
 
     Args:
         name: what is lost.
-        module: dotted name below heatsplat, or of datamodules and preparation.
+        module: dotted name below heatsplat, where datamodules and preparation are found, too.
         before: text that occurs once in the module's file.
         after: what takes its place.
         tests: what is run, as pytest takes it, until something fails.
