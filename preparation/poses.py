@@ -95,6 +95,8 @@ class FindPoses:
             if name != "focal_px" or self.focal_px is not None:
                 check_positive(f"poses.{name}", getattr(self, name))
         check_numbers("poses.all_pairs", self.all_pairs, error=SceneError)
+        if self.all_pairs < 0:
+            raise SceneError(f"poses.all_pairs must be 0 or above, got {self.all_pairs}")
         check_numbers("poses.gps_sd_m", self.gps_sd_m, 2, SceneError)
         for value in self.gps_sd_m:
             check_positive("poses.gps_sd_m", value)

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 
 import pytest
 
@@ -10,6 +11,9 @@ from heatsplat.training.machine import cores
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cores() // int(WORKERS))))
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job: what it starts would not hear Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 RUNS = {
     "benchmarks",

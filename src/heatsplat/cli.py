@@ -68,9 +68,12 @@ def stoppable() -> Iterator[None]:
             signal.signal(number, listener)
 
 
-# What a disk says that is full, may not be written to, or has a file where a folder is to be: the message names it, and no
-# traceback helps.
-NO_PLACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EEXIST, errno.ENOTDIR}
+# What a disk says that is full, may not be written to, or has a file where a folder is to be: no traceback helps.
+NO_PLACE = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room, or give a folder on another disk")
+NO_PLACE |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "nothing may be written there: give another folder")
+NO_PLACE |= dict.fromkeys(
+    (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
+)
 
 EXAMPLES = {
     "train": (
@@ -119,7 +122,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             cause = _expected(error)
             if all_of_it or cause is None:
                 raise
-            sys.exit(f"{type(cause).__name__}: {cause}")
+            sys.exit(_sentence(cause))
         finally:
             if not all_of_it:
                 del os.environ["HYDRA_FULL_ERROR"]
@@ -190,7 +193,7 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
                     (output_dir / FAILED).write_text(traceback.format_exc())
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
-            log.error("%s: %s", type(cause).__name__, cause)
+            log.error("%s", _sentence(cause))
             sys.exit(1)
 
     return job
@@ -203,6 +206,14 @@ def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> N
     written = {"config": config, "hydra": {"hydra": hydra_config}, "overrides": hydra_config.overrides.task}
     for name, content in written.items():
         write_atomically(folder / f"{name}.yaml", OmegaConf.to_yaml(content))
+
+
+def _sentence(error: BaseException) -> str:
+    """What is printed of an error that is the user's to mend."""
+    remedy = NO_PLACE.get(error.errno) if isinstance(error, OSError) else None
+    if remedy is None:
+        return f"{type(error).__name__}: {error}"
+    return f"{error.filename}: {error.strerror}; {remedy}" if error.filename else f"{error.strerror}; {remedy}"
 
 
 def _expected(error: BaseException) -> BaseException | None:

@@ -158,6 +158,7 @@ def test_photos_place_the_thermal_camera_that_is_turned_against_the_visible_one(
         ({"gps_sd_m": 2.0}, "poses.gps_sd_m must be a list of 2 numbers"),
         ({"gps_sd_m": [2.0, 0.0]}, "poses.gps_sd_m must be above 0"),
         ({"all_pairs": "few"}, "poses.all_pairs"),
+        ({"all_pairs": -3}, "poses.all_pairs must be 0 or above, got -3"),
         ({"camera_model": "RADIALL"}, "poses.camera_model must be one of SIMPLE_PINHOLE"),
         ({"video": "yes"}, "poses.video"),
     ],

@@ -153,4 +153,4 @@ def test_the_command_prepares_and_goes_on(tmp_path):
     assert "and the same command goes on" in said and "Traceback" not in said
     (tmp_path / "scene.txt").touch()
     said = succeeds([*command[:2], "target=scene.txt"], tmp_path, 1)
-    assert "File exists: 'scene.txt'" in said and "Traceback" not in said
+    assert "scene.txt: File exists; a file is where a folder is to be" in said and "Traceback" not in said
