@@ -12,6 +12,9 @@ TORCH_BUILD := $(if $(LOCAL_TORCH),,--torch-backend $(if $(CUDA),auto,cpu))
 EXTRAS      := dev$(if $(CUDA),$(comma)gsplat)
 comma       := ,
 
+# Where it is set, each of the hundreds of processes that the tests start would compile every module of every package again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-slow wheel-test docs lint format bench stability fuzz tensorboard clean
 
