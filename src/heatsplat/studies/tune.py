@@ -182,7 +182,7 @@ def _checked(
     if unknown := [name for name in methods or () if name not in cases]:
         raise SceneError(
             f"study.methods: {', '.join(unknown)} has no case; there are {', '.join(cases)}. Give one: "
-            f'"+study.cases.{unknown[0]}={{scene:[data.scene=cooling],knobs:{{thermal.lr:[1e-4,1e-2]}}}}"'
+            f"\"+study.cases.{unknown[0]}={{scene:['data.scene=cooling'],knobs:{{thermal.lr:[1e-4,1e-2]}}}}\""
         )
     chosen = {name: cases[name] for name in methods or cases}
     for name, case in chosen.items():
