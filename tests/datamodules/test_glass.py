@@ -16,7 +16,7 @@ from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, p
 from heatsplat.datamodules.synthetic_scene.presets import PANE, PRESETS, TABLE_TOP, Pattern, Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box
-from heatsplat.metrics import psnr
+from heatsplat.metrics.psnr import psnr
 
 SMALL = replace(SIZES["tiny"], frames=4, points=800)
 

@@ -9,7 +9,8 @@ from kornia.metrics import psnr as kornia_psnr
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from heatsplat.metrics import psnr, ssim
+from heatsplat.metrics.psnr import psnr
+from heatsplat.metrics.ssim import ssim
 from heatsplat.metrics.valid import saturated_fraction, valid_pixels
 from heatsplat.training.rng import generator_for
 

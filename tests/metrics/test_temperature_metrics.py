@@ -9,16 +9,11 @@ from kornia.filters import otsu_threshold as kornia_otsu
 from torchmetrics.functional.regression import mean_absolute_error
 
 from heatsplat.contracts import ThermalRange
-from heatsplat.metrics import (
-    DEFINITIONS,
-    Scorer,
-    mae_c,
-    mae_roi_image_c,
-    mae_roi_scene_c,
-    mean_of_images,
-    otsu_level,
-    scene_threshold,
-)
+from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.metrics.mae import mae_c
+from heatsplat.metrics.mae_roi import mae_roi_image_c, mae_roi_scene_c, scene_threshold
+from heatsplat.metrics.otsu import otsu_level
+from heatsplat.metrics.scores import Scorer, mean_of_images
 from heatsplat.training.rng import generator_for
 
 RANGE = ThermalRange(10.0, 50.0)

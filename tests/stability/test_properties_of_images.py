@@ -15,7 +15,12 @@ from heatsplat.losses.edge import Edge, EdgeEnhanced
 from heatsplat.losses.gradients import GradientConsistency
 from heatsplat.losses.low_resolution import Curriculum, OnTargetGrid
 from heatsplat.losses.photometric import Photometric, ssim_map
-from heatsplat.metrics import Scorer, mae_c, otsu_level, psnr, scene_threshold, ssim
+from heatsplat.metrics.mae import mae_c
+from heatsplat.metrics.mae_roi import scene_threshold
+from heatsplat.metrics.otsu import otsu_level
+from heatsplat.metrics.psnr import psnr
+from heatsplat.metrics.scores import Scorer
+from heatsplat.metrics.ssim import ssim
 from heatsplat.sensors.agc import GainControl
 from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.calibration import Calibration

@@ -3,7 +3,7 @@
 import json
 
 import torch
-from running import run
+from running import NO_PICTURES, run
 
 from heatsplat.physics.units import KELVIN_AT_0_C
 
@@ -13,6 +13,8 @@ SHORT = (
     "data.downscale=2",
     "threads=1",
     "callbacks.images=null",
+    "callbacks.viewer=null",
+    *NO_PICTURES,
     "callbacks.attributes=null",
     "callbacks.probes=null",
     "callbacks.costs.fps_repeats=1",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from omegaconf import OmegaConf
-from running import compose_run, run
+from running import NO_PICTURES, compose_run, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from weathered import make_scene
 
@@ -24,6 +24,8 @@ SHORT = (
     "thermal.width=16",
     "callbacks.images=null",
     "callbacks.probes=null",
+    "callbacks.viewer=null",
+    *NO_PICTURES,
     "callbacks.statistics.every=1",
     "callbacks.attributes.test_views=1",
     "callbacks.costs.fps_repeats=1",

@@ -23,7 +23,8 @@ from heatsplat.io.pictures import (
     write_png,
 )
 from heatsplat.io.quantities import moment
-from heatsplat.metrics import mae_c, psnr
+from heatsplat.metrics.mae import mae_c
+from heatsplat.metrics.psnr import psnr
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
 RANGE_PIXELS = 20_000  # of each of them, at most

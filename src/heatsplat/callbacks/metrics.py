@@ -13,15 +13,10 @@ from heatsplat.callbacks.board import board
 from heatsplat.contracts import SceneData
 from heatsplat.io.results import CURVE_FILE
 from heatsplat.io.tables import write_csv
-from heatsplat.metrics import (
-    DEFINITIONS,
-    IMAGE_SCORES,
-    LpipsUnavailable,
-    Scorer,
-    load_lpips,
-    mean_of_images,
-    scene_threshold,
-)
+from heatsplat.metrics.definitions import DEFINITIONS, IMAGE_SCORES
+from heatsplat.metrics.lpips import LpipsUnavailable, load_lpips
+from heatsplat.metrics.mae_roi import scene_threshold
+from heatsplat.metrics.scores import Scorer, mean_of_images
 
 log = logging.getLogger("heatsplat")
 

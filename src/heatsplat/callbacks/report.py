@@ -26,7 +26,7 @@ from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
 from heatsplat.io.tables import NONE, markdown_table, read_csv
-from heatsplat.metrics import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 REPORT_FILE = "report.md"

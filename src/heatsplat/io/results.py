@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import heatsplat
-from heatsplat.metrics import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS
 
 # What a run leaves in its folder, beside checkpoints and pictures.
 METRICS_FILE = "metrics.json"

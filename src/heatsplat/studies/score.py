@@ -17,7 +17,8 @@ from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.io.results import METRICS_FILE, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.io.tiff import read_temperature
-from heatsplat.metrics import DEFINITIONS, Scorer, mean_of_images
+from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.metrics.scores import Scorer, mean_of_images
 
 log = logging.getLogger("heatsplat")
 

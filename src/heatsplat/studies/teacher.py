@@ -20,7 +20,7 @@ from heatsplat.io.pictures import Panel, colorize, compose, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.losses.swinir import SwinIR
-from heatsplat.metrics import psnr
+from heatsplat.metrics.psnr import psnr
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")

@@ -11,7 +11,7 @@ import numpy as np
 
 from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
-from heatsplat.metrics import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.earlier import pictures_of
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.leaderboard.standings import (

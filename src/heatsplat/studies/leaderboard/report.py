@@ -9,7 +9,7 @@ from pathlib import Path
 
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
-from heatsplat.metrics import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.leaderboard.standings import Entry, Standings, beside_reference, spread_of, standings, summary

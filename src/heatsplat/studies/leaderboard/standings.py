@@ -14,7 +14,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, write_atomically
-from heatsplat.metrics import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import add_earlier, handed_in, place_of, read_page, sentence, told_by
 from heatsplat.studies.leaderboard.plan import Board

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
-from heatsplat.metrics import LpipsUnavailable
-from heatsplat.metrics.lpips import find_backbone
+from heatsplat.metrics.lpips import LpipsUnavailable, find_backbone
 from heatsplat.studies.published.figures import METRICS, TITLES, Figure, doubts, figures
 from heatsplat.studies.published.sources import Source, source
 
