@@ -224,7 +224,9 @@ def test_methods_without_curves_choose_among_all_that_was_measured():
 @pytest.mark.parametrize("method", ["ravigs", "ti3dgs"])
 def test_every_choice_of_the_repository_is_open_to_methods_without_curves(method):
     points = [point for point in read_points(CURVES_FILE) if point.method != method]
-    assert set(Outlook(points).choices) == {point.choice for point in points}
+    usual = {(point.method, point.scene) for point in points if point.choice == Choice(3.0, 1.0)}
+    compared = {point.choice for point in points if (point.method, point.scene) in usual}  # haze starts from 500 points
+    assert set(Outlook(points).choices) == compared
     for asked in (10.0, 30.0):  # to stay with the Gaussians of the start would cost 3 to 5 dB
         assert plan(points, method, PACE, asked, cap_max=100_000).growth > 1.0
 
