@@ -105,9 +105,7 @@ DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
 CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
     "indoor": lambda scene: scene.weather is None,
     "outdoor": lambda scene: scene.weather is not None,
-    "outdoor, at night": lambda scene: (
-        scene.weather is not None and float(scene.weather.irradiance_w_m2.max()) < 1
-    ),
+    "outdoor, at night": lambda scene: scene.weather is not None and float(scene.weather.irradiance_w_m2.max()) < 1,
     "10 training frames or fewer": lambda scene: len(scene.train) <= 10,
     "11 to 20 training frames": lambda scene: 10 < len(scene.train) <= 20,
     "more than 20": lambda scene: len(scene.train) > 20,
