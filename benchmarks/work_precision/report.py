@@ -51,7 +51,9 @@ def rules(settings: Mapping[str, Any], load: float, seconds: float) -> list[str]
         "No gradients are requested; the time-stepped kernel computes its own anyway.".format(**settings),
         "Times are CPU time, the minimum of {rounds} rounds in which the solvers alternate; solvers that take more than "
         "{once_above_s:g} s run once. Integrations that take more than {limit_s:g} s ({adaptive_limit_s:g} s with adaptive steps) "
-        "are stopped and listed. The time of an adaptive solver includes its controller and rejected steps.".format(**settings),
+        "are stopped and listed. The time of an adaptive solver includes its controller and rejected steps.".format(
+            **settings
+        ),
         "*In order*: the solver passes through all frames once, the best case for an integration. *Alone*: each frame is "
         "computed separately, as in training, so an integration starts anew each time. This is not measured but scaled from the "
         "first, by the share of the record before each frame. Solvers that evaluate any time directly cost the same in both.",
