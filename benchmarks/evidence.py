@@ -29,42 +29,42 @@ HEAD = """# Effects: which physical effects a scene shows, and how `method=auto`
 
 This page is generated: `python src/study.py study=evidence`.
 
-`method=auto` simulates an effect if its *evidence* exceeds its *threshold* and the decision is sufficiently certain. Evidence is a
-statistic of the training images that stays below the threshold under the effect's null hypothesis. An effect whose metadata are
-missing is off, and its reason says so.
+`method=auto` simulates an effect if its *evidence* exceeds its *threshold* and the decision is sufficiently certain. Evidence
+is a statistic of the training images that stays below the threshold under the effect's null hypothesis. An effect whose
+metadata are missing is off, and its reason says so.
 
 **Joint fit.** Some effects look alike when tested alone. One fit of all effects to tracks of scene points separates them
-(`effects/joint/selection.py`): an effect is selected only if it lowers a Bayesian information criterion in the presence of the
-others.
+(`effects/joint/selection.py`): an effect is selected only if it lowers a Bayesian information criterion in the presence of
+the others.
 
 **Cross-validation.** A selected effect must also explain held-out observations (`effects/joint/certainty.py`, four folds):
 
 - It gains at least 0.3 dB, and 3.5 standard errors over the images.
 - Images with shuffled residuals do not gain as much.
 - A change common to an image is common to all of its points.
-- If there are too few frames to follow the scene, or the weather describes its changes only roughly, the effect must gain this
-  much in addition to a generic change of the scene: one or two time courses, scaled separately for each point.
+- If there are too few frames to follow the scene, or the weather describes its changes only roughly, the effect must gain
+  this much in addition to a generic change of the scene: one or two time courses, scaled separately for each point.
 - An effect that gains less than 0.1 dB is absent; so is a change over time if no such course gains more.
 - A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt.
 
-**Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the scene
-otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms them. On
-`moving_source` there are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
+**Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
+scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms
+them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
 
-**Weather.** Sun, sky and wind are judged by heat balances fitted with and without them (`effects/weathered.py`); massive walls by
-balances of bodies with one rate, with a core, and of infinite depth.
+**Weather.** Sun, sky and wind are judged by heat balances fitted with and without them (`effects/weathered.py`); massive
+walls by balances of bodies with one rate, with a core, and of infinite depth.
 
-- Shadows are cast by the sparse points and add no parameter to a balance. They gain 0.13 dB (3.2 standard errors) on `outdoor_true`
-  (demo) and lose 0.85 dB on `outdoor`, which has none.
-- Hidden sky, light from the ground and reflected sky are tested in the same way, but they also absorb other errors of a balance:
-  they gain up to 0.47 dB where they are absent, and at most 0.08 dB on `outdoor_true`, which has all three. They are therefore
-  simulated only if they gain 0.5 dB or are switched on.
+- Shadows are cast by the sparse points and add no parameter to a balance. They gain 0.13 dB (3.2 standard errors) on
+  `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, which has none.
+- Hidden sky, light from the ground and reflected sky are tested in the same way, but they also absorb other errors of a
+  balance: they gain up to 0.47 dB where they are absent, and at most 0.08 dB on `outdoor_true`, which has all three. They are
+  therefore simulated only if they gain 0.5 dB or are switched on.
 - Hidden sky scales what a point absorbs and emits by a constant, which the point's own parameters can represent as well. Its
   estimate from sparse points is too coarse to add anything.
 
 **Undecided effects.** An effect **cannot be told** if it fails these tests, if another effect would take its place, or if the
-record has too few frames. Its reason says what would be needed. It is then simulated only if the joint fit selected it as the best
-available explanation of the images. The run's report lists the gain in dB and the cost in ms of each effect;
+record has too few frames. Its reason says what would be needed. It is then simulated only if the joint fit selected it as the
+best available explanation of the images. The run's report lists the gain in dB and the cost in ms of each effect;
 `effects.least_db_per_ms` sets a minimum ratio.
 
 ## Selections
@@ -72,34 +72,36 @@ available explanation of the images. The run's report lists the gain in dB and t
 | setting | simulates |
 |---|---|
 | `effects=auto` (of `method=auto`) | the effects that the scene shows |
-| `effects=all` | everything that the metadata allow (walls of infinite depth, which replace other bodies, only if the scene shows them) |
+| `effects=all` | everything that the metadata allow (walls of infinite depth, which replace others, only if shown by the scene) |
 | `effects=none` | nothing |
 | `effects=etgs`, `ravigs`, `ti3dgs`, `thermogs`, `supirgs` | the effects of that paper, whatever the scene |
 | `effects.<name>=on`, `off`, `auto` | overrides a single effect |
 
-Values set by hand (`effects.parts.attenuation.moments=8`) take precedence over initial values from the evidence. `effects=etgs` is
-`method=etgs` to the last bit, and `effects=supirgs` has the camera of SupIR-GS. Where a paper uses a network, the catalogue uses a
-closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
+Values set by hand (`effects.parts.attenuation.moments=8`) take precedence over initial values from the evidence.
+`effects=etgs` is `method=etgs` to the last bit, and `effects=supirgs` has the camera of SupIR-GS. Where a paper uses a
+network, the catalogue uses a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
 
 ## Add an effect
 
-1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it and orders effects from the scene to
-   the sensor: by `stage`, then by `place`.
-2. Add it to `conf/effects/shared`: a line in `choices.yaml`, and the settings of its part in `parts.yaml` unless another effect
-   already has that part.
+1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it and orders effects from the
+   scene to the sensor: by `stage`, then by `place`.
+2. Add it to `conf/effects/shared`: a line in `choices.yaml`, and the settings of its part in `parts.yaml` unless another
+   effect already has that part.
 
 Nothing else changes. The file states:
 
 - `summary`, `source`, `adds`, and `needs`: the metadata it requires;
 - `evidence`, a function of an `Inspection` of the scene (`inspected.obs`: images and tracks; `inspected.joint`: the joint fit
   and its selection), the `null` hypothesis, and the `threshold` with a comment on its origin;
-- `term` in the joint fit, if tracks can show the effect: `Own` parameters of each point, `Shared` parameters of all points, or a
-  `Path` that transmits a fraction of the heat (`effects/joint/terms.py`), with the rules it must meet besides the threshold;
+- `term` in the joint fit, if tracks can show the effect: `Own` parameters of each point, `Shared` parameters of all points,
+  or a `Path` that transmits a fraction of the heat (`effects/joint/terms.py`), with the rules it must meet besides the
+  threshold;
 - `part`: the configuration slot, the settings, and what is set if the effect is off while another effect needs the part;
 - `stands_on` (the effects it requires) and `displaces` (those it replaces).
 
-`effects/physical/tone.py` is a short example; `tests/effects/test_new_effect.py` adds one. The part itself is a class in `thermal/`
-or `sensors/`. `tests/effects/test_off_is_absent.py` needs a case for each effect, to check that nothing of it remains when it is off.
+`effects/physical/tone.py` is a short example; `tests/effects/test_new_effect.py` adds one. The part itself is a class in
+`thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` needs a case for each effect, to check that nothing of it
+remains when it is off.
 """
 DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
 CONDITIONS: dict[str, Callable[[SceneData], bool]] = {

@@ -285,7 +285,8 @@ def learned_section(folder: Path) -> list[str]:
         told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
         rows.append((*told, row["unit"] or ""))
     note = (
-        "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the uncertainty of a "
+        "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
+        "uncertainty of a "
         + ("value; that is the median standard deviation of one Gaussian. " if known else
            "value, which `evaluate.py callbacks=uncertainty` estimates. ")
         + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
@@ -298,11 +299,11 @@ def learned_section(folder: Path) -> list[str]:
 
 
 EFFECTS_NOTE = (
-    "An effect is simulated if its statistic exceeds the threshold and the images can show it. There is no number if the effect was "
-    "set by hand or the data are not sufficient. dB: gain on held-out observations. An effect that is off is absent: no "
-    "parameter, no operation. Parameters: of the Gaussians at the end. ms per step: difference of whole training steps on the initial "
-    "Gaussians with all effects and without this one (and those that depend on it), alternating, fastest of each; a few hundredths are "
-    "noise."
+    "An effect is simulated if its statistic exceeds the threshold and the images can show it. There is no number if the effect "
+    "was set by hand or the data are not sufficient. dB: gain on held-out observations. An effect that is off is absent: no "
+    "parameter, no operation. Parameters: of the Gaussians at the end. ms per step: difference of whole training steps on the "
+    "initial Gaussians with all effects and without this one (and those that depend on it), alternating, fastest of each; a few "
+    "hundredths are noise."
 )
 
 
