@@ -59,7 +59,7 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
     assert (
         spread_of(list(found.values()), asked)
-        == "What ran with one seed is taken to spread by 6.7 %, as the others do."
+        == "Methods with one seed are assumed to vary by 6.7 %, the average of the others."
     )
     assert found["3dgs", "driven"].reason == "not run yet"
     assert found["supirgs", "driven"].reason.startswith("made for coarse images")
