@@ -50,7 +50,8 @@ def markdown(found: Standings, board: Board) -> str:
         f"{', '.join(board.sizes)}; {told['runs']} runs, {told['hours']:.2f} h of {_clock(board)} in total; seeds "
         f"{', '.join(map(str, board.seeds))}. {' '.join(filter(None, (board.note, found.note)))}".rstrip(),
         "",
-        f"The interactive [page]({PAGE_FILE}) sorts the table, plots error against time, and compares renders with the ground truth.",
+        f"The interactive [page]({PAGE_FILE}) sorts the table, plots error against time, and "
+        "compares renders with the ground truth.",
         "",
         f"Cells: {score} ({unit}) on held-out views, mean over seeds, and the range of ranks in parentheses: {TIES} "
         f"{spread_of(entries, board)} `x {board.protocol['reference']}` is the geometric mean of a method's error relative to "
