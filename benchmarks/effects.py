@@ -159,7 +159,7 @@ def tables(rows: Sequence[Row]) -> str:
         if row.job.left_out is None
     ]  # fmt: skip
     head = ("scene", "selection", "effects", "PSNR (dB)", "clean (dB)", "MAE (°C)", "parameters", "ms per step")
-    lines = ["# What choosing effects is worth", "", NOTE, "", *markdown_table(head, chosen, align="lllrrrrr")]
+    lines = ["# What selecting effects is worth", "", NOTE, "", *markdown_table(head, chosen, align="lllrrrrr")]
     whole = {row.job.preset: row for row in rows if row.job.selection == "auto" and row.job.left_out is None}
     left = []
     for row in (row for row in rows if row.job.left_out):
@@ -179,8 +179,8 @@ def tables(rows: Sequence[Row]) -> str:
             "parameters saved",
             "ms per step saved",
         )
-        lines += ["", "## Left out of what auto chose", ""]
-        lines += ["What the run loses (PSNR down, MAE up) and saves without the effect and what stands on it.", ""]
+        lines += ["", "## Leaving out one effect", ""]
+        lines += ["Losses (PSNR down, MAE up) and savings without the effect and everything that depends on it.", ""]
         lines += markdown_table(head, left, align="llrrrrr")
     return "\n".join([*lines, ""])
 

@@ -25,76 +25,92 @@ from heatsplat.training.machine import cores
 
 log = logging.getLogger("heatsplat")
 
-HEAD = """# Effects: what a scene may call for, and how that is told
+HEAD = """# Effects: which physical effects a scene shows, and how `method=auto` decides
 
 This page is generated: `python src/study.py study=evidence`.
 
-An effect is simulated where its evidence exceeds its threshold and images can tell it. Evidence is a statistic on the training
-images that stays below the threshold under the null hypothesis. Effects that look alike one by one are told apart by one joint
-fit of all of them to tracks of scene points (`effects/joint/selection.py`): each has to lower a Bayesian information criterion
-in the presence of the others. Where metadata is missing an effect is off, and the reason says so.
+`method=auto` simulates an effect if its *evidence* exceeds its *threshold* and the decision is sufficiently certain. Evidence
+is a statistic of the training images that stays below the threshold under the effect's null hypothesis. An effect whose
+metadata are missing is off, and its reason says so.
 
-What was taken in has to show it where it was not fitted (`effects/joint/certainty.py`): on observations that were left out, a
-quarter at a time, it has to gain 0.3 dB, and 3.5 standard errors over the images; images whose departures are shuffled must not
-gain as much; and what an image has in common must be common to all of its points. Where frames are too few to follow the scene,
-or the weather says only roughly how it changes, it has to do so beside any change of the scene: one or two courses over time of
-which each point has its own measure. What gains less than 0.1 dB is absent, and so is a change where no such course gains more.
-An effect that was left out is in doubt only where it explains what was left out as well as one that is in doubt itself.
+**Joint fit.** Some effects look alike when tested alone. One fit of all effects to tracks of scene points separates them
+(`effects/joint/selection.py`): an effect is selected only if it lowers a Bayesian information criterion in the presence of
+the others.
 
-What a hot thing warms as it passes shares no course with other points: each changes at a moment of its own. Where the scene
-cools otherwise, such points are counted (`effects/joint/moments.py`), and a source of all harmonics stands for what warms them.
-On `moving_source` they are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
+**Cross-validation.** A selected effect must also explain held-out observations (`effects/joint/certainty.py`, four folds):
 
-Sun, sky and wind are judged by balances of heat fitted with and without them (`effects/weathered.py`), massive walls by balances
-of bodies of one rate, with a core, and without an end. Shadows are cast by the sparse points: they add no number to a balance,
-gain 0.13 dB (3.2 standard errors) on `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, where there are none. Hidden sky, light
-from the ground and mirrored sky are asked in the same way, but what balances miss is taken for them: they gain up to 0.47 dB
-where there is none, and 0.08 dB and less on `outdoor_true`, where all three are. So they are simulated where they gain 0.5 dB,
-or where they are switched on. Sky that is hidden takes a constant share of what a point absorbs and
-emits, which its own numbers take as well; that of sparse points is too rough beside it.
+- It gains at least 0.3 dB, and 3.5 standard errors over the images.
+- Images with shuffled residuals do not gain as much.
+- A change common to an image is common to all of its points.
+- If there are too few frames to follow the scene, or the weather describes its changes only roughly, the effect must gain
+  this much in addition to a generic change of the scene: one or two time courses, scaled separately for each point.
+- An effect that gains less than 0.1 dB is absent; so is a change over time if no such course gains more.
+- A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt.
 
-What fails, what would take its place, and what the record has too few frames for **cannot be told**, and its reason says what
-would be needed. It is then simulated only where the joint fit took it in, as the best explanation of the images that there is.
-A run's table has the decibels beside the milliseconds that they cost; `effects.least_db_per_ms` asks for a least ratio of the
-two.
+**Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
+scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms
+them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
 
-`method=auto` with `effects=auto` asks the scene, `effects=all` simulates whatever its metadata allow (bodies without an end,
-which stand in the place of others, where the scene says so), `effects=none` nothing. `effects.<name>=on|off|auto` overrules any
-of them. What is set by hand (`effects.parts.attenuation.moments=8`) wins over what the evidence would start from. The papers'
-systems are selections too, `effects=etgs|ravigs|ti3dgs|thermogs|supirgs`: the effects that they simulate, whatever the scene.
-That of ETGS is `method=etgs` to the last bit, that of SupIR-GS has its camera; where a paper has a network, the catalogue has a
-closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
+**Weather.** Sun, sky and wind are judged by heat balances fitted with and without them (`effects/weathered.py`); massive
+walls by balances of bodies with one rate, with a core, and of infinite depth.
+
+- Shadows are cast by the sparse points and add no parameter to a balance. They gain 0.13 dB (3.2 standard errors) on
+  `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, which has none.
+- Hidden sky, light from the ground and reflected sky are tested in the same way, but they also absorb other errors of a
+  balance: they gain up to 0.47 dB where they are absent, and at most 0.08 dB on `outdoor_true`, which has all three. They are
+  therefore simulated only if they gain 0.5 dB or are switched on.
+- Hidden sky scales what a point absorbs and emits by a constant, which the point's own parameters can represent as well. Its
+  estimate from sparse points is too coarse to add anything.
+
+**Undecided effects.** An effect **cannot be told** if it fails these tests, if another effect would take its place, or if the
+record has too few frames. Its reason says what would be needed. It is then simulated only if the joint fit selected it as the
+best available explanation of the images. The run's report lists the gain in dB and the cost in ms of each effect;
+`effects.least_db_per_ms` sets a minimum ratio.
+
+## Selections
+
+| setting | simulates |
+|---|---|
+| `effects=auto` (of `method=auto`) | the effects that the scene shows |
+| `effects=all` | everything that the metadata allow (walls of infinite depth, which replace others, only if shown by the scene) |
+| `effects=none` | nothing |
+| `effects=etgs`, `ravigs`, `ti3dgs`, `thermogs`, `supirgs` | the effects of that paper, whatever the scene |
+| `effects.<name>=on`, `off`, `auto` | overrides a single effect |
+
+Values set by hand (`effects.parts.attenuation.moments=8`) take precedence over initial values from the evidence.
+`effects=etgs` is `method=etgs` to the last bit, and `effects=supirgs` has the camera of SupIR-GS. Where a paper uses a
+network, the catalogue uses a closed form. `effects=etgs effects.harmonic_source=off` is ETGS without its source.
 
 ## Add an effect
 
-1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it there and puts it in the order in
-   which heat meets effects: by `stage`, then by `place`.
-2. Give it its entry in `conf/effects/shared`: a line in `choices.yaml`, and the settings of its part in `parts.yaml`, unless
-   another effect has that part already.
+1. Write `effects/physical/<name>.py` with one `EFFECT = Effect(...)`. The catalogue finds it and orders effects from the
+   scene to the sensor: by `stage`, then by `place`.
+2. Add it to `conf/effects/shared`: a line in `choices.yaml`, and the settings of its part in `parts.yaml` unless another
+   effect already has that part.
 
-Nothing else changes. The file says:
+Nothing else changes. The file states:
 
-- what it is: `summary`, `source`, `adds`, and `needs`, the metadata without which it is off;
-- its `evidence`, a function of an `Inspection` of the scene (`inspected.obs`: images and tracks; `inspected.joint`: the joint fit
-  and what it selected), its `null` hypothesis and its `threshold`, with a comment where the number comes from;
-- its `term` in the joint fit, if tracks can show it: `Own` numbers of each point, `Shared` numbers of all points, or a `Path`
-  that lets a share of the heat arrive (`effects/joint/terms.py`), with the rules that it has to meet beside its threshold;
-- its `part`: the slot of the configuration, the settings, and what is set when it is off while another effect needs the part;
-- what it `stands_on`, and which effects it `displaces`.
+- `summary`, `source`, `adds`, and `needs`: the metadata it requires;
+- `evidence`, a function of an `Inspection` of the scene (`inspected.obs`: images and tracks; `inspected.joint`: the joint fit
+  and its selection), the `null` hypothesis, and the `threshold` with a comment on its origin;
+- `term` in the joint fit, if tracks can show the effect: `Own` parameters of each point, `Shared` parameters of all points,
+  or a `Path` that transmits a fraction of the heat (`effects/joint/terms.py`), with the rules it must meet besides the
+  threshold;
+- `part`: the configuration slot, the settings, and what is set if the effect is off while another effect needs the part;
+- `stands_on` (the effects it requires) and `displaces` (those it replaces).
 
-`effects/physical/tone.py` is a short one to start from, `tests/effects/test_new_effect.py` adds one. The part itself is a class
-in `thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` asks for a case of each effect: off, nothing of it is left.
+`effects/physical/tone.py` is a short example; `tests/effects/test_new_effect.py` adds one. The part itself is a class in
+`thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` needs a case for each effect, to check that nothing of it
+remains when it is off.
 """
 DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
 CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
-    "in a room": lambda scene: scene.weather is None,
-    "under the sky": lambda scene: scene.weather is not None,
-    "under the sky at night": lambda scene: (
-        scene.weather is not None and float(scene.weather.irradiance_w_m2.max()) < 1
-    ),
+    "indoor": lambda scene: scene.weather is None,
+    "outdoor": lambda scene: scene.weather is not None,
+    "outdoor, at night": lambda scene: scene.weather is not None and float(scene.weather.irradiance_w_m2.max()) < 1,
     "10 training frames or fewer": lambda scene: len(scene.train) <= 10,
-    "11 to 20": lambda scene: 10 < len(scene.train) <= 20,
-    "more": lambda scene: len(scene.train) > 20,
+    "11 to 20 training frames": lambda scene: 10 < len(scene.train) <= 20,
+    "more than 20": lambda scene: len(scene.train) > 20,
     "8 bits": lambda scene: scene.notes["bits"] == 8,
     "noise of 0.15 K or more": lambda scene: scene.notes["noise_k"] >= 0.15,
     "poses off by half a pixel or more": lambda scene: scene.notes["pose_error_px"] >= 0.5,
@@ -258,7 +274,7 @@ def written(
     ]  # fmt: skip
     lines = [HEAD, "## The catalogue\n", *markdown_table(COLUMNS, rows)]
     for size in dict.fromkeys(outcome.size for outcome in outcomes):
-        for which, wanted in ((size, False), (f"{size}, on recordings that no threshold was set on", True)):
+        for which, wanted in ((size, False), (f"{size}, on recordings not used to set thresholds", True)):
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
             lines += _confusion(which, these) if these else []
     for name, these in of_numbers.items():
@@ -275,20 +291,20 @@ def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:
         shows = ", ".join(sorted(these[0].present)) or "nothing"
         good = sum(outcome.wrong == 0 for outcome in these)
         by_scene.append((scene, shows, f"{good} of {len(these)}", *map(_counted, lists)))
-    head = ("scene", "shows", "nothing wrong", "missed", "taken in", "cannot be told")
-    return [*_by_effect(f"Verdicts against truth, {which}", outcomes), *markdown_table(head, by_scene)]
+    head = ("scene", "shows", "no wrong verdict", "missed", "wrongly found", "cannot be told")
+    return [*_by_effect(f"Verdicts compared with the truth, {which}", outcomes), *markdown_table(head, by_scene)]
 
 
 def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     """How verdicts and truth agree on scenes drawn at random: one table by effect, one by how they were recorded."""
     numbers = sorted(outcome.seed for outcome in outcomes)
-    title = f"Verdicts against truth, scenes drawn at random, {name} ({DRAWN}{numbers[0]} to {DRAWN}{numbers[-1]})"
+    title = f"Verdicts compared with the truth, scenes drawn at random, {name} ({DRAWN}{numbers[0]} to {DRAWN}{numbers[-1]})"
     rows = []
     for condition in CONDITIONS:
         these = [outcome for outcome in outcomes if condition in outcome.conditions]
         if these:
             rows.append((condition, len(these), *_shares(these)))
-    head = ("recorded", "scenes", "right %", "cannot be told %", "wrong %")
+    head = ("recording", "scenes", "right %", "cannot be told %", "wrong %")
     return [*_by_effect(title, outcomes), *markdown_table(head, rows)]
 
 
@@ -317,14 +333,14 @@ def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
             groups.append((on, len(these) - on - unsure, unsure))
         rows.append((effect.name, *groups[0], groups[1][1], groups[1][0], groups[1][2]))
     head = (
-        "effect", "present: found", "present: missed", "present: cannot be told", "absent: left out", "absent: taken in",
+        "effect", "present: found", "present: missed", "present: cannot be told", "absent: left out", "absent: wrongly found",
         "absent: cannot be told",
     )  # fmt: skip
     return [
         f"\n## {title}\n",
-        f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % say that it cannot be told, {wrong} % are "
-        f"wrong ({len(sought)} verdicts are on effects whose metadata are there). {clean} of {len(outcomes)} scenes have not a "
-        f"single wrong one. Deciding on a scene took {seconds:.1f} s (median, one thread).\n",
+        f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % cannot be told, {wrong} % are "
+        f"wrong ({len(sought)} verdicts concern effects whose metadata are present). {clean} of {len(outcomes)} scenes have no "
+        f"wrong verdict. A scene's verdicts took {seconds:.1f} s (median, one thread).\n",
         *markdown_table(head, rows),
         "",
     ]

@@ -108,7 +108,7 @@ def _seen_exact(radiance):
 
 CASES = (
     Case(
-        "What a black body sends within a band",
+        "Band radiance of a black body",
         "1 .. 10 000 K, bands from 1 .. 1000 µm to twice that; slope by the temperature",
         "1/(e^{hc/λkT} - 1)",
         "itself + 1e-30 W/(m² sr)",
@@ -118,7 +118,7 @@ CASES = (
         scale=lambda exact: exact[0] + SLIGHT, slope_scale=lambda exact, slopes: slopes[0] + SLIGHT,
     ),
     Case(
-        "The temperature of a black body, from what it sends within 7.5 to 14 µm",
+        "Temperature of a black body from its radiance within 7.5 to 14 µm",
         "radiance of 12 .. 9900 K; slope by the radiance",
         "Planck's law at the middle of the band",
         "itself",

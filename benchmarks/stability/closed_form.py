@@ -171,7 +171,7 @@ CASES = (
         by="rate", constants=("omega", "time"), promise=5.0, types=("float32",),
     ),
     Case(
-        "A body that exchanges (almost) no heat",
+        "A body with (almost) no heat exchange",
         "h 1e-30 .. 0.01 and 0, C 0.1 .. 100, ω 0.001 .. 1 rad/s, t 1 .. 4000 s, 300 K before 290 K, source up to 0.02 K/s",
         "ETGS Eq. 8 with τ = C/h",
         "300 K",
@@ -179,7 +179,7 @@ CASES = (
         constants=("omega", "time"), scale=lambda exact: 300, promise=4.0,
     ),
     Case(
-        "A moment before the first training frame",
+        "A time before the first training frame",
         "a 1e-12 .. 1e4 1/s, t -1e5 .. -1e-3 s; defined as at most one time constant backwards; slope by a",
         "e^{-at}",
         "300 K; slope: itself",
@@ -206,7 +206,7 @@ CASES = (
         _highest_printed, _highest_ours, _highest_exact, constants=("gain",), promise=8.0, types=("float64",),
     ),
     Case(
-        "One frequency, and two frames of one moment",
+        "One frequency, and two frames at the same time",
         "K = 1, moments 0, t, t with t 1 .. 1e5 s",
         "(k - 1)/(K - 1), 1/(2 Δt_min) (ETGS Eq. 28, 7)",
         "itself",

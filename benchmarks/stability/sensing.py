@@ -82,7 +82,7 @@ def _octave_exact(position):
 
 CASES = (
     Case(
-        "Gain control of black, white and what lies beyond",
+        "Gain control of black, white and values beyond",
         "image 0, 1e-8 .. 1 - 6e-8, 1, -0.1, 1.1; s = 1.75, t = -0.5; slope by the image",
         "sigmoid(s logit I + t) (SupIR-GS Eq. 5)",
         "1",
@@ -90,7 +90,7 @@ CASES = (
         by="image", scale=lambda exact: 1, slope_scale=lambda exact, slopes: 1, promise=12_000.0,
     ),
     Case(
-        "A field that has learned too fast",
+        "A field with exploding exponents",
         "absorption 0.001 .. 1, distance -1e4 .. 1e4; slope by distance",
         "e^{-(μa + μs) d} (TI-3DGS Eq. 9)",
         "e⁴",

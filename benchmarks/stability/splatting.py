@@ -217,7 +217,7 @@ CASES = (
         scale=lambda exact: 1, promise=4.0,
     ),
     Case(
-        "Between two cameras that almost look alike",
+        "Interpolation between two nearly equal rotations",
         "half angle 1e-8 .. 1",
         "sin(θ/4)/sin θ with θ = acos(p·q)",
         "itself",

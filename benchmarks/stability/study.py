@@ -35,18 +35,18 @@ ROUNDING = 1e-15  # errors below are rounding of float64 or none at all, on any 
 ABSENT, INFINITE = "", "∞"
 
 Row = dict[tuple[str, str], float | None]
-HEAD = """# Hard cases stay stable
+HEAD = """# Numerical stability in hard cases
 
-This page is generated: `make stability` measures every number, and a test (`tests/benchmarks`) fails when one of them no
-longer holds. Errors are the worst of seeded draws over the stated range, compared with 120 digits, in float32 and float64,
-for values and for the gradients that autograd returns ("slope"). ∞ stands for a result that is NaN or infinite. Empty
-cells do not exist: a form without a gradient, or a kernel with one type. Numbers are rounded up to one digit and hold
-within a factor of ten on any machine. Ours is promised to stay below a number of machine epsilons (1.2e-7 in float32,
-2.2e-16 in float64), which the test checks as well.
+This page is generated: `make stability` measures every number, and a test (`tests/benchmarks`) fails if one no longer holds.
 
-What the renderers, the training, the step sizes and random inputs go through is not in this table but in the tests beside
-it (`tests/stability`). `python src/study.py study=mutations` puts naive forms back, one by one, and lists the tests that
-notice (docs/mutations.md).
+Each case compares the formula as printed in a paper with our form. Errors are the maximum over seeded random inputs in the
+stated range, relative to a reference with 120 digits, in float32 and float64, for values and for the gradients from autograd
+("slope"). ∞ stands for NaN or infinity. An empty cell means that the combination does not exist: a form without a gradient,
+or a kernel with one type. Numbers are rounded up to one digit and hold within a factor of ten on any machine. Our form also
+stays below a promised number of machine epsilons ε (1.2e-7 in float32, 2.2e-16 in float64), which the test checks.
+
+Tests in `tests/stability` cover renderers, training, step sizes and random inputs. `python src/study.py study=mutations` puts
+unstable forms back one by one and lists the tests that notice (docs/mutations.md).
 """
 
 

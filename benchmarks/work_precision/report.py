@@ -39,7 +39,7 @@ STYLES = {  # colour, mark
 
 
 def rules(settings: Mapping[str, Any], load: float, seconds: float) -> list[str]:
-    """The rules, a sentence or some each.
+    """The rules, one or a few sentences each.
 
     Args:
         settings: of the study.
@@ -48,26 +48,26 @@ def rules(settings: Mapping[str, Any], load: float, seconds: float) -> list[str]
     """
     return [
         "One process, one thread, {gaussians} Gaussians, {frames} frames, K = {frequencies} frequencies. "
-        "No gradients are asked for; the time-stepped kernel computes its own all the same.".format(**settings),
-        "Time is that of the processor, the minimum of {rounds} rounds in which all solvers take turns; what takes over "
-        "{once_above_s:g} s runs once. An integration over {limit_s:g} s ({adaptive_limit_s:g} s if it chooses its steps) is "
-        "given up and listed. An adaptive solver's time holds its controller and refused steps.".format(**settings),
-        "*In order*: the solver passes through all frames once; an integration could not have it better. *Alone*: each frame is "
-        "asked for by itself, as in training, so that an integration starts anew; not measured but counted from the first, by "
-        "the share of the record before each frame. What answers any moment by itself costs the same in both.",
-        "Errors are in kelvin, the worst and the root mean square over all frames of {sample} Gaussians, those with "
-        "the fastest and the slowest rate among them. The truth has 50 digits (mpmath) where there is a formula; with T⁴ "
-        "it is scipy's LSODA at 1e-12, restarted at each sample of the weather. Inputs are values of float32.".format(
+        "No gradients are requested; the time-stepped kernel computes its own anyway.".format(**settings),
+        "Times are CPU time, the minimum of {rounds} rounds in which the solvers alternate; solvers that take more than "
+        "{once_above_s:g} s run once. Integrations that take more than {limit_s:g} s ({adaptive_limit_s:g} s with adaptive "
+        "steps) are stopped and listed. The time of an adaptive solver includes its controller and rejected steps.".format(
             **settings
         ),
-        "Integrations step onto every frame and every sample of the weather (but Radau, whose frames are interpolated), take "
-        "one product of matrix and vector for all harmonics, share the source between stages of one moment, and keep "
-        "exponentials while steps and rates stay equal. All are in torch. torchdiffeq's implicit Adams iterates without a "
-        "Jacobian; scipy's Radau has the exact, diagonal one, and float64 only.",
-        "What depends on the record alone (tables of the weather) is built once for a scene, is not in the time, and is "
-        "listed. Tables of one frame are in the time.",
-        "Exponential Euler is exact for cooling, and ETD2 for weather without T⁴ and wind at steps of its samples: there "
-        "they are closed forms, taken from step to step.",
+        "*In order*: the solver passes through all frames once, the best case for an integration. *Alone*: each frame is "
+        "computed separately, as in training, so an integration starts anew each time. This is not measured but scaled from the "
+        "first, by the share of the record before each frame. Solvers that evaluate any time directly cost the same in both.",
+        "Errors are in kelvin: the maximum and the root mean square over all frames of {sample} Gaussians, including those with "
+        "the fastest and the slowest rate. The reference is the formula with 50 digits (mpmath) if there is one; with T⁴ "
+        "it is scipy's LSODA at 1e-12, restarted at each weather sample. Inputs are float32 values.".format(**settings),
+        "Integrations step onto every frame and every weather sample (except Radau, whose frames are interpolated), use "
+        "one matrix-vector product for all harmonics, share the source between stages at the same time, and reuse "
+        "exponentials while steps and rates stay equal. All run in torch. torchdiffeq's implicit Adams iterates without a "
+        "Jacobian; scipy's Radau has the exact, diagonal one, and runs in float64 only.",
+        "Tables that depend only on the weather record are built once per scene; their time is listed separately and not "
+        "included. Tables of a single frame are included.",
+        "Exponential Euler is exact for cooling, and so is ETD2 for weather without T⁴ and wind with steps at its samples: "
+        "there they are closed forms, applied step by step.",
         f"The machine's load was {load:.1f}; the study took {seconds:.0f} s.",
     ]
 
@@ -95,7 +95,7 @@ def write(
         write_atomically(folder / f"{name}.svg", vector.getvalue())
     stated = ["## Rules", "", *(f"- {rule}" for rule in rules), ""]
     verdicts = [
-        "## What the pictures show",
+        "## Results",
         "",
         *(line for name in titles for line in _verdict(rows, name, titles[name])),
         "",
@@ -117,13 +117,14 @@ def write(
 HEAD = [
     "# What accuracy costs",
     "",
-    "Generated by `python src/study.py study=work_precision`, which measures it again in some minutes. Times belong to the "
-    "machine; errors do not.",
+    "Generated by `python src/study.py study=work_precision`, which repeats the measurements in some minutes. Times depend "
+    "on the machine, errors do not.",
 ]
 LEGEND = [
-    "Left is quick, down is exact. Stars and marks with a black rim are ours. Full marks are float32, hollow ones float64. The "
-    f"grey line is the front: nothing lies left of and below it. Dotted: the noise of a good camera, {CAMERA_K:g} K. Faint marks "
-    f"on the upper edge blew up; marks on the lower edge err by less than {MIN_K:g} K.",
+    "Faster is to the left, more accurate is lower. Stars and markers with a black edge are ours. Filled markers are float32, "
+    "open ones float64. The grey line is the Pareto front: no point is both faster and more accurate. The dotted line is the "
+    f"noise of a good camera, {CAMERA_K:g} K. Faint markers on the upper edge diverged; markers on the lower edge have errors "
+    f"below {MIN_K:g} K.",
 ]
 
 
@@ -232,7 +233,7 @@ def markdown(rows: Sequence[Any], titles: dict[str, str]) -> list[str]:
         done = [row for row in own if not row.given_up]
         lines += [f"## {title}", ""]
         lines += markdown_table(
-            ["ours", "type", "µs", "worst K", "rms K", "once for a record"],
+            ["ours", "type", "µs", "maximum K", "RMS K", "once per record"],
             [
                 [
                     _name(r),
@@ -246,8 +247,8 @@ def markdown(rows: Sequence[Any], titles: dict[str, str]) -> list[str]:
                 if r.ours
             ],
         )
-        lines += ["", "Least µs (in order / alone) for a worst error of at most"]
-        head = ["solver", *(f"{level:g} K" for level in LEVELS_K), "least error", "given up"]
+        lines += ["", "Shortest time in µs (in order / alone) for a maximum error of at most"]
+        head = ["solver", *(f"{level:g} K" for level in LEVELS_K), "smallest error", "stopped"]
         cells = []
         for solver in dict.fromkeys(r.solver for r in own):
             points, lost = (
@@ -273,17 +274,20 @@ def _verdict(rows: Sequence[Any], name: str, title: str) -> list[str]:
     for order, label in (("us", "In order"), ("us_alone", "Alone")):
         best = front(done, order)
         others = [f"{_point(r, order)}" for r in best if not r.ours]
-        text = "ours and " if any(r.ours for r in best) else "not ours, but "
+        text = "ours and " if any(r.ours for r in best) else "other solvers only: "
         if not others:
-            text = "ours alone" if best else "empty: all blew up"
-        lines.append(f"  - {label}, the front is {text}{'; '.join(others)}.")
+            text = "ours only" if best else "no solver: all diverged"
+        lines.append(f"  - {label}, the front consists of {text}{'; '.join(others)}.")
         for own in _chosen(done):
             rivals = [r for r in done if not r.ours and drawn(r) <= EQUAL * drawn(own)]
             rival = min(rivals, key=lambda r: getattr(r, order), default=None)
-            text = "no other comes within twice its error within the limits"
+            text = "no other solver reaches twice this error within the limits"
             if rival is not None:
                 ratio = getattr(rival, order) / getattr(own, order)
-                text = f"the cheapest other within twice its error costs {_ratio(ratio)} times as much: {_point(rival, order)}"
+                text = (
+                    f"the fastest other solver with at most twice this error takes {_ratio(ratio)} times as long: "
+                    f"{_point(rival, order)}"
+                )
             lines.append(f"    - {_point(own, order)}: {text}.")
     return lines
 
@@ -327,4 +331,4 @@ def _time(us: float) -> str:
 
 
 def _error(kelvin: float) -> str:
-    return "blew up" if not kelvin < BLOWN_K else f"{kelvin:.0e}" if kelvin < 1e-3 else f"{kelvin:.2g}"
+    return "diverged" if not kelvin < BLOWN_K else f"{kelvin:.0e}" if kelvin < 1e-3 else f"{kelvin:.2g}"

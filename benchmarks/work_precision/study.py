@@ -37,7 +37,7 @@ class Row:
         ours: whether the product solves it so.
         us: microseconds per Gaussian and frame, all frames in order.
         us_alone: the same where each frame is asked for by itself, as training does.
-        worst_k, rms_k: errors in kelvin; infinite where it blew up.
+        worst_k, rms_k: errors in kelvin; infinite if it diverged.
         setup_s: seconds spent once for a record, not in ``us``.
         given_up: why there is no result, or "".
     """

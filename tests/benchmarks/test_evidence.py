@@ -54,7 +54,7 @@ def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
     text = written(outcomes, frozenset({last}))
     cases = [int(line.split()[1]) for line in text.splitlines() if line.startswith("Of ")]
     assert cases == [len(CATALOGUE) * (len(outcomes) - len(fresh)), len(CATALOGUE) * len(fresh)]
-    assert "## Verdicts against truth, tiny, on recordings that no threshold was set on" in text
+    assert "## Verdicts compared with the truth, tiny, on recordings not used to set thresholds" in text
 
 
 def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path):

@@ -134,7 +134,7 @@ def test_the_study_runs_from_its_configuration(tmp_path):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
         assert "RK4" in (tmp_path / f"{name}.svg").read_text()
     text = (tmp_path / "table.md").read_text()
-    assert "## Rules" in text and "the front is" in text and "nan" not in text
+    assert "## Rules" in text and "the front consists of" in text and "nan" not in text
     assert not document.exists()  # half a table does not replace a whole one
     with pytest.raises(ValueError, match="solvers must name some of explicit Euler.*got 'RK5'"):
         measured(solvers=["RK5"])

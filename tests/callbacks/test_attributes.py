@@ -151,4 +151,4 @@ def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_aske
     (row,) = learned(tmp_path, monkeypatch, deviations=True)
     assert row["deviation"] == 0.05
     text = "\n".join(learned_section(tmp_path))
-    assert "± 0.05" in text and "in the median" in text
+    assert "± 0.05" in text and "median standard deviation" in text

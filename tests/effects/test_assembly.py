@@ -187,19 +187,19 @@ def test_recorded_weather_takes_the_place_of_harmonics():
     both = verdicts("relaxation", "harmonic_source", "solar")
     assert names_on(assembly.reconcile(both)) == {"relaxation", "solar"}
     assert names_on(assembly.reconcile(both, {"harmonic_source": "on"})) == {"relaxation", "harmonic_source"}
-    with pytest.raises(SceneError, match="effects.harmonic_source=on cannot be had: the recorded weather drives"):
+    with pytest.raises(SceneError, match="effects.harmonic_source=on is not possible: the recorded weather drives"):
         assembly.reconcile(both, {"harmonic_source": "on", "solar": "on"})
 
 
 def test_relaxation_that_is_switched_off_takes_along_what_stands_on_it():
     found = assembly.reconcile(verdicts("harmonic_source", "agc"), {"relaxation": "off"})
     assert names_on(found) == {"agc"} and found["harmonic_source"].reason == "it stands on relaxation, which is off"
-    with pytest.raises(SceneError, match="effects.relaxation=off cannot be had: harmonic_source stands on it"):
+    with pytest.raises(SceneError, match="effects.relaxation=off is not possible: harmonic_source stands on it"):
         assembly.reconcile(verdicts("harmonic_source"), {"relaxation": "off", "harmonic_source": "on"})
 
 
 def test_what_the_scene_cannot_give_is_refused_where_it_was_asked_for():
-    with pytest.raises(SceneError, match="effects.solar=on cannot be had: as measured"):
+    with pytest.raises(SceneError, match="effects.solar=on is not possible: as measured"):
         assembly.reconcile(verdicts(), {"solar": "on"})
 
 

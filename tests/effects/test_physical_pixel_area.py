@@ -76,6 +76,6 @@ def test_what_cannot_be_had_is_refused_by_name():
     on = decide(scene(), {"pixel_area": "on"})
     dropped = assembly.drop_impossible(on, scene())
     with pytest.raises(
-        ValueError, match=r"effects\.pixel_area=on cannot be had: no views are asked for that are finer"
+        ValueError, match=r"effects\.pixel_area=on is not possible: no views are asked for that are finer"
     ):
         assembly.reconcile(dropped, {"pixel_area": "on"})

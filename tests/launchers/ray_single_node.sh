@@ -2,7 +2,7 @@
 # A Ray cluster with one node on this machine, a sweep through it, and what became of every job:
 #     pip install -e '.[ray]'
 #     tests/launchers/ray_single_node.sh [python]
-# Its state lies in a temporary folder, and the cluster ends with the script. Kept output: docs/scaling.md.
+# Its state lies in a temporary folder, and the cluster ends with the script. Results of one run: docs/scaling.md.
 set -euo pipefail
 
 PYTHON=$(realpath -s "${1:-python}")

@@ -2,7 +2,7 @@
 # SLURM with one node on this machine, a sweep through it, and what became of every job. For root on Debian or Ubuntu:
 #     apt-get install -y --no-install-recommends slurmctld slurmd slurm-client munge
 #     tests/launchers/slurm_single_node.sh [python]
-# Its state lies in a temporary folder; every daemon that it started ends with it. Kept output: docs/scaling.md.
+# Its state lies in a temporary folder; every daemon that it started ends with it. Results of one run: docs/scaling.md.
 set -euo pipefail
 
 PYTHON=$(realpath -s "${1:-python}")

@@ -395,7 +395,7 @@ def test_a_resumed_run_keeps_its_schedule():
 
 def test_a_budget_needs_the_clock_of_the_costs():
     trainer = SimpleNamespace(callbacks=[])
-    with pytest.raises(SceneError, match="budget needs the clock of callbacks.costs"):
+    with pytest.raises(SceneError, match="budget needs callbacks.costs"):
         a_clock().on_train_start(trainer, None)
 
 

@@ -34,5 +34,5 @@ def test_the_page_has_all_entries_pictures_and_links(tmp_path):
     assert red > blue  # too warm
     entry = next(one for one in told["entries"] if one["method"] == "3dgs")
     assert entry["links"] == ["3dgs_cooling_steps_0/.hydra/config.yaml"] and len(entry["rank"]) == 2
-    assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("made for")
+    assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("it is for")
     assert content(page(found, asked, None))["entries"][0]["links"] == []

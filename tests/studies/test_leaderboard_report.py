@@ -29,14 +29,15 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     }
     text = (tmp_path / "docs" / "board.md").read_text()
     assert (
-        "Scenes of size tiny; 4 runs, 0.01 h of processor time together; seeds 0, 1. On a busy machine." in text
+        "Scene size: tiny; 4 runs, 0.01 h of CPU time in total; seeds 0, 1. On a busy machine." in text
         and "steps taken: `2,000`" in text
     )
     assert "| `3dgs` | 1.00 | 1 | 10 | **1.100 (1–2)** | – |" in text
     assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
     assert "- `etgs` on driven: scene 'x' lacks weather" in text
     assert (
-        "- `3dgs` on driven: not run yet" in text and "- `supirgs` on cooling, driven: made for coarse images" in text
+        "- `3dgs` on driven: not run yet" in text
+        and "- `supirgs` on cooling, driven: it is for low-resolution images" in text
     )
     rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
     found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]

@@ -17,7 +17,7 @@ def test_every_method_meets_every_scene_once_for_each_seed(tmp_path):
     assert {"data.scene=coarse_camera", "data.degrade=null", "callbacks.temperatures.image=clean"} <= set(coarse)
     assert {"max_steps=2000", "leaderboard.track=steps", "seed=0"} <= set(jobs[0])
     assert all("seed=0" in job for job in jobs[:7]) and all("seed=1" in job for job in jobs[7:])
-    assert found.left_out("supirgs", "cooling").startswith("made for coarse images")
+    assert found.left_out("supirgs", "cooling").startswith("it is for low-resolution images")
     assert board(tmp_path, train=False).jobs() == []
 
 

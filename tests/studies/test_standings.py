@@ -59,10 +59,10 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
     assert (
         spread_of(list(found.values()), asked)
-        == "What ran with one seed is taken to spread by 6.7 %, as the others do."
+        == "Methods with one seed are assumed to vary by 6.7 %, the average of the others."
     )
     assert found["3dgs", "driven"].reason == "not run yet"
-    assert found["supirgs", "driven"].reason.startswith("made for coarse images")
+    assert found["supirgs", "driven"].reason.startswith("it is for low-resolution images")
     beside = beside_reference(list(found.values()), asked)
     assert beside["etgs", "steps"] == (pytest.approx(0.5, abs=1e-4), 1)
     (sweep / "3dgs_cooling_steps_0" / "submission" / "near_00003.tiff").unlink()

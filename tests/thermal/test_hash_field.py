@@ -120,7 +120,9 @@ def test_what_needs_gaussians_is_refused_with_a_remedy(trained):
     def begun(*overrides):
         build(compose([*TINY, *overrides])["module"]).attach(module.scene)
 
-    with pytest.raises(SceneError, match=r"what HashField learned cannot leave it .* it has no Gaussians.*method=3dgs"):
+    with pytest.raises(
+        SceneError, match=r"what HashField learned cannot be exported as Gaussians.* it has no Gaussians.*method=3dgs"
+    ):
         snapshot(module)
     with pytest.raises(SceneError, match="HashField has no Gaussians, which this asks for: leave it out"):
         module.composited(module.scene.train.frames[0], torch.zeros(0, 1))

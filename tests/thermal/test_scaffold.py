@@ -132,7 +132,9 @@ def test_what_needs_gaussians_that_stay_is_refused_with_a_remedy(trained):
     def begun(*overrides):
         build(compose([*TINY, *overrides])["module"]).attach(module.scene)
 
-    with pytest.raises(SceneError, match=r"what Scaffold learned cannot leave it .* change with the view.*method=3dgs"):
+    with pytest.raises(
+        SceneError, match=r"what Scaffold learned cannot be exported as Gaussians.* change with the view.*method=3dgs"
+    ):
         snapshot(module)
     with pytest.raises(SceneError, match="the Gaussians of Scaffold cannot be merged: they are made anew .*merge=none"):
         FlatMerging().check(module)

@@ -67,7 +67,7 @@ def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(
     assert "| frame_offset | **yes** | 4 | 1 | – | – | as known | 16 |" in text.replace(
         f"| {len(module.scene.train)} |", "| 16 |"
     )
-    assert "quickest against quickest" in text and "| agc | no | 0.1 | 1 | – | – | as known | 0 | 0 |" in text
+    assert "fastest of each" in text and "| agc | no | 0.1 | 1 | – | – | as known | 0 | 0 |" in text
 
 
 def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, tmp_path):
@@ -103,9 +103,9 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
 
 
 def test_what_the_choice_would_replace_is_refused(scene_says, tmp_path):
-    with pytest.raises(SceneError, match="thermal.clip=hard would be replaced: .* effects.states"):
+    with pytest.raises(SceneError, match="thermal.clip=hard has no effect here: .* effects.states"):
         run(tmp_path, *SHORT, "method=auto", "thermal.clip=hard")
-    with pytest.raises(SceneError, match="sensor=frame_offset would be replaced"):
+    with pytest.raises(SceneError, match="sensor=frame_offset has no effect here"):
         run(tmp_path, *SHORT, "method=auto", "sensor=frame_offset")
 
 

@@ -82,12 +82,10 @@ def test_the_report_is_one_page_with_all_its_pictures(browser, folder):
         browser,
         "[...document.images].every((i) => i.complete && i.naturalWidth > 0) && [...document.images].map((i) => i.alt)",
     )
-    assert {"the scene, turning", "numbered surfaces", "scores", "maps of what was learned"} <= set(names)
+    assert {"the scene, turning", "numbered surfaces", "scores", "maps of learned quantities"} <= set(names)
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
     titles = [title.text for title in browser.find_elements("css selector", "h2, summary")]
-    assert {"Hottest and coldest surfaces", "What was learned", "How to cite", "Scores and what they cost"} <= set(
-        titles
-    )
+    assert {"Hottest and coldest surfaces", "Learned quantities", "How to cite", "Scores and cost"} <= set(titles)
     assert "m²" in browser.page_source and "Zhongwen Wang" in browser.page_source
     assert all(link.startswith("#") or (folder / link).exists() for link in re.findall(r'<a href="([^"]*)"', text))
     browser.set_window_size(390, 800)

@@ -56,7 +56,9 @@ class BudgetClock(pl.Callback):
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         self._meter = next((callback for callback in trainer.callbacks if isinstance(callback, CostMeter)), None)
         if self._meter is None:
-            raise SceneError("budget needs the clock of callbacks.costs; leave callbacks.costs on, or budget out")
+            raise SceneError(
+                "budget needs callbacks.costs, which measures time: keep callbacks.costs on, or leave budget out"
+            )
         self._cap = module.density.cap_max
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:

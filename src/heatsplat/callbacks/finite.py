@@ -30,7 +30,7 @@ class FiniteGuard(pl.Callback):
 
     def __init__(self, every: int = 50) -> None:
         if every < 1:
-            raise ValueError(f"FiniteGuard(every={every}): at least 1 step must lie between looks")
+            raise ValueError(f"FiniteGuard(every={every}): checks must be at least 1 step apart")
         self.every = every
         self._seen: str | None = None
 

@@ -15,7 +15,7 @@ from heatsplat.io.results import write_atomically
 
 PAGE_FILE = "report.html"
 QUALITY = 85  # of WebP, of 100, for still pictures
-FOLDED = ("The run", "Data: what was found and assumed", "What the scores mean", "Versions")
+FOLDED = ("The run", "Data: findings and assumptions", "Definitions of the scores", "Versions")
 STYLE = """
 :root { color-scheme: light dark; --paper: #fbfaf7; --ink: #23272b; --faint: #6a7178; --line: #dcd8d0; --accent: #a8470a; }
 @media (prefers-color-scheme: dark) {

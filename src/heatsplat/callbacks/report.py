@@ -214,29 +214,29 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
     pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
-    lines += ["## Scores and what they cost", "", *table]
+    lines += ["## Scores and cost", "", *table]
     missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
     if missing:
-        lines += ["", "Not to be had:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
+        lines += ["", "Not available:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
     if (folder / VIEWER_FILE).exists():
-        lines += ["", f"The scene itself, to turn and to measure in: [{VIEWER_FILE}]({VIEWER_FILE})."]
+        lines += ["", f"Interactive 3D view with temperatures: [{VIEWER_FILE}]({VIEWER_FILE})."]
     if pictures:
         lines += ["", "## Test views", ""]
         for path in pictures:
             lines += [f"![{path.stem}]({path.relative_to(folder).as_posix()})", ""]
         if (folder / TEST_FILE).exists():
-            lines.append(f"Every test image's scores are in [{TEST_FILE}]({TEST_FILE}).")
+            lines.append(f"Scores of each test image: [{TEST_FILE}]({TEST_FILE}).")
     lines += _picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning")
     if curves is not None:
-        lines += ["", "## Quality against time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
-        lines += ["", f"The numbers are in [{CURVE_FILE}]({CURVE_FILE})."]
+        lines += ["", "## Quality over training time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
+        lines += ["", f"Values: [{CURVE_FILE}]({CURVE_FILE})."]
     lines += _picture_section("Temperature over time", folder, "renders/probes.png", "probes")
     lines += _surfaces_section(folder)
     lines += learned_section(folder)
     lines += ["", "## The run", "", *_bullets(run)]
     lines += _effects_section(content["effects"])
-    lines += ["", "## Data: what was found and assumed", "", *_bullets(content["data"])]
-    lines += ["", "## What the scores mean", "", *_bullets(content["definitions"])]
+    lines += ["", "## Data: findings and assumptions", "", *_bullets(content["data"])]
+    lines += ["", "## Definitions of the scores", "", *_bullets(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"])]
     if entries := citations(run.get("method")):
         lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
@@ -265,8 +265,8 @@ def _surfaces_section(folder: Path) -> list[str]:
     moment = found[0]["time_s"]
     when = "" if moment is None else f", {moment:.6g} s after the first training frame"
     note = (
-        f"Connected surfaces that training views see, as the model renders them{when}: H the hottest, C the coldest. "
-        f"The centre is in coordinates of the scene; the table is [{SURFACES_FILE}]({SURFACES_FILE})."
+        f"Connected surfaces seen by training views, as rendered by the model{when}: H the hottest, C the coldest. "
+        f"Centres are in scene coordinates. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
     )
     table = markdown_table(("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z"), rows, "lrrrr")
     picture = [f"![numbered surfaces]({SURFACES_PICTURE})", ""] if (folder / SURFACES_PICTURE).exists() else []
@@ -285,24 +285,25 @@ def learned_section(folder: Path) -> list[str]:
         told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
         rows.append((*told, row["unit"] or ""))
     note = (
-        "Nine in ten Gaussians, weighted by opacity and area, lie in the interval: how the scene varies, not how uncertain a "
-        + ("value is; that is the standard deviation of one of them, in the median. " if known else
-           "value is, which `evaluate.py callbacks=uncertainty` tells. ")
-        + f"The table is [{LEARNED_FILE}]({LEARNED_FILE})."
+        "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
+        "uncertainty of a "
+        + ("value; that is the median standard deviation of one Gaussian. " if known else
+           "value, which `evaluate.py callbacks=uncertainty` estimates. ")
+        + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
     )  # fmt: skip
     pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
-    maps = [f"![maps of what was learned]({path.relative_to(folder).as_posix()})" for path in pictures]
-    heads = ("", "median", "nine in ten", *["one of them"] * known, "unit")
+    maps = [f"![maps of learned quantities]({path.relative_to(folder).as_posix()})" for path in pictures]
+    heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit")
     table = markdown_table(heads, rows, "l" + "r" * (len(heads) - 2) + "l")
-    return ["", "## What was learned", "", *table, "", note, "", *maps]
+    return ["", "## Learned quantities", "", *table, "", note, "", *maps]
 
 
 EFFECTS_NOTE = (
-    "An effect is simulated where its statistic exceeds the threshold and the images can tell it; no number stands where it "
-    "was asked for or the data cannot say. Decibels: what it gains on observations that it was not fitted to. What is off is "
-    "absent: no parameter, no operation. Parameters are those of the "
-    "Gaussians at the end. Milliseconds per step: whole training steps on the Gaussians of the start, with all effects and "
-    "without the one (and what stands on it), by turns; quickest against quickest, so a few hundredths are noise."
+    "An effect is simulated if its statistic exceeds the threshold and the images can show it. There is no number if the effect "
+    "was set by hand or the data are not sufficient. dB: gain on held-out observations. An effect that is off is absent: no "
+    "parameter, no operation. Parameters: of the Gaussians at the end. ms per step: difference of whole training steps on the "
+    "initial Gaussians with all effects and without this one (and those that depend on it), alternating, fastest of each; a few "
+    "hundredths are noise."
 )
 
 
@@ -312,7 +313,7 @@ def _effects_section(effects: Mapping[str, Any]) -> list[str]:
         simulated = {
             name: {key: value for key, value in effect.items() if key != "on"} for name, effect in effects.items()
         }
-        return ["", "## Effects that were simulated", "", *(_bullets(simulated) or ["None."])]
+        return ["", "## Simulated effects", "", *(_bullets(simulated) or ["None."])]
     settings = {name: effect["settings"] for name, effect in effects.items() if effect.get("settings")}
     return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_bullets(settings)]
 

@@ -71,7 +71,7 @@ class Anchors(DensityControl):
         self.size = self.voxel or spacing(scene.points)
         if self.size == 0:
             raise SceneError(
-                f"most points of scene '{scene.name}' lie on another, so that they tell no size of cubes: give density.voxel"
+                f"most points of scene '{scene.name}' coincide, so no voxel size can be derived from them: give density.voxel"
             )
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:

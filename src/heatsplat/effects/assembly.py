@@ -104,12 +104,14 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
 
     def turn(name: str, on: bool, reason: str) -> None:
         if given.get(name) == ("off" if on else "on"):
-            raise SceneError(f"effects.{name}={given[name]} cannot be had: {reason}; leave it out or change the other")
+            raise SceneError(
+                f"effects.{name}={given[name]} is not possible: {reason}; leave it out or change the other"
+            )
         found[name] = replace(found[name], on=on, reason=reason)
 
     for name, choice in given.items():
         if choice == "on" and not found[name].on:
-            raise SceneError(f"effects.{name}=on cannot be had: {found[name].reason}; add that, or leave it out")
+            raise SceneError(f"effects.{name}=on is not possible: {found[name].reason}; add that, or leave it out")
     for name in _on(found):
         others = [other for other in _on(found) if name in _effect(other).displaces]
         if others and given.get(name) == "on" and not any(given.get(other) == "on" for other in others):

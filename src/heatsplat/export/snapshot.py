@@ -100,7 +100,7 @@ def snapshot(module: Any) -> Snapshot:
     """
     if module.thermal.stays_here:
         raise SceneError(
-            f"what {type(module.thermal).__name__} learned cannot leave it as Gaussians: {module.thermal.stays_here}. Render "
+            f"what {type(module.thermal).__name__} learned cannot be exported as Gaussians: {module.thermal.stays_here}. Render "
             "images of it (src/render.py), or train a method whose Gaussians stay as they are, such as method=3dgs"
         )
     scene: SceneData = module.scene

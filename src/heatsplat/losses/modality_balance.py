@@ -26,8 +26,9 @@ class ByOthersShare:
         logits = inputs.splats["opacity_logits"].detach()
         if not self.opacity < logits.shape[1] > 1:
             raise ValueError(
-                f"a loss term is weighted by who has opacity {self.opacity}, but Gaussians have {logits.shape[1]}; give the "
-                "thermal model opacities of its own for each image (thermal.shared_opacity=false) and init=separate"
+                f"a loss term is weighted by the Gaussians that have opacity {self.opacity}, but Gaussians have "
+                f"{logits.shape[1]}; give the thermal model opacities of its own for each image "
+                "(thermal.shared_opacity=false) and init=separate"
             )
         factor = self.weight * (logits.argmax(dim=1) != self.opacity).float().mean()
         values = self.term(inputs)

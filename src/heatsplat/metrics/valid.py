@@ -33,7 +33,7 @@ def valid_pixels(prediction: Tensor, target: Tensor, mask: Tensor | None = None)
     if broken:
         raise ValueError(
             f"prediction has {broken} pixels that are NaN or infinite where the ground truth is known; a score over "
-            "the rest would hide it. Inspection for the tensor that broke with the finite-guard callback."
+            "the rest would hide it. Turn on callbacks.finite, which names the tensor that became NaN."
         )
     return valid
 

@@ -43,7 +43,7 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
         idle = [text for text in config["overrides"] if text.lstrip("+~").startswith(replaced)]
         if idle:
             raise SceneError(
-                f"{idle[0]} would be replaced: effects={config['effects']['select']} puts thermal model and sensor together. "
+                f"{idle[0]} has no effect here: effects={config['effects']['select']} puts thermal model and sensor together. "
                 "Set its parts by effects.states.*, effects.parts.* and effects.sensor.*, or choose a method that has its own."
             )
     return config

@@ -47,7 +47,7 @@ def trusted(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[
     except RecursionError:
         found = "its configuration contains itself"
     if found is not None:
-        raise SceneError(f"{path} is not built, for {found}")
+        raise SceneError(f"{path} is not loaded: {found}")
     return kept
 
 

@@ -167,16 +167,16 @@ class EnergyBalance(ThermalModel):
         convection = _convection(exchange)
         if semi_infinite and solution != "linear":
             raise ValueError(
-                "bodies without an end are solved about a mean only: give solution=linear or semi_infinite=false"
+                "semi_infinite works only with the linearised balance: give solution=linear or semi_infinite=false"
             )
         if nodes == 2 and semi_infinite:
-            raise ValueError("a body has no end or two nodes, not both: give nodes=1 or semi_infinite=false")
+            raise ValueError("semi_infinite and nodes=2 exclude each other: give nodes=1 or semi_infinite=false")
         if convection is not None:
             if sky is None or (convection[1] > 0 and not wind):
                 raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
             wind = convection[1] > 0
         if indoor_c is not None and not inner:
-            raise ValueError("indoor_c tells nothing without heat from within: give inner=true")
+            raise ValueError("indoor_c has no effect without heat from within: give inner=true")
         if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
             raise ValueError(
                 "shadows, sky_view and albedo are of sunlight on surfaces as they lie: give sun=true, normals=seen"

@@ -135,7 +135,7 @@ class Voxels(Initialisation):
         size = self.voxel or spacing(scene.points)
         if size == 0:
             raise SceneError(
-                f"most points of scene '{scene.name}' lie on another and tell no size of cubes: give init.voxel"
+                f"most points of scene '{scene.name}' coincide, so no voxel size can be derived from them: give init.voxel"
             )
         means = middles(torch.unique(cells(scene.points, size), dim=0), size)
         if most is not None and most < len(means):

@@ -34,9 +34,9 @@ EFFECT = Effect(
     name="agc",
     stage="sensor",
     place=6,
-    summary="contrast that the camera stretches from image to image",
+    summary="automatic gain control: contrast changes from image to image",
     source="SupIR-GS, Eq. 5",
-    null="the images have one gain",
+    null="all images have the same gain",
     # Up to 0.7 without it, from 1.6 with it.
     threshold=SHARED_HURDLE,
     adds="a stretch and a shift for each training image, a logit and a sigmoid",

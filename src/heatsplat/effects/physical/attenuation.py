@@ -83,12 +83,12 @@ EFFECT = Effect(
     name="attenuation",
     stage="path",
     place=0,
-    summary="air that swallows heat over distance and sends its own",
+    summary="air that absorbs radiation over distance and emits its own",
     source="TI-3DGS, Eq. 6; Beer and Lambert",
     null="a point looks the same from near and far",
     # Up to 0.9 without it; from 30 with it, and 0 once, where haze passes for heat.
     threshold=SHARED_HURDLE,
-    adds="one extinction, or a curve of it over time",
+    adds="one extinction coefficient, or its course over time",
     evidence=evidence,
     part=Part("path", "attenuation"),
     term=Path(

@@ -109,10 +109,10 @@ EFFECT = Effect(
     name="conduction",
     stage="state",
     place=6,
-    summary="heat that flows between neighbouring parts of a surface",
+    summary="heat conduction between neighbouring parts of a surface",
     source="Fourier's law on the graph of nearest Gaussians",
     needs=frozenset({"time"}),
-    null="contrasts between neighbours fade as fast as levels do",
+    null="contrasts between neighbours fade as fast as temperatures do",
     # Contrasts fade FASTER; up to 0.2 without it, from 2.9 with it.
     threshold=1.0,
     adds="a diffusivity and a linear solve over neighbours",

@@ -69,7 +69,7 @@ EFFECT = Effect(
     place=3,
     summary="uneven gain and offset of the pixels",
     source="SupIR-GS, Eq. 4",
-    null="residuals average to nothing at every place of the image",
+    null="residuals average to zero at every image position",
     # All points share it, but how courses of points err looks like a pattern on heated scenes: it has gained 1.7 there.
     # Up to 1.2 without it, from 6.0 with it.
     threshold=OWN_HURDLE,

@@ -75,9 +75,9 @@ EFFECT = Effect(
     name="frame_offset",
     stage="sensor",
     place=5,
-    summary="a level of the sensor that drifts from image to image",
+    summary="sensor offset that drifts from image to image",
     source="drift of uncooled cameras between shutters",
-    null="the images have no offset in common with all their points",
+    null="no offset is common to all points of an image",
     # Up to 0.9 without it, from 71 with it.
     threshold=SHARED_HURDLE,
     adds="one number for each training image",

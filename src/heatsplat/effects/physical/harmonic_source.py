@@ -99,10 +99,10 @@ EFFECT = Effect(
     name="harmonic_source",
     stage="state",
     place=1,
-    summary="heat that is switched on and off, as a sum of K harmonics",
+    summary="heat sources that are switched on and off, as a sum of K harmonics",
     source="ETGS, Eq. 4, 7, 8",
     needs=frozenset({"time"}),
-    null="what changes is a mixture of relaxations",
+    null="all changes are mixtures of relaxations",
     # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it. Of points that something passes: up to 1.5 and from 5.0.
     threshold=OWN_HURDLE,
     adds="2 K amplitudes for each Gaussian, 11 K operations",

@@ -35,9 +35,9 @@ EFFECT = Effect(
     name="reflection",
     stage="emission",
     place=1,
-    summary="surroundings seen as in a mirror",
+    summary="mirror reflection of the surroundings",
     source="RaViGS, Eq. 4",
-    null="what depends on direction does not follow the mirrored ray",
+    null="view dependence does not follow the reflected ray",
     # Up to 1.0 without it, from 10 with it.
     threshold=SHARED_HURDLE,
     adds="a reflectivity for each Gaussian, one map of the surroundings",

@@ -81,10 +81,10 @@ EFFECT = Effect(
     name="relaxation",
     stage="state",
     place=0,
-    summary="every surface tends to the temperature of its surroundings",
+    summary="surfaces relax to the temperature of their surroundings",
     source="ETGS, Eq. 3",
     needs=frozenset({"time"}),
-    null="every point keeps its level through the record",
+    null="every point keeps its temperature over the record",
     # Up to 0.2 without it, and 3.2 once, in haze; from 3.3 with it.
     threshold=OWN_HURDLE,
     adds="a level and a rate for each Gaussian, an exponential at each time",

@@ -54,12 +54,12 @@ EFFECT = Effect(
     name="tone",
     stage="sensor",
     place=7,
-    summary="a bent curve from heat to grey",
+    summary="nonlinear response from radiation to grey value",
     source="SupIR-GS, Eq. 7, 8",
-    null="what a common change of an image does to its greys is a straight line of them",
+    null="a change common to an image is linear in its grey values",
     # Up to 0.4 without it, from 190 with it.
     threshold=SHARED_HURDLE,
-    adds="a small network of one number, kept as 256 levels",
+    adds="a small network of one variable, stored as 256 levels",
     evidence=evidence,
     part=Part("camera", "tone"),
     term=Shared(

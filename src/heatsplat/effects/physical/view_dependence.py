@@ -24,7 +24,7 @@ EFFECT = Effect(
     place=0,
     summary="emission that depends on the direction of view",
     source="3DGS, spherical harmonics",
-    null="a point looks the same from every side",
+    null="a point looks the same from every direction",
     # Up to 1.7 without it, from 4.7 with it.
     threshold=OWN_HURDLE,
     adds="harmonics for each Gaussian",

@@ -99,7 +99,7 @@ EFFECT = Effect(
     place=4,
     summary="falloff of the lens towards the corners",
     source="SupIR-GS, Eq. 6",
-    null="residuals do not depend on the distance from the middle of the image",
+    null="residuals do not depend on the distance from the image centre",
     # Up to 0.3 without it, from 0.4 with it: beside a heat source it is missed.
     threshold=SHARED_HURDLE,
     adds="two numbers",

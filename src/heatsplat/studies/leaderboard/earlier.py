@@ -88,8 +88,8 @@ def pictures_of(content: Mapping[str, Any] | None, scene: str, view: str) -> Map
 
 def sentence(factors: Mapping[str, float]) -> str:
     """What was taken from a page, and by how much the seconds of later runs were scaled, for the table."""
-    text = "What no later run has as many seeds of stands as an earlier page had it."
+    text = "Results of an earlier page fill in where later runs have fewer seeds."
     scaled = " and ".join(f"{factor:.2f} (equal {track})" for track, factor in factors.items())
     if scaled:
-        text += f" Seconds of later runs are multiplied by {scaled}, so that the reference takes what it took there."
+        text += f" Seconds of later runs are multiplied by {scaled}, which equalises the times of the reference."
     return text

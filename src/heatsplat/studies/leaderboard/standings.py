@@ -239,8 +239,8 @@ def spread_of(entries: Sequence[Entry], board: Board) -> str:
         return ""
     usual = usual_spread(entries, board.protocol["scores"][0])
     if usual is None:
-        return "All ran with one seed, which tells no spread: ranks are those of the bare numbers."
-    return f"What ran with one seed is taken to spread by {100 * usual:.1f} %, as the others do."
+        return "All methods ran with one seed, so the spread is unknown and ranks follow the means."
+    return f"Methods with one seed are assumed to vary by {100 * usual:.1f} %, the average of the others."
 
 
 def standard_error(entry: Entry, score: str, usual: float | None) -> float:
