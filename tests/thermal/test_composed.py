@@ -215,6 +215,27 @@ def test_extinction_over_the_record_is_linear_in_its_logarithm_between_moments()
         part.extinction(None)
 
 
+def test_extinction_goes_on_through_a_gap_as_it_bends_on_both_sides():
+    """Moments that no view sees: four on a parabola, whose top lies in the gap between them."""
+    part = Attenuation(moments=7)
+    part.prepare(scene())
+    parabola = 1 - (torch.arange(7) - 3.0).square() / 9
+    seen = torch.tensor([0, 1, 5, 6])
+    optimizer = torch.optim.LBFGS(part.parameters(), max_iter=200, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimizer.zero_grad()
+        fit = (part.log_depth[seen] - parabola[seen]).square().sum()
+        loss = fit + part.regularisers(splats_of(made("static")))["extinction_smooth"]
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    top = part.log_depth.detach()[3].item()
+    assert top == pytest.approx(1, abs=0.15)  # a straight line through the gap would be at 0.56
+    assert Attenuation(moments=2).regularisers(None) == Attenuation(moments=0).regularisers(None) == {}
+
+
 @pytest.mark.parametrize("log_depth", [-1e4, 1e4])
 def test_air_is_finite_whatever_the_extinction(log_depth):
     part = Attenuation()

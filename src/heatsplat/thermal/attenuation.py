@@ -29,7 +29,8 @@ class Attenuation(HeatPart):
     Args:
         depth: β times the typical distance between cameras and points, at the start; positive.
         moments: of the curve; 0 keeps β the same throughout.
-        smooth: weight of the penalty on the mean squared difference of log β from moment to moment.
+        smooth: weight of the penalty on the mean squared second difference of log β over the moments. Where no training
+            view looks, the curve goes on as it bends on both sides.
         lr, lr_end: learning rate of log β and of A, and the factor on it at the end of the run.
 
     Raises:
@@ -37,7 +38,7 @@ class Attenuation(HeatPart):
     """
 
     def __init__(
-        self, depth: float = 0.1, moments: int = 12, smooth: float = 1e-4, lr: float = 0.01, lr_end: float = 0.1
+        self, depth: float = 0.1, moments: int = 12, smooth: float = 3e-3, lr: float = 0.01, lr_end: float = 0.1
     ) -> None:
         super().__init__()
         if depth <= 0 or moments == 1 or moments < 0:
@@ -90,9 +91,9 @@ class Attenuation(HeatPart):
         return torch.lerp(self.log_depth[before], self.log_depth[before + 1], place - before)
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        if self.moments == 0 or self.smooth == 0:
+        if self.moments < 3 or self.smooth == 0:
             return {}
-        return {"extinction_smooth": self.smooth * self.log_depth.diff().square().mean()}
+        return {"extinction_smooth": self.smooth * self.log_depth.diff(n=2).square().mean()}
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         with torch.no_grad():
