@@ -190,6 +190,71 @@ def test_everything_beside_it_draws(page):
     assert page.execute_script("return viewer.errors") == []
 
 
+def test_coarser_numbers_while_frames_come_slowly_and_exact_ones_at_rest(page):
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    values = "viewer.frame(performance.now()); return viewer.sampled()"
+    exact = np.array(page.execute_script(values))
+    page.execute_script("viewer.drawing.quick = true")
+    quick = np.array(page.execute_script(values))
+    assert page.execute_script("return viewer.drawing.targets.first.kind === viewer.drawing.quicker")
+    span = np.ptp(page.execute_script("return viewer.told.limits"))
+    assert 0 < np.abs(quick - exact).max() < 0.01 * span
+    wait_until(page, "!viewer.drawing.quick && viewer.drawing.targets.first.kind === viewer.drawing.exact")
+    assert np.array(page.execute_script(values)) == pytest.approx(exact)
+
+
+def test_frames_that_come_slowly_cost_numbers_first_and_then_pixels(page):
+    """A clock that runs as on a slow computer, without waiting for it."""
+    found = page.execute_script("""const v = viewer, told = [];
+      v.dragging = true; v.pacing = null; v.lastFrame = 1000;
+      for (let i = 1; i < 4; i++) {
+        v.frame(1000 + 100 * i);
+        told.push([v.drawing.quick, v.quality]);
+      }
+      v.dragging = false;
+      return told;""")
+    assert found[0] == [True, 1] and found[1][1] < 1 and found[2][1] < found[1][1]
+    wait_until(page, "!viewer.drawing.quick && viewer.quality === 1")
+
+
+def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order && !viewer.pending")
+    keys(page, "x")
+    hot, cold = wait_until(page, "viewer.spots && [viewer.spots.hot, viewer.spots.cold]")
+    values = page.execute_script("return viewer.sampled()")
+    assert hot["value"] == pytest.approx(max(values), abs=0.5) and hot["value"] > np.quantile(values, 0.99)
+    assert cold["value"] < np.quantile(values, 0.05)
+    shown = page.execute_script("return [...document.querySelectorAll('#marks text')].map((one) => one.textContent)")
+    assert f"hot {hot['value']:.2f} °C" in shown and f"cold {cold['value']:.2f} °C" in shown
+    keys(page, "x")
+    assert page.execute_script("return document.querySelectorAll('#marks .spot').length") == 0
+
+
+def test_curves_and_the_picture_can_be_kept(page):
+    page.execute_script("viewer.probes = []; viewer.goTo(0); viewer.pin(...viewer.middle())")
+    head, *rows = page.execute_script("return viewer.curves()").strip().split("\n")
+    assert head.startswith("time (s),probe ") and head.endswith("truth (°C)")
+    told = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    series = "const p = viewer.probes[0]; return [viewer.chartTimes, p.model, p.truth]"
+    assert told.T == pytest.approx(np.array(page.execute_script(series)), abs=6e-4)
+    kept = page.execute_script("""viewer.frame(performance.now());
+      const kept = viewer.picturePage(), shown = document.getElementById('canvas');
+      const one = kept.getContext('2d').getImageData(0, 0, shown.width, shown.height).data;
+      return [kept.width - shown.width, kept.height - shown.height, new Set(one).size];""")
+    assert kept[0] == 0 and kept[1] > 20 and kept[2] > 50
+
+
+def test_colours_are_those_of_both_sides_of_another_time(page):
+    page.execute_script("viewer.goTo(0); viewer.choose({other: 'nothing'}); viewer.setTime(viewer.told.record[1])")
+    page.execute_script("viewer.frame(performance.now()); document.getElementById('auto').click()")
+    before = page.execute_script("return viewer.range")
+    page.execute_script("viewer.choose({otherTime: viewer.told.record[0], other: 'time', how: 'swipe'})")
+    low, high = page.execute_script("return viewer.range")
+    assert high > before[1] + 1  # it was warmer at the beginning
+    page.execute_script("viewer.state.ranges.values = [10, 11]; viewer.byHand = true; viewer.choose({other: 'truth'})")
+    assert page.execute_script("return viewer.range") == [10, 11]  # what was typed in stays
+
+
 def test_away_from_a_camera_its_image_gives_way_to_the_scene(page):
     page.execute_script("viewer.goTo(0, true); viewer.choose({other: 'recorded', how: 'difference'})")
     assert page.execute_script("return viewer.differing")
