@@ -293,6 +293,26 @@ def test_a_second_run_is_itself(page, folder):
     page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
     values = np.array(page.execute_script("return viewer.sampled()"))
     assert len(values) > 1000 and np.abs(values).max() < 0.01
+    at = "const c = document.getElementById('canvas').getBoundingClientRect(); viewer.hover(c.left + {} * c.width, c.top + 0.5 * c.height);"
+    told = "return document.getElementById('readout').textContent"
+    assert abs(float(page.execute_script(at.format(0.6) + told).split()[0])) < 0.01  # a difference, not a temperature
+    page.execute_script("viewer.choose({how: 'swipe'}); viewer.frame(performance.now())")
+    assert float(page.execute_script(at.format(0.6) + told).split()[0]) > 5
+
+
+def test_the_cursor_reads_what_is_shown_on_each_side(page):
+    page.execute_script(
+        "viewer.goTo(0); viewer.setTime(viewer.told.record[1]); viewer.choose({otherTime: viewer.told.record[0]})"
+    )
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    found = page.execute_script("""const v = viewer, c = document.getElementById('canvas'), x = c.width >> 1, y = c.height >> 1, told = [];
+      for (const split of [0.9, 0.1]) {
+        v.choose({other: 'time', how: 'swipe', split}); v.frame(performance.now());
+        told.push(v.valueOf(v.drawing.read('first', x, y, 1, 1), 0, x, y));
+      }
+      const pixel = v.splats.weightsAt(v.camera, (x + 0.5 - v.view.left) / v.view.scale, (y + 0.5 - v.view.top) / v.view.scale);
+      return [...told, ...v.splats.seriesAt(pixel, v.layer, [v.state.time, v.state.otherTime])];""")
+    assert found[:2] == pytest.approx(found[2:], abs=0.1) and abs(found[0] - found[1]) > 0.3
 
 
 def test_narrow_screens_have_everything_too(folder):

@@ -396,9 +396,9 @@ class Viewer {
     return content[k + 1] === 1 ? content[k] : null;
   }
 
-  // Value that the pixel (x, y) of the canvas shows, from what was blended there, [value, second, -, alpha] from the place j on;
-  // null where next to nothing is.
-  valueOf(blended, j, x, y) {
+  // Value that the pixel (x, y) of the canvas shows, from what was blended there, [value, second, -, alpha] from the place j on,
+  // and what was of a second run where one is compared; null where next to nothing is.
+  valueOf(blended, j, x, y, ofRun = null) {
     const alpha = blended[j + 3], { splats, told } = this;
     if (alpha < 0.02) return null;
     if (this.attribute) {
@@ -411,15 +411,24 @@ class Viewer {
     const [low, high] = told.tableEnds;
     const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
     const first = value(blended[j], layer);
-    if (this.differing && (this.state.other === "recorded" || this.state.other === "sensor")) {
+    const other = this.beside;
+    if (other === "nothing" || other === "visible" || (!this.differing && x <= this.state.split * $("canvas").width)) return first;
+    let second;
+    if (other === "recorded" || other === "sensor") {
       const seen = this.picturedAt(x, y);
       if (seen === null) return null;
-      return this.state.other === "recorded" ? first - seen : first - Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
-    }
-    const beside = this.state.other === "time" ? layer : splats.layer(this.state.other);
-    if (!beside) return first;
-    if (this.differing) return first - value(blended[j + 1], beside);
-    return x > this.state.split * $("canvas").width ? value(blended[j + 1], beside) : first;
+      second = other === "recorded" ? seen : Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
+    } else if (other === "run") {
+      if (!ofRun || ofRun[j + 3] < 0.05) return null;
+      const [start, end] = this.run.told.tableEnds, rest = 1 - ofRun[j + 3];
+      second = this.run.scene.splats.decoded(ofRun[j + 3] * start + ofRun[j] * (end - start) + rest * this.run.told.background);
+    } else second = value(blended[j + 1], other === "time" ? layer : splats.layer(other));
+    return this.differing ? first - second : second;
+  }
+
+  // What was blended of a second run in a rectangle, where one is compared.
+  readRun(x, y, width, height) {
+    return this.beside === "run" && this.run && this.layer ? this.drawing.read("second", x, y, width, height) : null;
   }
 
   // Values of the picture, to fit colours to and to count.
@@ -427,16 +436,11 @@ class Viewer {
     const { width, height } = $("canvas");
     const content = this.drawing.read("first", 0, 0, width, height);
     if (!content) return [];
-    const second = this.differing && this.state.other === "run" && this.run ? this.drawing.read("second", 0, 0, width, height) : null;
+    const ofRun = this.readRun(0, 0, width, height);
     const stride = 4 * Math.max(1, Math.round(width * height / 60000)), found = [];
     for (let j = 0; j < content.length; j += stride) {
-      const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width));
-      if (value === null) continue;
-      if (!second) found.push(this.attribute?.log ? Math.log10(value) : value);
-      else if (second[j + 3] > 0.05) {
-        const { told, scene } = this.run, [low, high] = told.tableEnds;
-        found.push(value - scene.splats.decoded(second[j + 3] * low + second[j] * (high - low) + (1 - second[j + 3]) * told.background));
-      }
+      const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width), ofRun);
+      if (value !== null) found.push(this.attribute?.log ? Math.log10(value) : value);
     }
     return found;
   }
@@ -481,15 +485,15 @@ class Viewer {
 
   // The hottest and the coldest place of the picture, left of the divider where there is one: {x, y, value}, in canvas pixels.
   extremes() {
-    if (this.state.quantity === "visible" || (this.differing && this.state.other === "run")) return null;
-    const { width, height } = $("canvas"), content = this.drawing.read("first", 0, 0, width, height);
+    if (this.state.quantity === "visible") return null;
+    const { width, height } = $("canvas"), ofRun = this.readRun(0, 0, width, height), content = this.drawing.read("first", 0, 0, width, height);
     const step = Math.max(1, Math.round(Math.sqrt(width * height / 2e5)));
     const end = this.beside !== "nothing" && !this.differing ? this.state.split * width : width;
     let hot = null, cold = null;
     for (let y = 0; y < height; y += step) for (let x = 0; x < end; x += step) {
       const j = 4 * ((height - 1 - y) * width + x);
       if (!(content[j + 3] > 0.5)) continue;  // edges of the scene
-      const value = this.valueOf(content, j, x, y);
+      const value = this.valueOf(content, j, x, y, ofRun);
       if (value === null) continue;
       if (!hot || value > hot.value) hot = { x, y, value };
       if (!cold || value < cold.value) cold = { x, y, value };
@@ -743,7 +747,7 @@ class Viewer {
     const x = Math.floor((clientX - box.left) * ratio), y = Math.floor((clientY - box.top) * ratio);
     const readout = $("readout");
     const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
-    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y) : null;
+    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y, this.readRun(x, y, 1, 1)) : null;
     readout.hidden = value === null;
     if (value === null) return;
     readout.textContent = this.words(value);
