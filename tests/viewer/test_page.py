@@ -293,11 +293,14 @@ def test_a_second_run_is_itself(page, folder):
     page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
     values = np.array(page.execute_script("return viewer.sampled()"))
     assert len(values) > 1000 and np.abs(values).max() < 0.01
-    at = "const c = document.getElementById('canvas').getBoundingClientRect(); viewer.hover(c.left + {} * c.width, c.top + 0.5 * c.height);"
+    at = (
+        "const box = document.getElementById('canvas').getBoundingClientRect();"
+        "viewer.hover(box.left + 0.6 * box.width, box.top + 0.5 * box.height);"
+    )
     told = "return document.getElementById('readout').textContent"
-    assert abs(float(page.execute_script(at.format(0.6) + told).split()[0])) < 0.01  # a difference, not a temperature
+    assert abs(float(page.execute_script(at + told).split()[0])) < 0.01  # a difference, not a temperature
     page.execute_script("viewer.choose({how: 'swipe'}); viewer.frame(performance.now())")
-    assert float(page.execute_script(at.format(0.6) + told).split()[0]) > 5
+    assert float(page.execute_script(at + told).split()[0]) > 5
 
 
 def test_the_cursor_reads_what_is_shown_on_each_side(page):
@@ -305,12 +308,14 @@ def test_the_cursor_reads_what_is_shown_on_each_side(page):
         "viewer.goTo(0); viewer.setTime(viewer.told.record[1]); viewer.choose({otherTime: viewer.told.record[0]})"
     )
     wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
-    found = page.execute_script("""const v = viewer, c = document.getElementById('canvas'), x = c.width >> 1, y = c.height >> 1, told = [];
+    found = page.execute_script("""const v = viewer, {width, height} = v.drawing.canvas, told = [];
+      const x = width >> 1, y = height >> 1;
       for (const split of [0.9, 0.1]) {
         v.choose({other: 'time', how: 'swipe', split}); v.frame(performance.now());
         told.push(v.valueOf(v.drawing.read('first', x, y, 1, 1), 0, x, y));
       }
-      const pixel = v.splats.weightsAt(v.camera, (x + 0.5 - v.view.left) / v.view.scale, (y + 0.5 - v.view.top) / v.view.scale);
+      const at = [x + 0.5 - v.view.left, y + 0.5 - v.view.top].map((place) => place / v.view.scale);
+      const pixel = v.splats.weightsAt(v.camera, ...at);
       return [...told, ...v.splats.seriesAt(pixel, v.layer, [v.state.time, v.state.otherTime])];""")
     assert found[:2] == pytest.approx(found[2:], abs=0.1) and abs(found[0] - found[1]) > 0.3
 
