@@ -13,7 +13,7 @@ from weathered import CAMERA
 from heatsplat.composition import build
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
-from heatsplat.uncertainty import Uncertainty, evidence, redundancy
+from heatsplat.uncertainty import Uncertainty, _shares, evidence, redundancy
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
 
@@ -169,3 +169,15 @@ def test_views_whose_errors_are_alike_count_as_fewer(kept, expected):
     for draw in draws[1:]:
         chain.append(kept * chain[-1] + (1 - kept**2) ** 0.5 * draw)
     assert redundancy(torch.stack(chain), torch.ones_like(draws)) == pytest.approx(expected, rel=0.15)
+
+
+def test_a_pixel_that_is_met_exactly_leaves_the_others_their_intervals():
+    """Where image and rendering are both at an end of the scene's range, a residual is 0: no gradient may be NaN there."""
+    generator = torch.Generator().manual_seed(0)
+    variances = torch.rand(4000, 3, generator=generator, dtype=torch.float64) + 0.1
+    squares = (variances.sum(1, keepdim=True).sqrt() * torch.randn(4000, 1, generator=generator)).square()
+    expected, _ = _shares(torch.cat([squares, variances], dim=1), 0.01)
+    squares[0] = 0.0
+    found, loss = _shares(torch.cat([squares, variances], dim=1), 0.01)
+    assert found.isfinite().all() and abs(loss) < 10.0
+    assert found == pytest.approx(expected, rel=0.02)

@@ -380,7 +380,8 @@ def _shares(rows: Tensor, noise: float) -> tuple[Tensor, float]:
     def loss() -> Tensor:
         optimiser.zero_grad()
         total = known + others @ logs.exp()
-        value = (0.5 * total.log() + (2 * squares / total).sqrt()).mean()
+        # As a product, for the root of a quotient has no gradient where a pixel is met exactly.
+        value = (0.5 * total.log() + (2 * squares).sqrt() * total.rsqrt()).mean()
         value.backward()
         return value
 

@@ -24,3 +24,12 @@ def test_another_library_reads_what_was_written(cooling, tmp_path, compressed):
     assert torch.allclose(torch.tensor(np.array(found["opacity"])), cooling.seen.opacities)
     colours = colours_of(cooling, "inferno", None)
     assert np.abs(found.red / 65535 - colours[:, 0]).max() < 1e-4
+
+
+def test_faint_gaussians_are_left_out_and_counted(cooling, tmp_path, caplog):
+    caplog.set_level("INFO", logger="heatsplat")
+    form = Las(compressed=False)
+    form.write(cooling, tmp_path / "a.las")
+    opaque = (cooling.seen.opacities >= 0.1).sum().item()
+    assert len(laspy.read(tmp_path / "a.las").points) == opaque
+    assert f"{opaque} of {len(cooling.seen.opacities)} Gaussians have an opacity of 0.1 or more" in caplog.text

@@ -59,3 +59,16 @@ def test_the_centre_lies_on_the_surface():
     (hot, *_), _ = extremes([Look(seen.camera, seen.depth, ring)], share=0.03)
     assert hot.mean == pytest.approx(30.0)
     assert 0.45 < (hot.centre[:2] - torch.tensor([0.1, 0.2], dtype=torch.float64)).norm() < 0.75
+
+
+def test_what_one_look_alone_puts_behind_a_wall_is_no_surface():
+    """A look whose hot patch lies a metre behind the wall that two others see; where those do not look, it counts."""
+    right, wrong = [look(-0.5), look(0.5)], look(0.0)
+    behind = wrong.values == 40.0
+    depth = torch.where(behind, wrong.depth + 1.0, wrong.depth)
+    cool = [Look(one.camera, one.depth, one.values.clamp(max=25.0)) for one in right]
+    (hot, *_), _ = extremes([*cool, Look(wrong.camera, depth, wrong.values)], share=0.03)
+    assert hot.mean < 26.0
+    blind = [Look(one.camera, torch.full_like(one.depth, torch.inf), one.values) for one in cool]
+    (hot, *_), _ = extremes([*blind, Look(wrong.camera, depth, wrong.values)], share=0.03)
+    assert hot.mean == pytest.approx(40.0) and hot.centre[2].item() == pytest.approx(5.0, abs=0.03)

@@ -20,6 +20,7 @@ from heatsplat.io.pictures import (
     comparison_panels,
     compose,
     error_limit_of,
+    visible,
     write_figure,
     write_png,
 )
@@ -203,3 +204,14 @@ def test_videos_are_checked(tmp_path, monkeypatch):
 def test_what_is_not_known_is_hatched_so_that_no_colour_bar_has_it():
     colors = colorize(np.full((12, 12), np.nan), 10, 50).reshape(-1, 3)
     assert {tuple(color) for color in np.unique(colors, axis=0)} == set(UNKNOWN)
+
+
+def test_visible_light_that_nobody_has_seen_is_hatched_like_temperatures():
+    image = torch.full((32, 48, 3), 0.5)
+    image[4:20, 8:30] = torch.nan
+    found = visible(image)
+    unseen = torch.full((32, 48), 20.0)
+    unseen[4:20, 8:30] = torch.nan
+    hatched = colorize(unseen, 0.0, 40.0)
+    assert (found[4:20, 8:30] == hatched[4:20, 8:30]).all() and len(np.unique(found[4:20, 8:30])) > 1
+    assert (found[:4] == 128).all()

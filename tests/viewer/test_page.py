@@ -188,6 +188,73 @@ def test_everything_beside_it_draws(page):
     assert page.execute_script("return viewer.errors") == []
 
 
+def test_coarser_numbers_while_frames_come_slowly_and_exact_ones_at_rest(page):
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    values = "viewer.frame(performance.now()); return viewer.sampled()"
+    exact = np.array(page.execute_script(values))
+    kind = "viewer.drawing.targets.first.kind === viewer.drawing.quicker"
+    quick, is_quick = page.execute_script(
+        f"viewer.drawing.quick = true; {values.replace('return ', 'return [')}, {kind}]"
+    )
+    assert is_quick
+    span = np.ptp(page.execute_script("return viewer.told.limits"))
+    assert 0 < np.abs(np.array(quick) - exact).max() < 0.01 * span
+    wait_until(page, "!viewer.drawing.quick && viewer.drawing.targets.first.kind === viewer.drawing.exact")
+    assert np.array(page.execute_script(values)) == pytest.approx(exact)
+
+
+def test_frames_that_come_slowly_cost_numbers_first_and_then_pixels(page):
+    """A clock that runs as on a slow computer, without waiting for it."""
+    found = page.execute_script("""const v = viewer, told = [];
+      v.dragging = true; v.pacing = null; v.lastFrame = 1000;
+      for (let i = 1; i < 4; i++) {
+        v.frame(1000 + 100 * i);
+        told.push([v.drawing.quick, v.quality]);
+      }
+      v.dragging = false;
+      return told;""")
+    assert found[0] == [True, 1] and found[1][1] < 1 and found[2][1] < found[1][1]
+    wait_until(page, "!viewer.drawing.quick && viewer.quality === 1")
+
+
+def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order && !viewer.pending")
+    keys(page, "x")
+    hot, cold = wait_until(page, "viewer.spots && [viewer.spots.hot, viewer.spots.cold]")
+    values = page.execute_script("return viewer.sampled()")
+    assert hot["value"] == pytest.approx(max(values), abs=0.5) and hot["value"] > np.quantile(values, 0.99)
+    assert cold["value"] < np.quantile(values, 0.05)
+    shown = page.execute_script("return [...document.querySelectorAll('#marks text')].map((one) => one.textContent)")
+    assert f"hot {hot['value']:.2f} °C" in shown and f"cold {cold['value']:.2f} °C" in shown
+    keys(page, "x")
+    assert page.execute_script("return document.querySelectorAll('#marks .spot').length") == 0
+
+
+def test_curves_and_the_picture_can_be_kept(page):
+    page.execute_script("viewer.probes = []; viewer.goTo(0); viewer.pin(...viewer.middle())")
+    head, *rows = page.execute_script("return viewer.curves()").strip().split("\n")
+    assert head.startswith("time (s),probe ") and head.endswith("truth (°C)")
+    told = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    series = "const p = viewer.probes[0]; return [viewer.chartTimes, p.model, p.truth]"
+    assert np.abs(told.T - np.array(page.execute_script(series))).max() < 6e-4
+    kept = page.execute_script("""viewer.frame(performance.now());
+      const kept = viewer.picturePage(), shown = document.getElementById('canvas');
+      const one = kept.getContext('2d').getImageData(0, 0, shown.width, shown.height).data;
+      return [kept.width - shown.width, kept.height - shown.height, new Set(one).size];""")
+    assert kept[0] == 0 and kept[1] > 20 and kept[2] > 50
+
+
+def test_colours_are_those_of_both_sides_of_another_time(page):
+    page.execute_script("viewer.goTo(0); viewer.choose({other: 'nothing'}); viewer.setTime(viewer.told.record[1])")
+    page.execute_script("viewer.frame(performance.now()); document.getElementById('auto').click()")
+    before = page.execute_script("return viewer.range")
+    page.execute_script("viewer.choose({otherTime: viewer.told.record[0], other: 'time', how: 'swipe'})")
+    low, high = page.execute_script("return viewer.range")
+    assert high > before[1] + 1  # it was warmer at the beginning
+    page.execute_script("viewer.state.ranges.values = [10, 11]; viewer.byHand = true; viewer.choose({other: 'truth'})")
+    assert page.execute_script("return viewer.range") == [10, 11]  # what was typed in stays
+
+
 def test_away_from_a_camera_its_image_gives_way_to_the_scene(page):
     page.execute_script("viewer.goTo(0, true); viewer.choose({other: 'recorded', how: 'difference'})")
     assert page.execute_script("return viewer.differing")
@@ -226,6 +293,31 @@ def test_a_second_run_is_itself(page, folder):
     page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
     values = np.array(page.execute_script("return viewer.sampled()"))
     assert len(values) > 1000 and np.abs(values).max() < 0.01
+    at = (
+        "const box = document.getElementById('canvas').getBoundingClientRect();"
+        "viewer.hover(box.left + 0.6 * box.width, box.top + 0.5 * box.height);"
+    )
+    told = "return document.getElementById('readout').textContent"
+    assert abs(float(page.execute_script(at + told).split()[0])) < 0.01  # a difference, not a temperature
+    page.execute_script("viewer.choose({how: 'swipe'}); viewer.frame(performance.now())")
+    assert float(page.execute_script(at + told).split()[0]) > 5
+
+
+def test_the_cursor_reads_what_is_shown_on_each_side(page):
+    page.execute_script(
+        "viewer.goTo(0); viewer.setTime(viewer.told.record[1]); viewer.choose({otherTime: viewer.told.record[0]})"
+    )
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    found = page.execute_script("""const v = viewer, {width, height} = v.drawing.canvas, told = [];
+      const x = width >> 1, y = height >> 1;
+      for (const split of [0.9, 0.1]) {
+        v.choose({other: 'time', how: 'swipe', split}); v.frame(performance.now());
+        told.push(v.valueOf(v.drawing.read('first', x, y, 1, 1), 0, x, y));
+      }
+      const at = [x + 0.5 - v.view.left, y + 0.5 - v.view.top].map((place) => place / v.view.scale);
+      const pixel = v.splats.weightsAt(v.camera, ...at);
+      return [...told, ...v.splats.seriesAt(pixel, v.layer, [v.state.time, v.state.otherTime])];""")
+    assert found[:2] == pytest.approx(found[2:], abs=0.1) and abs(found[0] - found[1]) > 0.3
 
 
 def test_narrow_screens_have_everything_too(folder):

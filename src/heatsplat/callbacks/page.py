@@ -17,23 +17,25 @@ PAGE_FILE = "report.html"
 QUALITY = 85  # of WebP, of 100, for still pictures
 FOLDED = ("The run", "Data: findings and assumptions", "Definitions of the scores", "Versions")
 STYLE = """
-:root { color-scheme: light dark; --paper: #fbfaf7; --ink: #23272b; --faint: #6a7178; --line: #dcd8d0; --accent: #a8470a; }
+:root { color-scheme: light dark; --paper: #ffffff; --ink: #1b1f24; --faint: #5d6672; --line: #e3e6ea; --accent: #b84a08; }
 @media (prefers-color-scheme: dark) {
-  :root { --paper: #14171a; --ink: #e6e9ec; --faint: #98a2ab; --line: #30363c; --accent: #ffa05a; }
+  :root { --paper: #14171b; --ink: #eceef1; --faint: #98a1ab; --line: #2a2f36; --accent: #ff8a3d; }
 }
-body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 1160px; background: var(--paper); color: var(--ink);
-  font: 16px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; overflow-wrap: anywhere; }
-h1 { font-size: 1.7rem; margin: 0 0 .3rem; }
-h2, summary { font-size: 1.15rem; font-weight: 650; margin: 2.2rem 0 .6rem;
-  border-top: 1px solid var(--line); padding-top: .8rem; }
+body { margin: 0 auto; padding: 2rem 1.25rem 4rem; max-width: 1160px; background: var(--paper); color: var(--ink);
+  font: 16px/1.55 Inter, system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; overflow-wrap: anywhere; }
+h1 { font-size: 1.75rem; font-weight: 650; letter-spacing: -.01em; margin: 0 0 .6rem; }
+h2, summary { font-size: 1.15rem; font-weight: 600; margin: 2.4rem 0 .8rem;
+  border-top: 1px solid var(--line); padding-top: 1.2rem; }
 summary { cursor: pointer; }
-nav { color: var(--faint); font-size: .9rem; }
+nav { display: flex; flex-wrap: wrap; gap: .4rem; font-size: .85rem; }
+nav a { padding: .15rem .7rem; border: 1px solid var(--line); border-radius: 1rem; color: var(--ink); text-decoration: none; }
+nav a:hover { border-color: var(--accent); color: var(--accent); }
 a { color: var(--accent); }
-img { max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
+img { max-width: 100%; height: auto; border: 1px solid var(--line); border-radius: 8px; background: #fff; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
-th, td { padding: .2rem .9rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { text-align: left; color: var(--faint); font-weight: 600; }
+table { border-collapse: collapse; font-size: .93rem; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
+th, td { padding: .35rem 1.4rem .35rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { text-align: left; color: var(--faint); font-size: .85rem; font-weight: 600; }
 @media print { details { display: block; } nav { display: none; } }
 """
 
@@ -62,7 +64,7 @@ def page(text: str, folder: Path) -> str:
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<title>{name[1] if name else "heatsplat"}</title><link rel="icon" href="data:,"><style>{STYLE}</style></head>\n'
-        f"<body>{head}<nav>{' · '.join(titles)}</nav>\n{''.join(sections)}</body></html>\n"
+        f"<body>{head}<nav>{''.join(titles)}</nav>\n{''.join(sections)}</body></html>\n"
     )
 
 

@@ -30,8 +30,8 @@ MARK = 8  # pixels
 class ExtremeSurfaces(pl.Callback):
     """Writes surfaces.csv and renders/surfaces.png at the end of the test, of scenes that have temperatures.
 
-    As the model renders them, without what the camera adds, in the middle of the record. Areas are those of what training
-    views see, in square metres where the scene's scale is known.
+    As the model renders them, without what the camera adds, at the moment of the training image nearest to the middle of the
+    record. Areas are those of what training views see, in square metres where the scene's scale is known.
 
     Args:
         views: training views from which surfaces are looked for, spread evenly.
@@ -71,10 +71,13 @@ class ExtremeSurfaces(pl.Callback):
 
 
 def middle(scene: SceneData, frame: Frame) -> Frame:
-    """A frame in the middle of the record, or as it is in scenes without time, small enough for a look."""
+    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look.
+
+    Between images, by day where all were taken by night, the model would only predict. In scenes without time, as it is.
+    """
     if frame.time_s is not None:
         start, span = scene.record
-        frame = at_time(scene, frame, start + span / 2)
+        frame = at_time(scene, frame, min(scene.train.times_s, key=lambda time_s: abs(time_s - start - span / 2)))
     return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
 
 

@@ -41,7 +41,8 @@ def extremes(looks: Sequence[Look], share: float = 0.05, count: int = 4) -> tupl
     """The hottest and the coldest surfaces, the largest ``count`` of each, from the most extreme mean on.
 
     Every pixel is a piece of surface whose area follows from its neighbours' depths; a piece that several looks see
-    counts once in all. The hottest (coldest) ``share`` of the whole area is joined where pieces touch.
+    counts once in all. One that a single look sees counts only where no other look has something else before or behind it.
+    The hottest (coldest) ``share`` of the whole area is joined where pieces touch.
 
     Args:
         looks: of the scene, at one moment.
@@ -52,7 +53,13 @@ def extremes(looks: Sequence[Look], share: float = 0.05, count: int = 4) -> tupl
     points, areas, values, widths = (torch.cat(column) for column in zip(*parts, strict=True))
     if not len(points):
         return [], []
-    areas = areas / sum(look.sees(points)[0].double() for look in looks).clamp(min=1)
+    seen = sum(look.sees(points)[0].long() for look in looks)
+    # Depths of a grazing look lie easily below the ground, in the air or in a wall: what one look alone sees, and another
+    # one denies, is no surface.
+    real = (seen > 1) | ~torch.stack([look.denies(points) for look in looks]).any(0)
+    points, areas, values, widths = points[real], (areas / seen.clamp(min=1))[real], values[real], widths[real]
+    if not len(points):
+        return [], []
     cell = CELLS * widths.median().item()
     order = values.argsort()
     reached = areas[order].cumsum(0) / areas.sum()

@@ -31,13 +31,23 @@ class Look:
 
     def sees(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Which points [n, 3] of surfaces it sees, [n] bool, and the values [n] of their pixels."""
+        inside, z, place = self._places(points)
+        there, found = self.depth[place].double(), self.values[place].double()
+        return inside & found.isfinite() & ((z - there).abs() <= DEPTH_TOLERANCE * there), found
+
+    def denies(self, points: Tensor) -> Tensor:
+        """Which points [n, 3] lie in its image where it shows a surface elsewhere, before or behind them; [n] bool."""
+        inside, z, place = self._places(points)
+        there = self.depth[place].double()
+        return inside & there.isfinite() & ((z - there).abs() > DEPTH_TOLERANCE * there)
+
+    def _places(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+        """Of points [n, 3] whether they lie in the image, their camera z, and row and column, within the image."""
         camera = self.camera
         local = to_camera(points.double(), camera.viewmat.double())
         column, row = to_pixels(local, camera.K.double()).floor().nan_to_num(-1).clamp(-1, 1e6).long().unbind(-1)
         inside = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-        place = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-        there, found = self.depth[place].double(), self.values[place].double()
-        return inside & found.isfinite() & ((local[:, 2] - there).abs() <= DEPTH_TOLERANCE * there), found
+        return inside, local[:, 2], (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1))
 
 
 def surface_points(camera: Camera, depth: Tensor) -> Tensor:

@@ -179,8 +179,12 @@ def error_limit_of(errors: Any) -> float:
 
 
 def visible(image: Any) -> np.ndarray:
-    """An image [H, W, 3] in [0, 1] as uint8; NaN is black."""
-    return (np.nan_to_num(np.asarray(image)).clip(0, 1) * 255).round().astype(np.uint8)
+    """An image [H, W, 3] in [0, 1] as uint8; a pixel with NaN is hatched grey."""
+    image = np.asarray(image)
+    colors = (np.nan_to_num(image).clip(0, 1) * 255).round().astype(np.uint8)
+    unknown = np.isnan(image).any(-1)
+    colors[unknown] = _hatching(image.shape[:2])[unknown]
+    return colors
 
 
 def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:

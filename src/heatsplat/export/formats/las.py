@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from heatsplat.export.formats.base import Format, colours_of, extra_columns, opt
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, place_of
 
+log = logging.getLogger("heatsplat")
+
 LONGEST_NAME = 32  # bytes of an extra dimension's name (LAS 1.4)
 STEPS = 2**30  # of a coordinate, stored as a whole number of 32 bits
 
@@ -22,7 +25,7 @@ class Las(Format):
 
     Args:
         compressed: LAZ.
-        least_opacity: Gaussians below are no surface and are left out, in [0, 1].
+        least_opacity: fainter Gaussians are left out, in [0, 1]: much of a surface is made of faint ones, and so is haze.
         colormap: colours of the points, as in ``formats.ply``.
         range_c: °C at the ends of the map; None takes the scene's range.
         gps: table of camera positions, "auto" or None (``export.place``).
@@ -31,7 +34,7 @@ class Las(Format):
     def __init__(
         self,
         compressed: bool = True,
-        least_opacity: float = 0.3,
+        least_opacity: float = 0.1,
         colormap: str = "inferno",
         range_c: Sequence[float] | None = None,
         gps: str | None = AUTO,
@@ -47,6 +50,7 @@ class Las(Format):
         kept = (moment.seen.opacities >= self.least_opacity).numpy()
         if not kept.any():
             raise SceneError(f"what.least_opacity={self.least_opacity}: no Gaussian is as opaque")
+        log.info("%d of %d Gaussians have an opacity of %g or more", kept.sum(), len(kept), self.least_opacity)
         points = place(moment.seen.means.double()).numpy()[kept]
         header = laspy.LasHeader(point_format=7, version="1.4")
         header.offsets = np.floor(points.min(0))

@@ -24,7 +24,7 @@ class Viewer {
       size: entry.recorded.shape, rgb: entry.rgb ? payload.array(entry.rgb) : null,
       added: entry.added ? entry.added.map((part) => ({ ...part, values: payload.array(part) })) : null }));
     this.off = new Set();  // parts of the camera's model that are switched off
-    this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, at: 0,
+    this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, spots: false, at: 0,
       time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
     this.probes = [];
     this.camera = this.cameras[0].camera;
@@ -116,7 +116,7 @@ class Viewer {
     }
     notes.push(...this.told.leftOut);
     if (this.told.effects.length) notes.push(`Effects in the model: ${this.told.effects.join(", ").replaceAll("_", " ")}.`);
-    notes.push(`Blended in ${this.drawing.precision}. Probes are computed in double precision, from the pixel of the camera they were pinned in.`);
+    notes.push(`Blended in ${this.drawing.exact.name}${this.drawing.exact === this.drawing.quicker ? "" : `, ${this.drawing.quicker.name} where frames come slowly while something moves`}. Probes are computed in double precision, from the pixel of the camera they were pinned in.`);
     $("notes").replaceChildren(...notes.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
     $("facts").textContent = `${this.splats.count.toLocaleString("en")} Gaussians`;
     const dark = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
@@ -244,7 +244,6 @@ class Viewer {
     this.state.playing = on;
     this.clockStart = null;
     if (on && this.state.time >= this.told.span[1]) this.setTime(this.told.span[0]);
-    $("play").textContent = on ? "❚❚" : "▶";
     $("play").setAttribute("aria-label", on ? "Pause" : "Play");
     this.request();
   }
@@ -275,7 +274,10 @@ class Viewer {
     if (since > 0 && since < 400 && (this.state.playing || this.dragging)) {
       this.pacing = this.pacing ? 0.9 * this.pacing + 0.1 * since : since;
       $("facts").textContent = `${this.splats.count.toLocaleString("en")} Gaussians · ${Math.round(1000 / this.pacing)} frames/s`;
-      if (this.pacing > PLAY_LIMIT_MS && this.quality > 0.5) this.quality = Math.max(0.5, this.quality - 0.1);
+      if (this.pacing > PLAY_LIMIT_MS) {  // coarser numbers first, then fewer pixels
+        if (this.drawing.quick) this.quality = Math.max(0.5, this.quality - 0.1);
+        else [this.drawing.quick, this.pacing] = [true, null];
+      }
     }
     this.resize();
     if (this.stale.order) {
@@ -284,6 +286,7 @@ class Viewer {
     }
     if (this.stale.values) this.fillValues();
     this.stale = { values: false, order: false };
+    this.spots = null;
     this.paint();
     this.overlay();
     if (this.state.playing) this.request();
@@ -293,8 +296,9 @@ class Viewer {
 
   // Once nothing moves: full size, the histogram.
   settle() {
-    if (!this.state.playing && !this.dragging && this.quality < 1) {
+    if (!this.state.playing && !this.dragging && (this.quality < 1 || this.drawing.quick)) {
       this.quality = 1;
+      this.drawing.quick = false;
       this.request();
       return;
     }
@@ -392,9 +396,9 @@ class Viewer {
     return content[k + 1] === 1 ? content[k] : null;
   }
 
-  // Value that the pixel (x, y) of the canvas shows, from what was blended there, [value, second, -, alpha] from the place j on;
-  // null where next to nothing is.
-  valueOf(blended, j, x, y) {
+  // Value that the pixel (x, y) of the canvas shows, from what was blended there, [value, second, -, alpha] from the place j on,
+  // and what was of a second run where one is compared; null where next to nothing is.
+  valueOf(blended, j, x, y, ofRun = null) {
     const alpha = blended[j + 3], { splats, told } = this;
     if (alpha < 0.02) return null;
     if (this.attribute) {
@@ -407,13 +411,24 @@ class Viewer {
     const [low, high] = told.tableEnds;
     const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
     const first = value(blended[j], layer);
-    if (this.differing && (this.state.other === "recorded" || this.state.other === "sensor")) {
+    const other = this.beside;
+    if (other === "nothing" || other === "visible" || (!this.differing && x <= this.state.split * $("canvas").width)) return first;
+    let second;
+    if (other === "recorded" || other === "sensor") {
       const seen = this.picturedAt(x, y);
       if (seen === null) return null;
-      return this.state.other === "recorded" ? first - seen : first - Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
-    }
-    const beside = this.state.other === "time" ? layer : splats.layer(this.state.other);
-    return this.differing && beside ? first - value(blended[j + 1], beside) : first;
+      second = other === "recorded" ? seen : Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
+    } else if (other === "run") {
+      if (!ofRun || ofRun[j + 3] < 0.05) return null;
+      const [start, end] = this.run.told.tableEnds, rest = 1 - ofRun[j + 3];
+      second = this.run.scene.splats.decoded(ofRun[j + 3] * start + ofRun[j] * (end - start) + rest * this.run.told.background);
+    } else second = value(blended[j + 1], other === "time" ? layer : splats.layer(other));
+    return this.differing ? first - second : second;
+  }
+
+  // What was blended of a second run in a rectangle, where one is compared.
+  readRun(x, y, width, height) {
+    return this.beside === "run" && this.run && this.layer ? this.drawing.read("second", x, y, width, height) : null;
   }
 
   // Values of the picture, to fit colours to and to count.
@@ -421,16 +436,11 @@ class Viewer {
     const { width, height } = $("canvas");
     const content = this.drawing.read("first", 0, 0, width, height);
     if (!content) return [];
-    const second = this.differing && this.state.other === "run" && this.run ? this.drawing.read("second", 0, 0, width, height) : null;
+    const ofRun = this.readRun(0, 0, width, height);
     const stride = 4 * Math.max(1, Math.round(width * height / 60000)), found = [];
     for (let j = 0; j < content.length; j += stride) {
-      const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width));
-      if (value === null) continue;
-      if (!second) found.push(this.attribute?.log ? Math.log10(value) : value);
-      else if (second[j + 3] > 0.05) {
-        const { told, scene } = this.run, [low, high] = told.tableEnds;
-        found.push(value - scene.splats.decoded(second[j + 3] * low + second[j] * (high - low) + (1 - second[j + 3]) * told.background));
-      }
+      const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width), ofRun);
+      if (value !== null) found.push(this.attribute?.log ? Math.log10(value) : value);
     }
     return found;
   }
@@ -465,14 +475,100 @@ class Viewer {
       const bin = Math.floor((value - low + pad) / (high - low + 2 * pad) * BINS);
       if (bin >= 0 && bin < BINS) counts[bin]++;
     }
+    if (this.state.spots) {
+      this.spots = this.extremes();
+      this.drawMarks();
+    }
     drawHistogram($("histogram"), counts, low - pad, high + pad, this.range, this.maps[this.mapName].colours);
     this.settled = true;
+  }
+
+  // The hottest and the coldest place of the picture, left of the divider where there is one: {x, y, value}, in canvas pixels.
+  extremes() {
+    if (this.state.quantity === "visible") return null;
+    const { width, height } = $("canvas"), ofRun = this.readRun(0, 0, width, height), content = this.drawing.read("first", 0, 0, width, height);
+    const step = Math.max(1, Math.round(Math.sqrt(width * height / 2e5)));
+    const end = this.beside !== "nothing" && !this.differing ? this.state.split * width : width;
+    let hot = null, cold = null;
+    for (let y = 0; y < height; y += step) for (let x = 0; x < end; x += step) {
+      const j = 4 * ((height - 1 - y) * width + x);
+      if (!(content[j + 3] > 0.5)) continue;  // edges of the scene
+      const value = this.valueOf(content, j, x, y, ofRun);
+      if (value === null) continue;
+      if (!hot || value > hot.value) hot = { x, y, value };
+      if (!cold || value < cold.value) cold = { x, y, value };
+    }
+    return hot && { hot, cold };
+  }
+
+  // Files to keep ----------------------------------------------------------------------------------------------------
+
+  keep(name, blob) {
+    const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  }
+
+  get stem() {
+    return `${this.told.scene}_${this.told.method}`.replace(/[^\w.-]+/g, "_");
+  }
+
+  // The curves of the probes as a table: a row for each moment, and of each probe the model and, where it is known, the truth.
+  curves() {
+    const unit = this.told.unit ? ` (${this.told.unit})` : "";
+    const columns = this.probes.flatMap((one) => [[`probe ${one.name}${unit}`, one.model], [`probe ${one.name} truth${unit}`, one.truth]])
+      .filter(([, values]) => values);
+    const rows = this.chartTimes.map((time, i) => [time.toFixed(3), ...columns.map(([, values]) => values[i].toFixed(unit ? 3 : 5))]);
+    return [["time (s)", ...columns.map(([name]) => name)], ...rows].map((row) => row.join()).join("\n") + "\n";
+  }
+
+  // The picture with its marks and, below it, the scale and the time: a canvas.
+  picturePage() {
+    const shown = $("canvas"), ratio = shown.width / shown.clientWidth, page = document.createElement("canvas");
+    const strip = Math.round(58 * ratio), style = getComputedStyle(document.body), ink = style.color;
+    Object.assign(page, { width: shown.width, height: shown.height + strip });
+    const context = page.getContext("2d");
+    context.fillStyle = style.backgroundColor;
+    context.fillRect(0, 0, page.width, page.height);
+    context.drawImage(shown, 0, 0);
+    context.font = `600 ${12 * ratio}px ${style.fontFamily}`;
+    for (const one of $("marks").querySelectorAll("circle, text")) {
+      const number = (key) => Number(one.getAttribute(key)) * ratio;
+      [context.strokeStyle, context.lineWidth, context.fillStyle] = [one.tagName === "text" ? "#000b" : "#fff", 2 * ratio, "#fff"];
+      if (one.tagName === "text") {
+        context.textAlign = one.getAttribute("text-anchor") || "start";
+        context.strokeText(one.textContent, number("x"), number("y"));
+        context.fillText(one.textContent, number("x"), number("y"));
+        continue;
+      }
+      context.beginPath();
+      context.arc(number("cx"), number("cy"), number("r"), 0, 2 * Math.PI);
+      if (one.getAttribute("fill")) {
+        context.fillStyle = one.getAttribute("fill");
+        context.fill();
+      }
+      context.stroke();
+    }
+    const top = shown.height, left = 14 * ratio, wide = Math.min(300 * ratio, page.width - 2 * left);
+    context.fillStyle = ink;
+    if (!$("legend").hidden) {
+      context.drawImage($("bar"), left, top + 24 * ratio, wide, 10 * ratio);
+      const words = [["barName", 0, 17, "start"], ["barLow", 0, 50, "start"], ["barMiddle", 0.5, 50, "center"], ["barHigh", 1, 50, "end"]];
+      for (const [id, share, down, align] of words) {
+        context.textAlign = align;
+        context.fillText($(id).textContent, left + share * wide, top + down * ratio);
+      }
+    }
+    context.textAlign = "end";
+    const told = [document.title, this.told.span ? $("timeText").textContent : ""].filter(Boolean).join(" · ");
+    if (page.width > 2 * wide) context.fillText(told, page.width - left, top + 17 * ratio);
+    return page;
   }
 
   // Controls follow the state ---------------------------------------------------------------------------------------
 
   overlay() {
-    const { state, told } = this, canvas = $("canvas"), ratio = canvas.width / canvas.clientWidth || 1;
+    const { state, told } = this;
     $("quantity").value = state.quantity;
     $("other").value = state.other;
     $("map").value = state.map;
@@ -481,6 +577,7 @@ class Viewer {
     $("how").hidden = state.other === "nothing" || state.other === "visible" || this.layer === null;
     $("otherTimeRow").hidden = state.other !== "time";
     $("parts").hidden = state.other !== "sensor";
+    $("spots").checked = state.spots;
     const swiping = this.beside !== "nothing" && this.layer !== null && !this.differing;
     $("divider").hidden = !swiping;
     $("divider").style.left = `${100 * state.split}%`;
@@ -491,6 +588,12 @@ class Viewer {
       $("time").setAttribute("aria-valuetext", $("timeText").textContent);
       $("otherTime").value = state.otherTime;
       $("otherTimeText").textContent = this.clock(state.otherTime);
+      const share = (moment) => (moment - told.span[0]) / (told.span[1] - told.span[0]);
+      for (const [id, moment] of [["time", state.time], ["otherTime", state.otherTime]]) {
+        $(id).style.setProperty("--share", share(moment));
+        $(id).style.setProperty("--from", `${100 * share(told.record[0])}%`);
+        $(id).style.setProperty("--to", `${100 * share(told.record[1])}%`);
+      }
     }
     const shown = (value) => this.attribute?.log ? 10 ** value : value;
     const digits = (value) => Number(shown(value).toPrecision(4)).toString();
@@ -499,17 +602,18 @@ class Viewer {
     }
     $("legend").hidden = state.quantity === "visible";
     $("barLow").textContent = digits(this.range[0]);
+    $("barMiddle").textContent = digits((this.range[0] + this.range[1]) / 2);
     $("barHigh").textContent = digits(this.range[1]);
     const quantity = $("quantity").selectedOptions[0]?.text || "";
     $("barName").textContent = (this.differing ? `minus ${$("other").selectedOptions[0].text}` : quantity.replace(/^learned: /, ""))
       + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
     drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
-    this.drawMarks(ratio);
+    this.drawMarks();
     this.drawProbes();
   }
 
-  drawMarks(ratio) {
-    const svg = $("marks"), { view } = this;
+  drawMarks() {
+    const svg = $("marks"), { view } = this, ratio = $("canvas").width / $("canvas").clientWidth || 1;
     svg.replaceChildren();
     const place = (point) => {
       const pixel = this.camera.project(point);
@@ -531,6 +635,12 @@ class Viewer {
       node("circle", { cx: at[0], cy: at[1], r: 6, fill: probe.colour, stroke: "#fff", "stroke-width": 2 }, svg);
       node("text", { x: at[0] + 10, y: at[1] + 4 }, svg, probe.name);
     });
+    for (const [name, mark] of Object.entries(this.spots || {})) {
+      const x = (mark.x + 0.5) / ratio, y = (mark.y + 0.5) / ratio, near = x > $("canvas").clientWidth - 110;
+      node("circle", { class: "spot", cx: x, cy: y, r: 7 }, svg);
+      node("path", { class: "spot", d: `M${x - 11},${y}h6m10,0h6M${x},${y - 11}v6m0,10v6` }, svg);
+      node("text", { x: x + (near ? -14 : 14), y: y + 4, "text-anchor": near ? "end" : "start" }, svg, `${name} ${this.words(mark.value)}`);
+    }
     if (document.activeElement === $("canvas") && this.keyboard) {
       const x = $("canvas").clientWidth / 2, y = $("canvas").clientHeight / 2;
       node("path", { class: "cross", d: `M${x - 12},${y}h8m8,0h8M${x},${y - 12}v8m0,8v8` }, svg);
@@ -597,8 +707,9 @@ class Viewer {
 
   drawProbes() {
     const unit = this.told.unit, list = $("probes");
-    if (this.told.span) drawCurves($("chart"), this.chartTimes || [], this.probes, this.state.time, unit, this.told.record);
+    $("curves").hidden = !this.told.span || !this.probes.length;
     $("chart").style.display = this.told.span && this.probes.length ? "" : "none";
+    if (this.told.span) drawCurves($("chart"), this.chartTimes || [], this.probes, this.state.time, unit, this.told.record);
     const dots = this.probes.some((probe) => probe.dots.length), truth = this.probes.some((probe) => probe.truth);
     $("chartNote").textContent = !this.told.span || !this.probes.length ? "" : `Lines: model${truth ? "; dashes: truth" : dots ? "; dots: training images" : ""}.`;
     const items = this.probes.map((probe) => {
@@ -625,17 +736,21 @@ class Viewer {
     if (focused >= 0) (list.querySelectorAll("button")[focused] || $("canvas")).focus();
   }
 
+  // A value of the picture, with its unit.
+  words(value) {
+    const number = this.attribute ? Number(value.toPrecision(3)) : value.toFixed(this.unit ? 2 : 4);
+    return `${this.differing && value > 0 ? "+" : ""}${number}${this.unit ? ` ${this.unit}` : ""}`;
+  }
+
   hover(clientX, clientY) {
     const canvas = $("canvas"), box = canvas.getBoundingClientRect(), ratio = canvas.width / box.width;
     const x = Math.floor((clientX - box.left) * ratio), y = Math.floor((clientY - box.top) * ratio);
     const readout = $("readout");
     const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
-    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y) : null;
+    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y, this.readRun(x, y, 1, 1)) : null;
     readout.hidden = value === null;
     if (value === null) return;
-    const number = this.attribute ? Number(value.toPrecision(3)) : value.toFixed(this.unit ? 2 : 4);
-    const mark = this.differing && value > 0 ? "+" : "";
-    readout.textContent = `${mark}${number}${this.unit ? ` ${this.unit}` : ""}`;
+    readout.textContent = this.words(value);
     const left = clientX - box.left, right = left > box.width - 110;
     readout.style.left = `${left + (right ? -100 : 14)}px`;
     readout.style.top = `${Math.max(clientY - box.top - 34, 4)}px`;
@@ -652,6 +767,11 @@ class Viewer {
       this.say(AT_CAMERAS);
     }
     if (this.layer && this.chartTimes) this.probes.forEach((probe) => this.measure(probe));
+    const besideIt = "other" in changes && !this.byHand && (this.state.other === "time" || this.splats.layer(this.state.other));
+    if (besideIt && this.layer && !this.differing) {  // colours for both sides
+      this.frame(performance.now());
+      this.fit();
+    }
     if (!this.state.ranges[this.rangeName]) {
       this.state.ranges[this.rangeName] = this.differing ? [-1, 1] : this.attribute ? [this.attribute.low, this.attribute.high] : [...this.told.limits];
       this.frame(performance.now());
@@ -663,7 +783,7 @@ class Viewer {
   cycle(id, key) {
     const options = [...$(id).options].map((option) => option.value);
     this.choose({ [key]: options[(options.indexOf(this.state[key]) + 1) % options.length] });
-    this.say(`${id === "other" ? "beside: " : ""}${[...$(id).options].find((option) => option.value === this.state[key]).text}`);
+    this.say(`${id === "other" ? "compare with: " : ""}${[...$(id).options].find((option) => option.value === this.state[key]).text}`);
   }
 
   fold(on) {
@@ -676,6 +796,11 @@ class Viewer {
     const root = document.documentElement;
     root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
     this.request();
+  }
+
+  help() {
+    $("keys").showModal();
+    $("keys").scrollTop = 0;  // the button that has the focus is at its end
   }
 
   async openRun(file) {
@@ -762,12 +887,19 @@ class Viewer {
     for (const input of document.querySelectorAll("input[name=how]")) input.onchange = () => this.choose({ how: input.value });
     for (const input of document.querySelectorAll("input[name=move]")) input.onchange = () => this.choose({ walk: input.value === "walk" });
     $("map").onchange = () => this.choose({ map: $("map").value });
-    $("auto").onclick = () => this.fit();
+    $("auto").onclick = () => {
+      this.byHand = false;
+      this.fit();
+    };
+    $("spots").onchange = () => this.choose({ spots: $("spots").checked });
+    $("save").onclick = () => this.picturePage().toBlob((blob) => this.keep(`${this.stem}.png`, blob));
+    $("curves").onclick = () => this.keep(`${this.stem}_probes.csv`, new Blob([this.curves()], { type: "text/csv" }));
     const ends = () => {
       const of = (id) => this.attribute?.log ? Math.log10(Number($(id).value)) : Number($(id).value);
       const [low, high] = [of("low"), of("high")];
       if (!(low < high)) return this.say("The lower end of the colours must be below the upper one.");
       this.state.ranges[this.rangeName] = [low, high];
+      this.byHand = true;
       return this.request();
     };
     $("low").onchange = $("high").onchange = ends;
@@ -775,7 +907,7 @@ class Viewer {
     $("otherTime").oninput = () => this.choose({ otherTime: Number($("otherTime").value) });
     $("play").onclick = () => this.play(!this.state.playing);
     $("theme").onclick = () => this.theme();
-    $("help").onclick = () => $("keys").showModal();
+    $("help").onclick = () => this.help();
     $("fold").onclick = () => this.fold(!document.body.classList.contains("folded"));
     $("run").onchange = () => $("run").files[0] && this.openRun($("run").files[0]);
     document.body.ondragover = (event) => event.preventDefault();
@@ -811,11 +943,12 @@ class Viewer {
       "[": () => this.choose({ split: Math.max(this.state.split - 0.04, 0.02) }),
       "]": () => this.choose({ split: Math.min(this.state.split + 0.04, 0.98) }),
       c: () => this.cycle("map", "map"), r: () => this.fit(),
+      x: () => this.choose({ spots: !this.state.spots }),
       o: () => {
         this.choose({ walk: !this.state.walk });
         this.say(this.state.walk ? "walk" : "orbit");
       },
-      t: () => this.theme(), h: () => $("keys").showModal(), "?": () => $("keys").showModal(),
+      t: () => this.theme(), h: () => this.help(), "?": () => this.help(),
       "\\": () => this.fold(!document.body.classList.contains("folded")),
     };
     const action = actions[key.length === 1 ? key.toLowerCase() : key];
