@@ -287,7 +287,7 @@ def learned_section(folder: Path) -> list[str]:
     note = (
         "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
         "uncertainty of a "
-        + ("value; that is the median standard deviation of one Gaussian. " if known else
+        + ("value, which is the median standard deviation of one Gaussian. " if known else
            "value, which `evaluate.py callbacks=uncertainty` estimates. ")
         + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
     )  # fmt: skip
