@@ -116,17 +116,29 @@ def _recorded(device: Device, zone: str | None) -> Material:
     """The files of a thermal camera, without poses."""
     frames = device.frames
     chosen = evenly_spread(len(frames), MAX_FRAMES)
-    images = [frames[i].pixels() for i in chosen]
+    images = torch.from_numpy(np.stack([frames[i].pixels() for i in chosen])).double()
     known = all(frame.calibration is not None for frame in frames)
+    bounds = _bounds_of_greys(frames[chosen[0]])
+    if bounds is not None:
+        images = (images - bounds[0]) / (bounds[1] - bounds[0])
     times = [None if frame.time is None else instant(frame.time) for frame in frames]
     return Material(
         names=[frame.name for frame in frames],
         times_s=None if any(time is None for time in times) else times,
         chosen=chosen,
-        images=torch.from_numpy(np.stack(images)).double(),
-        unit_k=1.0 if known else None,
+        images=images,
+        unit_k=bounds[1] - bounds[0] if bounds is not None else 1.0 if known else None,
+        bounds_c=bounds,
         rgb_times_s=_photo_times(frames, zone),
     )
+
+
+def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
+    """°C of black and white where a frame is a grey of 8 bits with bounds; else None."""
+    calibration = frame.calibration
+    if calibration is None or calibration.scale is None or frame.load().dtype != np.uint8:
+        return None
+    return calibration.offset_c, calibration.offset_c + np.iinfo(np.uint8).max * calibration.scale
 
 
 def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | None:
