@@ -27,6 +27,7 @@ from heatsplat.preparation.report import Section
 log = logging.getLogger(__name__)
 
 QUARTER_S = 900.0  # zones lie whole quarters of an hour apart
+LATER = "Drift, poses, focal length and what else needs cameras is looked at once they are known."
 DONE = {"dead_pixels": "The masks of the prepared scene leave them out."}  # what a preparation does by itself
 
 
@@ -54,8 +55,11 @@ def check(
     """
     rows = Path(table).expanduser() if table else None
     reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
-    found = examined(materials_in(Path(folder).expanduser(), downscale, reading))
+    materials = materials_in(Path(folder).expanduser(), downscale, reading)
+    found = examined(materials)
     show(found, str(folder))
+    if _more_with_cameras(materials, found):
+        log.info("%s", LATER)
     path = (target or Path()) / FINDINGS_FILE
     write_findings(found, path)
     log.info("%s", path)
@@ -71,9 +75,14 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
-    if not posed and all(one.check != "still" for one in found):
-        lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
+    if _more_with_cameras(materials, found):
+        lines += ["", LATER]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
+
+
+def _more_with_cameras(materials: Mapping[str, Material], found: Sequence[Finding]) -> bool:
+    """Whether a search for cameras would let more checks look; not where the camera stood still."""
+    return all(one.cameras is None for one in materials.values()) and all(one.check != "still" for one in found)
 
 
 def materials_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> dict[str, Material]:

@@ -34,6 +34,17 @@ def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
     assert {"dead_pixels", "pairing"} <= {one["check"] for one in said.values["findings"]}
 
 
+def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
+    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    write_camera(recording, tmp_path / "camera")
+    write_colmap(recording, tmp_path / "scene")
+    for folder, told in (("camera", True), ("scene", False)):
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            assert check(str(tmp_path / folder), tmp_path) == []
+        assert ("once they are known" in caplog.text) == told
+
+
 def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_prepared(tmp_path):
     recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
     low, high = float(recording.celsius.min()), float(recording.celsius.max())
