@@ -64,8 +64,8 @@ def run(
         output_dir: of the study; files, prepared scenes and runs lie in it.
         prepare, train: paths of prepare.py and train.py.
         cases: name -> a recording that is written as a camera would (scene, frames, width, height, and the rest of
-            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings, search and
-            train: further overrides of prepare.py, of its search for cameras alone, and of train.py.
+            ``write_camera``'s Field), or files and the folder whose sparse/0 has their cameras (files, model); settings, search
+            and train: further overrides of prepare.py, of its search for cameras alone, and of train.py.
         overrides: of train.py; None: nothing is trained.
         threads: CPU threads of training; None is all cores.
         seeds: of training; cameras are found once.
