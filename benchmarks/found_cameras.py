@@ -15,6 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from statistics import fmean, stdev
 from typing import Any
 
 import numpy as np
@@ -53,17 +54,21 @@ def run(
     cases: Mapping[str, Mapping[str, Any]],
     overrides: Sequence[str] | None,
     threads: int | None = None,
+    seeds: Sequence[int] = (0,),
 ) -> None:
     """Prepares every case, compares its cameras, trains it with both; writes found_cameras.md. What is done is not done again.
+
+    Of several seeds the table has means and, of the scores, standard deviations.
 
     Args:
         output_dir: of the study; files, prepared scenes and runs lie in it.
         prepare, train: paths of prepare.py and train.py.
         cases: name -> a recording that is written as a camera would (scene, frames, width, height, and the rest of
-            ``write_camera``'s Field), or files and the folder of a COLMAP model of them (files, model); settings, search and
-            train: further overrides of prepare.py, of its search for cameras alone, and of train.py.
+            ``write_camera``'s Field), or files and the folder whose sparse/0 has their cameras (files, model); settings, search
+            and train: further overrides of prepare.py, of its search for cameras alone, and of train.py.
         overrides: of train.py; None: nothing is trained.
         threads: CPU threads of training; None is all cores.
+        seeds: of training; cameras are found once.
 
     Raises:
         SceneError: prepare.py found no cameras, or a run failed.
@@ -86,11 +91,19 @@ def run(
         )
         lines = [*overrides, *case.get("train", ()), "data=colmap", f"threads={'null' if threads is None else threads}"]
         for kind in ("found", "true"):
-            results = trained(place / f"trained_{kind}", train, [*lines, f"data.root={place / kind}"], output_dir)
-            training.append([name, kind, *_scores(results)])
+            runs = [
+                trained(
+                    place / f"trained_{kind}_{seed}",
+                    train,
+                    [*lines, f"seed={seed}", f"data.root={place / kind}"],
+                    output_dir,
+                )
+                for seed in seeds
+            ]
+            training.append([name, kind, *_scores(runs)])
     text = markdown_table(["scene", "found", "angle", "place", "s", "MiB"], cameras)
     if training:
-        head = ["scene", "cameras", "PSNR, dB", "MAE, °C", "Gaussians", "s"]
+        head = ["scene", "cameras", "PSNR, dB", "MAE, °C", "Gaussians", "processor s"]
         text += ["", *markdown_table(head, training)]
     write_atomically(output_dir / TABLE_FILE, "\n".join(text) + "\n")
     log.info("\n%s", "\n".join(text))
@@ -187,10 +200,13 @@ def _row(name: str, frames: int, errors: PoseErrors, spent: Mapping[str, float])
     ]
 
 
-def _scores(results: RunResults) -> list[str]:
+def _scores(runs: Sequence[RunResults]) -> list[str]:
+    def told(values: list[float], digits: int, spread: bool = False) -> str:
+        return number(fmean(values), digits, stdev(values) if spread and len(values) > 1 else None)
+
     return [
-        number(results.test["psnr"], 1),
-        number(results.test["mae_c"], 3),
-        number(results.cost["gaussians"], 0),
-        number(results.cost["train_seconds"], 0),
+        told([run.test["psnr"] for run in runs], 1, spread=True),
+        told([run.test["mae_c"] for run in runs], 3, spread=True),
+        told([run.cost["gaussians"] for run in runs], 0),
+        told([run.cost["cpu_seconds"] for run in runs], 0),
     ]

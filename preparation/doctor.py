@@ -27,6 +27,7 @@ from heatsplat.preparation.report import Section
 log = logging.getLogger(__name__)
 
 QUARTER_S = 900.0  # zones lie whole quarters of an hour apart
+LATER = "Drift, poses, focal length and what else needs cameras is looked at once they are known."
 DONE = {"dead_pixels": "The masks of the prepared scene leave them out."}  # what a preparation does by itself
 
 
@@ -54,8 +55,11 @@ def check(
     """
     rows = Path(table).expanduser() if table else None
     reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
-    found = examined(materials_in(Path(folder).expanduser(), downscale, reading))
+    materials = materials_in(Path(folder).expanduser(), downscale, reading)
+    found = examined(materials)
     show(found, str(folder))
+    if _more_with_cameras(materials, found):
+        log.info("%s", LATER)
     path = (target or Path()) / FINDINGS_FILE
     write_findings(found, path)
     log.info("%s", path)
@@ -71,9 +75,14 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     for one in found:
         log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
-    if not posed and all(one.check != "still" for one in found):
-        lines += ["", "Drift, poses, focal length and what else needs cameras is looked at once they are known."]
+    if _more_with_cameras(materials, found):
+        lines += ["", LATER]
     return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
+
+
+def _more_with_cameras(materials: Mapping[str, Material], found: Sequence[Finding]) -> bool:
+    """Whether a search for cameras would let more checks look; not where the camera stood still."""
+    return all(one.cameras is None for one in materials.values()) and all(one.check != "still" for one in found)
 
 
 def materials_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> dict[str, Material]:
@@ -116,17 +125,29 @@ def _recorded(device: Device, zone: str | None) -> Material:
     """The files of a thermal camera, without poses."""
     frames = device.frames
     chosen = evenly_spread(len(frames), MAX_FRAMES)
-    images = [frames[i].pixels() for i in chosen]
+    images = torch.from_numpy(np.stack([frames[i].pixels() for i in chosen])).double()
     known = all(frame.calibration is not None for frame in frames)
+    bounds = _bounds_of_greys(frames[chosen[0]])
+    if bounds is not None:
+        images = (images - bounds[0]) / (bounds[1] - bounds[0])
     times = [None if frame.time is None else instant(frame.time) for frame in frames]
     return Material(
         names=[frame.name for frame in frames],
         times_s=None if any(time is None for time in times) else times,
         chosen=chosen,
-        images=torch.from_numpy(np.stack(images)).double(),
-        unit_k=1.0 if known else None,
+        images=images,
+        unit_k=bounds[1] - bounds[0] if bounds is not None else 1.0 if known else None,
+        bounds_c=bounds,
         rgb_times_s=_photo_times(frames, zone),
     )
+
+
+def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
+    """°C of black and white where a frame is a grey of 8 bits with bounds; else None."""
+    calibration = frame.calibration
+    if calibration is None or calibration.scale is None or frame.load().dtype != np.uint8:
+        return None
+    return calibration.offset_c, calibration.offset_c + np.iinfo(np.uint8).max * calibration.scale
 
 
 def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | None:

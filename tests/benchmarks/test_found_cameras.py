@@ -30,7 +30,12 @@ def in_another_world(viewmat: np.ndarray) -> np.ndarray:
     return moved
 
 
-def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("seeds", "scores"),
+    [((0,), "31.0 | 0.100 | 1,200"), ((0, 2), "32.0 ± 1.4 | 0.100 ± 0.000 | 1,300")],
+    ids=["one seed", "two"],
+)
+def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, monkeypatch, seeds, scores):
     true = film(Scene(PRESETS["cooling"]), Size(32, 24, 5, 16)).viewmats
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
     asked, trained_on = [], []
@@ -47,20 +52,24 @@ def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, mo
 
     def train(place, program, overrides, study):
         trained_on.append(overrides)
+        seed = int(overrides[-2].removeprefix("seed="))
         results = RunResults()
-        for section, name, value in (("test", "psnr", 31.25), ("test", "mae_c", 0.1), ("cost", "gaussians", 1200)):
+        for section, name, value in (
+            ("test", "psnr", 31.0 + seed),
+            ("test", "mae_c", 0.1),
+            ("cost", "gaussians", 1200 + 100 * seed),
+            ("cost", "cpu_seconds", 7.0),
+        ):
             results.put(section, name, value)
-        results.put("cost", "train_seconds", 7.0)
         return results
 
     monkeypatch.setattr(found_cameras, "prepared", pretend)
     monkeypatch.setattr(found_cameras, "trained", train)
-    found_cameras.run(
-        tmp_path, "prepare.py", "train.py", {"room": CASE | {"settings": ["poses.clip=2"]}}, ["max_steps=3"], 1
-    )
+    case = {"room": CASE | {"settings": ["poses.clip=2"]}}
+    found_cameras.run(tmp_path, "prepare.py", "train.py", case, ["max_steps=3"], 1, seeds)
     table = (tmp_path / TABLE_FILE).read_text()
     assert "| room | 4 of 5 | 0.00° (0.00°) | 0.00 % (0.00 %) | 12 | 456 |" in table
-    assert "| room | found | 31.2 | 0.100 | 1,200 | 7 |" in table and "| room | true | 31.2 " in table
+    assert f"| room | found | {scores} | 7 |" in table and f"| room | true | {scores} " in table
     given = read_model(tmp_path / "room" / "model")
     np.testing.assert_allclose(np.stack(given.viewmats), true[[0, 1, 3, 4]], atol=1e-9)
     np.testing.assert_allclose(np.sort(given.points, 0), np.sort(points, 0), atol=1e-6)
@@ -68,8 +77,8 @@ def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, mo
     assert (
         asked[0] == [f"source={tmp_path / 'room' / 'files' / 'thermal'}", "poses.clip=2"] and "poses=given" in asked[1]
     )
-    assert [lines[-1] for lines in trained_on] == [
-        f"data.root={tmp_path / 'room' / kind}" for kind in ("found", "true")
+    assert [lines[-2:] for lines in trained_on] == [
+        [f"seed={seed}", f"data.root={tmp_path / 'room' / kind}"] for kind in ("found", "true") for seed in seeds
     ]
 
 

@@ -11,11 +11,24 @@ def test_contrast_that_the_camera_stretches_is_no_temperature():
     middle = clean().images.mean()
     wild = (middle + gain[:, None, None] * (clean().images - middle)).clamp(0, 1)
     assert "agc" in checks(changed(clean(), wild))
-    low, high = clean().images.amin((1, 2), keepdim=True), clean().images.amax((1, 2), keepdim=True)
-    assert "agc" in checks(changed(clean(), (clean().images - low) / (high - low), cameras=None, points=None))
     assert "agc" not in checks(
         changed(clean(), wild, unit_k=None, bounds_c=None)
     )  # greys that nobody calls temperatures
+
+
+def test_greys_that_all_reach_from_black_to_white_were_stretched_one_by_one():
+    low, high = clean().images.amin((1, 2), keepdim=True), clean().images.amax((1, 2), keepdim=True)
+    full = (clean().images - low) / (high - low)
+    greys = (255.0 * full).round() / 255.0
+    assert "agc" in checks(changed(clean(), greys, cameras=None, points=None))
+    # Temperatures whose warmest and coldest spots every frame shows are no pictures.
+    assert "agc" not in checks(changed(clean(), full, cameras=None, points=None))
+
+
+def test_frames_in_celsius_have_no_black_and_white():
+    winter = 30.0 * clean().images - 10.0
+    unposed = {"unit_k": 1.0, "bounds_c": None, "cameras": None, "points": None}
+    assert "agc" not in checks(changed(clean(), winter, **unposed))
 
 
 def test_mist_that_comes_and_goes_is_no_camera_that_stretches():

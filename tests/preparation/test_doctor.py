@@ -17,7 +17,8 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
 from heatsplat.preparation.doctor import _photo_times, check, section
 from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import read_frames, taken_at
+from heatsplat.preparation.frames import Reading, read_frames, taken_at
+from heatsplat.preparation.meaning import Meaning
 
 
 def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
@@ -31,6 +32,31 @@ def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
     write_camera(recording, tmp_path / "camera", Field(dead_pixels=5, rgb=True, rgb_clock_s=400.0))
     said = section(tmp_path / "camera")
     assert {"dead_pixels", "pairing"} <= {one["check"] for one in said.values["findings"]}
+
+
+def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
+    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    write_camera(recording, tmp_path / "camera")
+    write_colmap(recording, tmp_path / "scene")
+    for folder, told in (("camera", True), ("scene", False)):
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            assert check(str(tmp_path / folder), tmp_path) == []
+        assert ("once they are known" in caplog.text) == told
+
+
+def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_prepared(tmp_path):
+    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    low, high = float(recording.celsius.min()), float(recording.celsius.max())
+    for name in ("stretched", "linear"):
+        (tmp_path / name).mkdir()
+        for i, frame in enumerate(recording.celsius):
+            own = np.quantile(frame, (0.002, 0.998)) if name == "stretched" else (low - 1.0, high + 1.0)
+            grey = np.rint(255.0 * np.clip((frame - own[0]) / (own[1] - own[0]), 0, 1)).astype(np.uint8)
+            Image.fromarray(grey).save(tmp_path / name / f"{i}.png")
+    reading = Reading(Meaning(bounds_c=(low - 1.0, high + 1.0)))
+    said = {name: section(tmp_path / name, reading).values["findings"] for name in ("stretched", "linear")}
+    assert said["stretched"][0]["check"] == "agc" and said["linear"] == []
 
 
 def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):

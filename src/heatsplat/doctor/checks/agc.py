@@ -7,6 +7,7 @@ from torch import Tensor
 
 from heatsplat.doctor.base import Check, Finding, Material
 from heatsplat.doctor.checks.drift import frame_levels
+from heatsplat.physics.noise import quantum_of
 
 MIN_POINTS, MIN_FRAMES = 40, 5
 GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
@@ -14,6 +15,7 @@ ROUGH = 0.4  # leaps in spreads of the gains: 1.2 where they have no order in ti
 EXPLAINED = 0.5  # share of what levels leave that gains have to explain
 ALIKE = 0.8  # correlation of what two halves of the points tell of the gains; a pane changes only what it mirrors
 FULL, MOST = 0.012, 0.9  # how near black and white frames reach that the camera stretched, and the share of such frames
+FINEST = 1.0 / 300.0  # of the range; steps of 8-bit greys are 1/255
 REACH = 3  # pixels that have to: a dead one alone does not count
 
 
@@ -85,6 +87,10 @@ def _leaps(gain: Tensor, times_s: Tensor | None) -> Tensor:
 
 
 def _fills_the_range(material: Material) -> bool:
+    """Whether nearly all greys of 8 bits reach from black to white. What has bounds and finer steps was no picture: a scene
+    whose warmest and coldest spots every frame shows fills the bounds that it was given after them."""
+    if material.bounds_c is None or quantum_of(material.known(0)) < FINEST:
+        return False
     full = 0
     for f in range(len(material.images)):
         known = material.known(f)
