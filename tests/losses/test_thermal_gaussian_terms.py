@@ -80,7 +80,7 @@ def test_the_image_with_more_gaussians_weighs_less():
 def test_a_share_without_opacities_of_its_own_is_refused():
     single = Splats({"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "quats": torch.ones(2, 4)}
                     | {"opacity_logits": torch.zeros(2, 1)})  # fmt: skip
-    with pytest.raises(ValueError, match=r"who has opacity 0, but Gaussians have 1; .*thermal.shared_opacity=false"):
+    with pytest.raises(ValueError, match=r"have opacity 0, but Gaussians have 1; .*thermal.shared_opacity=false"):
         ByOthersShare(Photometric(), 0)(inputs(splats=single))
 
 

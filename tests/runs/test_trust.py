@@ -49,7 +49,7 @@ def test_nothing_foreign_is_built(composed, tmp_path, monkeypatch, name, place):
     monkeypatch.setattr(run, "build", lambda *_, **__: pytest.fail("something was built"))
     bad = copy.deepcopy(composed)
     bad[place]["extra"] = FOREIGN[name]
-    with pytest.raises(SceneError, match=rf"sent\.ckpt is not built, for {place}\.extra"):
+    with pytest.raises(SceneError, match=rf"sent\.ckpt is not loaded: {place}\.extra"):
         run.load(stored(tmp_path, bad))
 
 
