@@ -319,6 +319,7 @@ class SceneData:
         true_attributes: function (points [n, 3]) -> properties of the surface there by name with unit, each [n], on
             synthetic scenes, or None.
         positions: table of where the cameras stood on the earth (``export.place``), or None.
+        reduced_by: kernel by which the data module made training images small (``data.degrade``), or None.
     """
 
     name: str
@@ -338,6 +339,7 @@ class SceneData:
     truth: Callable[[Tensor, Tensor], Tensor] | None = None
     true_attributes: Callable[[Tensor], dict[str, Tensor]] | None = None
     positions: Path | None = None
+    reduced_by: str | None = None
 
     @property
     def bulk(self) -> tuple[Tensor, float]:

@@ -43,6 +43,7 @@ def make_scene(count=3, width=WIDTH, height=HEIGHT, mask=None, rgb=True):
 def test_a_reduced_image_is_what_its_camera_would_see(degrade):
     scene = degraded(make_scene(), degrade)
     view, factor = scene.train[1], Reduction.parse(degrade).factor
+    assert scene.reduced_by == Reduction.parse(degrade).kernel and make_scene().reduced_by is None
     assert (view.camera.width, view.camera.height) == (WIDTH // factor, HEIGHT // factor)
     inside = (slice(2, -2), slice(2, -2))  # the border has less of the kernel
     assert torch.allclose(view.thermal[inside], plane(view.camera)[inside], atol=1e-6)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, Frame, View
+from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.geometry.resampling import resampled
 from heatsplat.losses.compose import Loss, LossInputs, Weighted
 from heatsplat.losses.low_resolution import Curriculum, OnTargetGrid, fineness
@@ -32,6 +32,17 @@ def test_a_fine_prediction_is_compared_after_it_shrank(kernel):
     assert {name: value.item() for name, value in got.items()} == {name: v.item() for name, v in expected.items()}
     sum(got.values()).backward()
     assert fine.grad.isfinite().all() and fine.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "made_by", "used"), [(None, "bicubic", "bicubic"), (None, None, "area"), ("area", "bicubic", "area")]
+)
+def test_the_kernel_is_that_of_the_training_images_unless_one_is_given(given, made_by, used):
+    fine, coarse = noise(48, 64), noise(12, 16, 1)
+    term = OnTargetGrid(Photometric(0.0), given)
+    term.prepare(SceneData("room", *[ViewSet([], None)] * 3, torch.zeros(4, 3), reduced_by=made_by), "thermal")
+    expected = (resampled(fine, 12, 16, used) - coarse).abs().mean()
+    torch.testing.assert_close(term(inputs(fine, coarse))["l1"], expected)
 
 
 def test_a_companion_shrinks_to_its_own_target():
@@ -117,6 +128,6 @@ def test_terms_that_ask_for_it_are_prepared_once_through_everything_around_them(
             return inputs.prediction.mean()
 
     term, idle = Asking(), Asking()
-    loss = Loss({"fine": Weighted(OnTargetGrid(term), 0.1), "off": Weighted(idle, 0.0), "plain": Photometric()})
+    loss = Loss({"fine": Weighted(OnTargetGrid(term, "area"), 0.1), "off": Weighted(idle, 0.0), "plain": Photometric()})
     assert loss.prepare("scene", "thermal") == {"teacher": "a kernel"}
     assert term.asked == [("scene", "thermal")] and idle.asked == []

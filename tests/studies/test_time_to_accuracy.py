@@ -86,6 +86,11 @@ def test_recipes_are_measured_by_the_reference_of_their_seed(runs, tmp_path):
     assert short["end_psnr"] == short["way_psnr"] == ""  # never as good
 
 
+def test_a_recipe_that_is_nothing_is_left_out(runs, tmp_path):
+    run(tmp_path / "out", str(runs), REFERENCE, RECIPES | {"draft": None})
+    assert "quick" in by_recipe(tmp_path / "out") and "draft" not in by_recipe(tmp_path / "out")
+
+
 def test_the_standard_schedule_in_the_same_time_lies_between_its_runs(runs, tmp_path):
     """20 s are half way between 10 and 40 over log seconds."""
     (panel,) = run(tmp_path / "out", str(runs), REFERENCE, RECIPES)

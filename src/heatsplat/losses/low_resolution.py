@@ -21,20 +21,23 @@ class OnTargetGrid:
 
     Args:
         term: what compares.
-        kernel: how the prediction shrinks, as the target lost its resolution: "bicubic" for images made by
-            ``data.degrade=lr4``, "area" for ``area4`` and as a fair guess for a real sensor.
+        kernel: how the prediction shrinks; None: as the training images lost their resolution (``SceneData.reduced_by``),
+            or "area" where the camera itself is coarse, since a detector averages over its area.
 
     Raises:
         ValueError: the kernel is unknown; or, when called, the prediction is not finer by a whole factor.
     """
 
-    def __init__(self, term: LossTerm, kernel: str = "bicubic") -> None:
-        if kernel not in KERNELS:
+    def __init__(self, term: LossTerm, kernel: str | None = None) -> None:
+        if kernel is not None and kernel not in KERNELS:
             raise ValueError(f"unknown resampling kernel '{kernel}'; there are {', '.join(KERNELS)}")
-        self.term, self.kernel = term, kernel
+        self.term, self.kernel = term, kernel or "area"
+        self._follows = kernel is None
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Prepares the term."""
+        """Prepares the term, and finds the kernel where none is given."""
+        if self._follows:
+            self.kernel = scene.reduced_by or "area"
         return prepare(self.term, scene, modality)
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:

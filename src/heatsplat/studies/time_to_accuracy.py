@@ -33,7 +33,7 @@ def run(
     output_dir: Path | str,
     runs: str | Sequence[str] | None,
     reference: Sequence[str],
-    recipes: Mapping[str, Sequence[str]],
+    recipes: Mapping[str, Sequence[str] | None],
     clock: str = "train_seconds",
     psnr_margin_db: float = 0.2,
     mae_margin_c: float = 0.02,
@@ -51,7 +51,8 @@ def run(
         runs: folders of finished runs or sweeps, searched to any depth; None: ``outputs`` where there are no cases, else none.
         reference: overrides of the reference, its max_steps among them; runs of another length with the same overrides are
             the standard schedule made shorter.
-        recipes: name -> overrides. Finished runs with other overrides are shown under these.
+        recipes: name -> overrides, or None for a recipe that is left out. Finished runs with other overrides are shown under
+            these.
         clock: "train_seconds" (a quiet machine) or "cpu_seconds" (one that does other work besides); see
             ``callbacks.timing.CostMeter``.
         psnr_margin_db, mae_margin_c: by how much a run may be worse than the reference and count as its equal.
@@ -68,6 +69,7 @@ def run(
             reference.
     """
     output_dir = Path(output_dir)
+    recipes = {name: given for name, given in recipes.items() if given is not None}
     if clock not in CLOCKS:
         raise SceneError(f"study.clock={clock}: give one of {', '.join(CLOCKS)}")
     if "max_steps" not in parsed(reference):
