@@ -100,6 +100,11 @@ def _rate(travel: float, least: float, most: float, *, _root_: DictConfig) -> fl
     return min(max(float(least), float(travel) / int(_root_.max_steps)), float(most))
 
 
+def _by_length(per_step: float, least: float, most: float, *, _root_: DictConfig) -> float:
+    """What grows with the length of the run, within bounds."""
+    return min(max(float(least), float(per_step) * int(_root_.max_steps)), float(most))
+
+
 def _cores_of(asked: int | None) -> int | None:
     """Threads of a job that asked for so many cores; a run outside a sweep, or with nothing asked, takes all."""
     return asked if HydraConfig.get().mode == RunMode.MULTIRUN else None
@@ -110,6 +115,7 @@ def _cores_by(jobs: int) -> int | None:
     return _cores_of(max(1, cores() // (cores() if jobs == -1 else jobs)))
 
 
+OmegaConf.register_new_resolver("by_length", _by_length, replace=True)
 OmegaConf.register_new_resolver("checkout", lambda path: CHECKOUT and str(CHECKOUT / path), replace=True)
 OmegaConf.register_new_resolver("cores_of", _cores_of, replace=True)
 OmegaConf.register_new_resolver("cores_by", _cores_by, replace=True)

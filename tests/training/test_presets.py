@@ -54,6 +54,12 @@ def test_presets_are_ordered():
         assert values == sorted(values) and len(set(values)) == len(PRESETS)
 
 
+@pytest.mark.parametrize(("steps", "multiple"), [(60, 3), (2000, 3), (4000, 4.8), (5000, 6), (30000, 6)])
+def test_longer_runs_grow_more_gaussians(steps, multiple):
+    assert compose([f"max_steps={steps}"])["density"]["multiple"] == pytest.approx(multiple)
+    assert compose([f"max_steps={steps}", "density.multiple=2"])["density"]["multiple"] == 2
+
+
 def test_what_is_given_beside_a_preset_wins():
     config = compose(["preset=fast", "max_steps=70", "cap_max=7", "optim.decay=0.5", "density=proximity"])
     assert (config["max_steps"], config["density"]["cap_max"], config["optim"]["decay"]) == (70, 7, 0.5)
