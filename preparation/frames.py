@@ -88,7 +88,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file()):
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file())
+    for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         kind = _kind(path)
         if kind == "sealed" and not greys_known:
             raise SceneError(
@@ -122,9 +123,15 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         frames.sort(key=lambda f: (instant(f.time), f.name))
     else:
         notes.append(
-            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time; they are in the order of names"
+            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
+            "names (table=... adds times)"
         )
     return Recording(frames, notes)
+
+
+def by_numbers(name: str) -> list[str | int]:
+    """What names are sorted by so that "image 2" comes before "image 10"."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _kind(path: Path) -> str:

@@ -22,7 +22,7 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -131,7 +131,12 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
 
 
 def _meant(error: Exception, name: str) -> str:
-    """ "Did you mean ...?" for a group's option or a key that there is not; empty where nothing is like it."""
+    """ "Did you mean ...?" for a group's option or a key that there is not, or how a value is written that Hydra cannot read;
+    empty where nothing is like it."""
+    if isinstance(error, OverrideParseException):
+        return _quoted(error.override)
+    if ambiguous := re.match(r"Ambiguous value for argument '(.+)'\n", str(error)):
+        return _quoted(ambiguous[1])
     if (wrong := getattr(error, "missing_cfg_file", None)) and error.options:
         group, _, wrong = wrong.rpartition("/")
         near, form = difflib.get_close_matches(wrong, error.options, 3, 0.5), f"{group}={{}}"
@@ -146,6 +151,16 @@ def _meant(error: Exception, name: str) -> str:
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _quoted(override: str) -> str:
+    """How a setting is written whose value Hydra's grammar does not take as it stands, such as a path with a space."""
+    key, _, value = override.partition("=")
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+    if not value or value[0] in "[{'\"":
+        return ""
+    return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: \"{key}='{value}'\""
 
 
 def _nulled() -> str | None:

@@ -122,6 +122,19 @@ def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
     assert f"Did you mean {meant}" in output and "Traceback" not in output
 
 
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        ("data.root=/data/Flug über Köln, 2. Tag", "\"data.root='/data/Flug über Köln, 2. Tag'\""),
+        ("data.root=/data/flight,2", "\"data.root='/data/flight,2'\""),
+        ("data.ambient_c=20,5", "data.ambient_c=20.5"),
+    ],
+)
+def test_a_value_that_hydra_cannot_read_is_shown_as_it_can(wrong, right, tmp_path):
+    output = command("train", "method=3dgs", wrong, cwd=tmp_path, code=1)
+    assert right in output and "Traceback" not in output
+
+
 def test_a_group_set_to_null_is_told_its_options(tmp_path):
     output = command("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
     assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
