@@ -6,6 +6,7 @@ A configuration is a dict of plain containers, and every step of ``begin`` retur
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -269,6 +270,12 @@ def _naming(checkpoint: Path | str) -> Iterator[None]:
         raise SceneError(f"{checkpoint}: {error}") from error
     except Exception as error:
         said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        absent = re.search(r"Error locating target '([\w.]+)'", said)
+        if absent and not absent[1].startswith("heatsplat."):
+            raise SceneError(
+                f"{checkpoint} needs {absent[1]}, which Python does not find here: install its package, or set PYTHONPATH to the "
+                "folder that holds it"
+            ) from error
         raise SceneError(
             f"{checkpoint} does not fit this heatsplat ({said}): it is of another version, or not as heatsplat wrote it"
         ) from error
