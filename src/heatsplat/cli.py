@@ -22,7 +22,7 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException, OverrideParseException
+from hydra.errors import CompactHydraException, InstantiationException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -115,6 +115,9 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         except (CompactHydraException, OmegaConfBaseException) as error:
             if all_of_it:
                 raise
+            place = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+            if place and isinstance(error.__cause__, ValueError):
+                sys.exit(f"{place[1]}: {error.__cause__}")
             sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
         except Exception as error:  # of a job of a sweep, when all others have run
             if "group override must be a string" in str(error) and (nulled := _nulled()) and not all_of_it:
@@ -147,7 +150,15 @@ def _meant(error: Exception, name: str) -> str:
             settings = OmegaConf.to_container(composed(given, name))
         except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
             return ""
-        near = difflib.get_close_matches(wrong, [*_keys(settings), *os.listdir(CONF)], 3)
+        keys = [*_keys(settings), *(path.name for path in Path(CONF).iterdir() if path.is_dir())]
+        parent, _, leaf = wrong.rpartition(".")
+        beside = {
+            name: key for key in keys for above, _, name in [key.rpartition(".")] if above == parent and name[0] != "_"
+        }
+        near = [beside[name] for name in difflib.get_close_matches(leaf, beside, 3)]
+        if not near and parent in keys:
+            return f"{parent} has {', '.join(sorted(beside)) or 'nothing to set'}"
+        near = near or difflib.get_close_matches(wrong, keys, 3)
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
