@@ -14,8 +14,9 @@ from heatsplat.physics.units import DAY_S
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")
 
 
-def _seconds_since_1970(moment: datetime) -> float:
-    # Clock times without a zone are read as UTC: only differences count, and they must not jump with daylight saving.
+def instant(moment: datetime) -> float:
+    """Seconds since 1970; a clock without a zone counts as UTC: only differences count, and they must not jump with daylight
+    saving."""
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
@@ -51,7 +52,7 @@ def dji_time(name: str) -> float | None:
     """Seconds of a DJI name such as DJI_20240806173449_0008_T.JPG (whole seconds, the camera's clock), or None."""
     match = DJI_NAME.search(PurePosixPath(name).name)
     try:
-        return _seconds_since_1970(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
+        return instant(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
     except ValueError:  # fourteen digits that are no date
         return None
 
@@ -74,7 +75,7 @@ def time_by_pattern(name: str, regex: str, form: str | None) -> float:
     try:
         if form is None:
             return float(part)
-        return seconds_of_day(part) if form == "HHMMSSmmm" else _seconds_since_1970(datetime.strptime(part, form))
+        return seconds_of_day(part) if form == "HHMMSSmmm" else instant(datetime.strptime(part, form))
     except ValueError as error:
         raise SceneError(f"image name {name}: {part!r} is no time of the form {form or 'seconds'} ({error})") from error
 
@@ -114,7 +115,7 @@ def _seconds_of(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        return _seconds_since_1970(datetime.fromisoformat(text))
+        return instant(datetime.fromisoformat(text))
 
 
 def stem_of(name: str) -> str:

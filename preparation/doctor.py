@@ -16,10 +16,11 @@ from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
+from heatsplat.datamodules.timestamps import instant
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.devices import Device, devices_of
-from heatsplat.preparation.frame import Frame, instant
+from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.frames import Reading, read_recording, taken_at, zone_of
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section, counted

@@ -21,10 +21,10 @@ from heatsplat.datamodules.formats.exif import exif_in
 from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_image, to_grey
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
-from heatsplat.datamodules.timestamps import dji_time, stem_of
+from heatsplat.datamodules.timestamps import dji_time, instant, stem_of
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.devices import devices_of, listed
-from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position, instant
+from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
 from heatsplat.preparation.meaning import Meaning
 
 __all__ = ["Attitude", "CameraInfo", "Frame", "Position", "Reading", "Recording", "read_frames", "read_recording"]

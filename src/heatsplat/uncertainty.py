@@ -165,10 +165,6 @@ class Uncertainty:
         unseen = ~covered(frame.camera, self._depth(frame), self._sightings)
         return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
 
-    def of_gaussians(self) -> Tensor:
-        """Standard deviation [N] of the temperature of each Gaussian, as far as it is a matter of who saw it."""
-        return self._known(self.stretch).sqrt().mul(self.unit).float()
-
     def of_attributes(self, frame: Frame) -> dict[str, Tensor]:
         """Standard deviations [N] of what the thermal model tells of every Gaussian at the time of a frame, by name.
 
