@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path, PurePosixPath
+from zoneinfo import ZoneInfo
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.side_files import read_table
@@ -18,6 +19,16 @@ def instant(moment: datetime) -> float:
     """Seconds since 1970; a clock without a zone counts as UTC: only differences count, and they must not jump with daylight
     saving."""
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def zone_of(name: str, key: str) -> tzinfo:
+    """A time zone: UTC, +02:00 or Europe/Berlin. Raises SceneError for anything else, as the value of the setting ``key``."""
+    try:
+        if name[:1] in ("+", "-"):
+            return datetime.fromisoformat(f"2000-01-01T00:00:00{name}").tzinfo
+        return UTC if name.upper() in ("UTC", "Z") else ZoneInfo(name)
+    except (ValueError, OSError, LookupError) as error:
+        raise SceneError(f"{key}={name} is no time zone; give UTC, +02:00 or a name such as Europe/Berlin") from error
 
 
 def seconds_of_day(digits: str) -> float:

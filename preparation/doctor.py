@@ -16,12 +16,12 @@ from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
-from heatsplat.datamodules.timestamps import instant
+from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import Reading, read_recording, taken_at, zone_of
+from heatsplat.preparation.frames import Reading, read_recording, taken_at
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section, counted
 
@@ -169,7 +169,7 @@ def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | Non
         if taken is None or frame.time is None:
             return None
         if taken.tzinfo is None and zone is not None:
-            taken = taken.replace(tzinfo=zone_of(zone))
+            taken = taken.replace(tzinfo=zone_of(zone, "zone"))
         apart = instant(taken) - instant(frame.time)
         if (taken.tzinfo is None) != (frame.time.tzinfo is None):
             apart -= QUARTER_S * round(apart / QUARTER_S)
