@@ -21,7 +21,7 @@ from torch import Tensor
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
-from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
@@ -194,11 +194,9 @@ class Trained:
         """Which pixels of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
         return covered(frame.camera, self.depth(frame), self._sightings)
 
-    @torch.no_grad()
     def depth(self, frame: Frame) -> Tensor:
         """Camera z [H, W] of the surface in a frame, in world units; infinite where there is none."""
-        output = self.module.render(frame, depth=True)
-        return surface_depth(output.depth, output.alpha[0]).cpu()
+        return self.module.depth(frame)
 
     @cached_property
     def _sightings(self) -> list[Sighting]:
