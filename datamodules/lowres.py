@@ -84,9 +84,7 @@ def degraded(scene: SceneData, degrade: str | None, upsample: str | None = None)
     }
     if upsample:
         notes["upsampled"] = f"training images enlarged again to the original grid ({upsample})"
-    return replace(
-        scene, train=ViewSet(frames, decode), notes={**scene.notes, **notes}, reduced_by=reduction.kernel
-    )
+    return replace(scene, train=ViewSet(frames, decode), notes={**scene.notes, **notes}, reduced_by=reduction.kernel)
 
 
 def _reduced_frame(frame: Frame, reduction: Reduction, degrade: str) -> Frame:

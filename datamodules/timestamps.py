@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path, PurePosixPath
+from zoneinfo import ZoneInfo
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.side_files import read_table
@@ -14,9 +15,20 @@ from heatsplat.physics.units import DAY_S
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")
 
 
-def _seconds_since_1970(moment: datetime) -> float:
-    # Clock times without a zone are read as UTC: only differences count, and they must not jump with daylight saving.
+def instant(moment: datetime) -> float:
+    """Seconds since 1970; a clock without a zone counts as UTC: only differences count, and they must not jump with daylight
+    saving."""
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def zone_of(name: str, key: str) -> tzinfo:
+    """A time zone: UTC, +02:00 or Europe/Berlin. Raises SceneError for anything else, as the value of the setting ``key``."""
+    try:
+        if name[:1] in ("+", "-"):
+            return datetime.fromisoformat(f"2000-01-01T00:00:00{name}").tzinfo
+        return UTC if name.upper() in ("UTC", "Z") else ZoneInfo(name)
+    except (ValueError, OSError, LookupError) as error:
+        raise SceneError(f"{key}={name} is no time zone; give UTC, +02:00 or a name such as Europe/Berlin") from error
 
 
 def seconds_of_day(digits: str) -> float:
@@ -51,7 +63,7 @@ def dji_time(name: str) -> float | None:
     """Seconds of a DJI name such as DJI_20240806173449_0008_T.JPG (whole seconds, the camera's clock), or None."""
     match = DJI_NAME.search(PurePosixPath(name).name)
     try:
-        return _seconds_since_1970(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
+        return instant(datetime.strptime(match[1], "%Y%m%d%H%M%S")) if match else None
     except ValueError:  # fourteen digits that are no date
         return None
 
@@ -74,7 +86,7 @@ def time_by_pattern(name: str, regex: str, form: str | None) -> float:
     try:
         if form is None:
             return float(part)
-        return seconds_of_day(part) if form == "HHMMSSmmm" else _seconds_since_1970(datetime.strptime(part, form))
+        return seconds_of_day(part) if form == "HHMMSSmmm" else instant(datetime.strptime(part, form))
     except ValueError as error:
         raise SceneError(f"image name {name}: {part!r} is no time of the form {form or 'seconds'} ({error})") from error
 
@@ -114,7 +126,7 @@ def _seconds_of(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        return _seconds_since_1970(datetime.fromisoformat(text))
+        return instant(datetime.fromisoformat(text))
 
 
 def stem_of(name: str) -> str:

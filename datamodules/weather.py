@@ -12,10 +12,9 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, Vi
 from heatsplat.datamodules.assemble import on_clock, weather_of
 from heatsplat.datamodules.side_files import finite, read_table, shortened
 from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.timestamps import zone_of
 
 log = logging.getLogger(__name__)
 
@@ -235,20 +235,8 @@ def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
                 f"{where}: {text!r} has no time zone. Write an offset (Z, +02:00) into the times, or say in which zone "
                 "they are: weather_zone=UTC, +02:00 or Europe/Berlin"
             )
-        moment = moment.replace(tzinfo=_zone(zone))
+        moment = moment.replace(tzinfo=zone_of(zone, "weather_zone"))
     return moment.timestamp()
-
-
-def _zone(name: str) -> tzinfo:
-    if offset := re.fullmatch(r"([+-])(\d{2}):?(\d{2})", name):
-        minutes = int(offset[2]) * 60 + int(offset[3])
-        return timezone(timedelta(minutes=minutes if offset[1] == "+" else -minutes))
-    try:
-        return UTC if name.upper() in ("UTC", "Z") else ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError) as error:
-        raise SceneError(
-            f"weather_zone={name} is no time zone; write UTC, +02:00 or a name such as Europe/Berlin"
-        ) from error
 
 
 def _plain(name: str) -> str:

@@ -22,7 +22,7 @@ def draw_cameras(path: Path, viewmats: Sequence[np.ndarray], points: np.ndarray,
         viewmats: world to camera [4, 4] in the order of the recording.
         points: [P, 3].
         east_north_up: whether the world's axes are these, in metres; else the picture has those of the largest, second
-            largest and least extent of points and cameras.
+            largest and least extent of points and cameras, in units of the reconstruction.
     """
     poses = np.stack(viewmats)
     centers = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
@@ -31,7 +31,7 @@ def draw_cameras(path: Path, viewmats: Sequence[np.ndarray], points: np.ndarray,
     if east_north_up:
         axes, labels = np.eye(3), ("east, m", "north, m", "up, m")
     else:
-        axes, labels = upright(points - middle, sights), ("", "", "")
+        axes, labels = upright(points - middle, sights), ("units of the reconstruction",) * 3
     cloud, where, sights = ((xyz - at) @ axes.T for xyz, at in ((points, middle), (centers, middle), (sights, 0.0)))
     low, high = np.quantile(cloud, [(1 - SHOWN) / 2, (1 + SHOWN) / 2], axis=0)
     low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))

@@ -248,7 +248,7 @@ def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
     for view in _few(views):
         camera, depth = view.camera, depth_of(view.frame)
         at, within = _pixels(camera, points)
-        far = points[within].double() @ camera.viewmat[2, :3].double() + camera.viewmat[2, 3].double()
+        far = camera.project(points[within])[1]
         found.append(depth[at[:, 1], at[:, 0]] / far)
     ratios = torch.cat(found)
     ratios = ratios[ratios.isfinite()]
@@ -286,10 +286,9 @@ def _unsettled(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
 
 def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (column, row) [n, 2] of the points that lie in an image, and which these are, [P] bool."""
-    local = points.double() @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
-    ahead = local[:, 2] > 0
-    at = ((local @ camera.K.double().T)[:, :2] / local[:, 2:].where(ahead[:, None], torch.ones(()))).floor()
-    within = ahead & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
+    places, depths = camera.project(points)
+    at = places.floor()
+    within = (depths > 0) & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
     return at[within].long(), within
 
 

@@ -30,8 +30,8 @@ class Device:
         size = None if self.like.size is None else "{}x{} pixels".format(*self.like.size)
         lens = f"{about.field_of_view_deg:.3g}° wide" if about.field_of_view_deg else None
         if lens is None and about.focal_mm:
-            lens = f"{about.focal_mm:.3g} mm"
-        name = " ".join(filter(None, (about.make, about.model, about.serial))) or "unknown"
+            lens = f"focal length {about.focal_mm:.3g} mm"
+        name = " ".join(filter(None, (about.make, about.model, about.serial))) or "unknown camera"
         return ", ".join(filter(None, (name, size, lens)))
 
 

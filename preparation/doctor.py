@@ -16,13 +16,14 @@ from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
+from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.devices import Device, devices_of
-from heatsplat.preparation.frame import Frame, instant
-from heatsplat.preparation.frames import Reading, read_recording, taken_at, zone_of
+from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frames import Reading, read_recording, taken_at
 from heatsplat.preparation.meaning import Meaning
-from heatsplat.preparation.report import Section
+from heatsplat.preparation.report import Section, counted
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,9 @@ def check(
     """
     rows = Path(table).expanduser() if table else None
     reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
-    materials = materials_in(Path(folder).expanduser(), downscale, reading)
+    materials, notes = materials_in(Path(folder).expanduser(), downscale, reading)
+    for note in notes:
+        log.info("%s", note)
     found = examined(materials)
     show(found, str(folder))
     if _more_with_cameras(materials, found):
@@ -68,7 +71,7 @@ def check(
 
 def section(folder: Path, reading: Reading | None = None) -> Section:
     """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
-    materials = materials_in(folder, 1.0, reading)
+    materials, _ = materials_in(folder, 1.0, reading)
     posed, found = any(material.cameras is not None for material in materials.values()), examined(materials)
     if not posed:
         found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
@@ -85,8 +88,11 @@ def _more_with_cameras(materials: Mapping[str, Material], found: Sequence[Findin
     return all(one.cameras is None for one in materials.values()) and all(one.check != "still" for one in found)
 
 
-def materials_in(folder: Path, downscale: float = 1.0, reading: Reading | None = None) -> dict[str, Material]:
-    """What there is to look at in a folder: a scene, called "", or the files of each thermal camera by its label.
+def materials_in(
+    folder: Path, downscale: float = 1.0, reading: Reading | None = None
+) -> tuple[dict[str, Material], list[str]]:
+    """What there is to look at in a folder: a scene, called "", or the files of each thermal camera by its label; and what was
+    taken for granted when the files were read.
 
     Raises:
         SceneError: the folder holds neither scene nor recording.
@@ -94,13 +100,14 @@ def materials_in(folder: Path, downscale: float = 1.0, reading: Reading | None =
     if not folder.is_dir():
         raise SceneError(f"check={folder}: there is no such folder")
     if find_model(folder) is not None:
-        return {"": material_of(_colmap(folder, downscale))}
+        return {"": material_of(_colmap(folder, downscale))}, []
     if find_transforms(folder):
-        return {"": material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)}
+        return {"": material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)}, []
     reading = reading or Reading()
-    return {
-        device.label: _recorded(device, reading.zone) for device in devices_of(read_recording(folder, reading).frames)
-    }
+    recording = read_recording(folder, reading)
+    devices = devices_of(recording.frames)
+    notes = [f"{counted(len(device.frames), 'frame')} of {device.label}" for device in devices]
+    return {device.label: _recorded(device, reading.zone) for device in devices}, [*notes, *recording.notes]
 
 
 def examined(materials: Mapping[str, Material]) -> list[Finding]:
@@ -162,7 +169,7 @@ def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | Non
         if taken is None or frame.time is None:
             return None
         if taken.tzinfo is None and zone is not None:
-            taken = taken.replace(tzinfo=zone_of(zone))
+            taken = taken.replace(tzinfo=zone_of(zone, "zone"))
         apart = instant(taken) - instant(frame.time)
         if (taken.tzinfo is None) != (frame.time.tzinfo is None):
             apart -= QUARTER_S * round(apart / QUARTER_S)

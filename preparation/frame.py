@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,6 @@ import numpy as np
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.radiometric import CELSIUS, Calibration, surface_celsius
 from heatsplat.physics.radiometry import Conditions
-
-
-def instant(moment: datetime) -> float:
-    """Seconds since 1970; a clock without a zone counts as UTC."""
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from zoneinfo import ZoneInfo
 
 import numpy as np
 from PIL import Image
@@ -21,10 +20,10 @@ from heatsplat.datamodules.formats.exif import exif_in
 from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_image, to_grey
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
-from heatsplat.datamodules.timestamps import dji_time, stem_of
+from heatsplat.datamodules.timestamps import dji_time, instant, stem_of, zone_of
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.devices import devices_of, listed
-from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position, instant
+from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
 from heatsplat.preparation.meaning import Meaning
 
 __all__ = ["Attitude", "CameraInfo", "Frame", "Position", "Reading", "Recording", "read_frames", "read_recording"]
@@ -83,12 +82,13 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     """
     reading = reading or Reading()
     if reading.zone is not None:
-        zone_of(reading.zone)
+        zone_of(reading.zone, "zone")
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file()):
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file())
+    for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         kind = _kind(path)
         if kind == "sealed" and not greys_known:
             raise SceneError(
@@ -122,9 +122,15 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         frames.sort(key=lambda f: (instant(f.time), f.name))
     else:
         notes.append(
-            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time; they are in the order of names"
+            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
+            "names (table=... adds times)"
         )
     return Recording(frames, notes)
+
+
+def by_numbers(name: str) -> list[str | int]:
+    """What names are sorted by so that "image 2" comes before "image 10"."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _kind(path: Path) -> str:
@@ -363,18 +369,8 @@ def _zoned(frame: Frame, zone: str | None) -> Frame:
     if time is None and (seconds := dji_time(frame.path.name)) is not None:
         time = datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None)
     if time is not None and time.tzinfo is None and zone is not None:
-        time = time.replace(tzinfo=zone_of(zone))
+        time = time.replace(tzinfo=zone_of(zone, "zone"))
     return replace(frame, time=time)
-
-
-def zone_of(name: str) -> tzinfo:
-    """A time zone: UTC, +02:00 or Europe/Berlin. Raises SceneError for anything else."""
-    try:
-        if name[:1] in "+-":
-            return datetime.fromisoformat(f"2000-01-01T00:00:00{name}").tzinfo
-        return ZoneInfo(name)
-    except (ValueError, OSError, LookupError) as error:
-        raise SceneError(f"zone={name} is no time zone; give UTC, +02:00 or a name such as Europe/Berlin") from error
 
 
 def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list[Frame]:

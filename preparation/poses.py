@@ -28,7 +28,7 @@ from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
 from heatsplat.preparation.features import Features, check_positive
-from heatsplat.preparation.frame import Frame, instant
+from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.writer import write_world
@@ -204,7 +204,7 @@ class Search:
 
     def pairs(self) -> list[tuple[str, str]]:
         """Names of frames that are matched with each other."""
-        names = sorted(self.frames, key=lambda name: (_moment(self.frames[name]), name))
+        names = list(self.frames)
         video = len(names) > self.options.all_pairs if self.options.video is None else self.options.video
         if not video:
             return list(combinations(names, 2))
@@ -306,7 +306,8 @@ class Search:
                 f"The thermal camera is turned by {turn:.2f}° against the visible one and stands at ({where}) in its axes "
                 "(right, down, forward), as far as they tell: both are brought to the same places in the mean."
             )
-        placed = sorted(written.images.values(), key=lambda image: (_moment(self.frames[image.name]), image.name))
+        by_name = {image.name: image for image in written.images.values()}
+        placed = [by_name[name] for name in self.frames if name in by_name]
         if len(written.points3D) > 2:
             draw_cameras(
                 self.target / PICTURE,
@@ -315,7 +316,12 @@ class Search:
                 self.origin is not None,
             )
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
-        lines += [f"- {name}: {reason}" for name, reason in missing.items()]
+        if missing:
+            lines.append(
+                f"{counted(len(missing), 'frame')} without a camera, left out of training; more overlap between frames helps, "
+                "and photos of a camera beside (poses=rgb):"
+            )
+        lines += ["", *(f"- {name}: {reason}" for name, reason in missing.items())]
         return Section("Poses", lines, values)
 
     def _made_of(self) -> str:
@@ -607,10 +613,6 @@ def _fix(frame: Frame) -> tuple[float, float, float] | None:
 
 def _shape(path: Path) -> tuple[int, int]:
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape
-
-
-def _moment(frame: Frame) -> float:
-    return 0.0 if frame.time is None else instant(frame.time)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -129,5 +130,8 @@ def _cameras(
             f"{error}. The temperatures are in {target / 'images'} all the same (poses=none leaves out the search)"
         ) from error
     log.info("%s", found.lines[0])
-    log.info("it trains: python src/train.py data=colmap data.root=%s", target)
+    root = f"data.root={target}"
+    if not re.fullmatch(r"[\w./=-]+", root, re.ASCII):  # Hydra takes other texts in quotes of their own
+        root = f"\"data.root='{target}'\""
+    log.info("it trains: python src/train.py data=colmap %s", root)
     return [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]

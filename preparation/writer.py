@@ -23,6 +23,7 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES
 from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.datamodules.timestamps import instant
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import write_csv
 from heatsplat.io.tiff import write_temperature
@@ -31,7 +32,7 @@ from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, mea
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
 from heatsplat.preparation.devices import devices_of
-from heatsplat.preparation.frame import Frame, instant
+from heatsplat.preparation.frame import Frame
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
 PARTIAL = ".partial"  # folder of what is being written

@@ -11,8 +11,8 @@ import numpy as np
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
 
-# What is wrong with a file is said by the exceptions below; OpenCV would add a line for every unknown TIFF tag.
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+# What is wrong with a file is said by the exceptions below; OpenCV would add lines of its own, even for unknown TIFF tags.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 

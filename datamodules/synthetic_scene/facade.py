@@ -33,6 +33,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor import (
     _shades,
     forcing_of,
 )
+from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
@@ -214,13 +215,7 @@ class FacadeScene(OutdoorScene):
         along = 5.0 * torch.sin(2.39996 * number + draws[:, 1])
         center = torch.stack([along, -8.5 - 1.5 * draws[:, 2], 1.2 + 3.6 * torch.remainder(0.618034 * number, 1.0)], 1)
         aim = torch.stack([0.35 * along, torch.zeros_like(along), 2.4 + 0.4 * (draws[:, 3] - 0.5)], 1)
-        forward = torch.nn.functional.normalize(aim - center, dim=1)
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=1)
-        viewmats = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
-        viewmats[:, :3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-        viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ center[:, :, None])[:, :, 0]
-        return times, viewmats
+        return times, looking(center, aim)
 
 
 def winter_weather(start_s: float, end_s: float) -> Weather:

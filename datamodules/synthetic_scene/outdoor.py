@@ -25,6 +25,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     integrate,
     solve,
 )
+from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
@@ -405,14 +406,7 @@ class OutdoorScene(Scene):
         aim = torch.tensor([0.0, -1.5, 1.5], dtype=torch.float64).expand(frames, 3)
         flat = radius * torch.cos(elevation)
         center = aim + torch.stack([flat * azimuth.sin(), -flat * azimuth.cos(), radius * elevation.sin()], dim=1)
-        forward = torch.nn.functional.normalize(aim - center, dim=1)
-        right = torch.nn.functional.normalize(
-            torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)), dim=1
-        )
-        viewmats = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
-        viewmats[:, :3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-        viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ center[:, :, None])[:, :, 0]
-        return times, viewmats
+        return times, looking(center, aim)
 
 
 def training_frames(frames: int) -> int:

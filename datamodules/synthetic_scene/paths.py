@@ -46,7 +46,7 @@ def camera_path(times_s: np.ndarray, duration_s: float, seed: int, approach_m: f
     radius = 2.2 + approach_m * sway(2.3)
     roll = torch.deg2rad(2.0 * sway(11.0))
     aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.05 * torch.stack([sway(7.0), sway(9.0), sway(13.0)], dim=1)
-    return _looking(_around(aim, azimuth, elevation, radius), aim, roll)
+    return looking(_around(aim, azimuth, elevation, radius), aim, roll)
 
 
 def swung(preset: Preset, frames: int, seed: int) -> tuple[np.ndarray, Tensor]:
@@ -63,7 +63,7 @@ def swung_path(times_s: Tensor, seed: int) -> Tensor:
     radius = 2.2 + 0.15 * sway(0.8)
     roll = torch.deg2rad(3.0 * sway(1.1))
     aim = torch.tensor(_LOOK_AT, dtype=torch.float64) + 0.35 * torch.stack([sway(1.4), sway(1.0), sway(1.6)], dim=1)
-    return _looking(_around(aim, azimuth, elevation, radius), aim, roll)
+    return looking(_around(aim, azimuth, elevation, radius), aim, roll)
 
 
 def _swaying(t: Tensor, generator: torch.Generator) -> Callable[[float], Tensor]:
@@ -84,14 +84,17 @@ def _around(aim: Tensor, azimuth: Tensor, elevation: Tensor, radius: Tensor) -> 
     )
 
 
-def _looking(center: Tensor, aim: Tensor, roll: Tensor) -> Tensor:
-    """World-to-camera matrices [n, 4, 4] of cameras at ``center`` [n, 3] that look at ``aim`` [n, 3]."""
+def looking(center: Tensor, aim: Tensor, roll: Tensor | None = None) -> Tensor:
+    """World-to-camera matrices [n, 4, 4] of cameras at ``center`` [n, 3] that look at ``aim`` [n, 3], z upwards in the image but
+    for a turn about the line of sight by ``roll`` [n] in radians."""
     forward = torch.nn.functional.normalize(aim - center, dim=1)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(forward)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=1)
     down = torch.linalg.cross(forward, right)
-    c, s = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
-    rotation = torch.stack([c * right + s * down, c * down - s * right, forward], dim=1)
+    if roll is not None:
+        c, s = torch.cos(roll)[:, None], torch.sin(roll)[:, None]
+        right, down = c * right + s * down, c * down - s * right
+    rotation = torch.stack([right, down, forward], dim=1)
     viewmats = torch.eye(4, dtype=torch.float64).repeat(len(center), 1, 1)
     viewmats[:, :3, :3] = rotation
     viewmats[:, :3, 3] = -(rotation @ center[:, :, None])[:, :, 0]

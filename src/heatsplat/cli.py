@@ -22,7 +22,7 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, InstantiationException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -115,6 +115,9 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         except (CompactHydraException, OmegaConfBaseException) as error:
             if all_of_it:
                 raise
+            place = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+            if place and isinstance(error.__cause__, ValueError):
+                sys.exit(f"{place[1]}: {error.__cause__}")
             sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
         except Exception as error:  # of a job of a sweep, when all others have run
             if "group override must be a string" in str(error) and (nulled := _nulled()) and not all_of_it:
@@ -131,7 +134,12 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
 
 
 def _meant(error: Exception, name: str) -> str:
-    """ "Did you mean ...?" for a group's option or a key that there is not; empty where nothing is like it."""
+    """ "Did you mean ...?" for a group's option or a key that there is not, or how a value is written that Hydra cannot read;
+    empty where nothing is like it."""
+    if isinstance(error, OverrideParseException):
+        return _quoted(error.override)
+    if ambiguous := re.match(r"Ambiguous value for argument '(.+)'\n", str(error)):
+        return _quoted(ambiguous[1])
     if (wrong := getattr(error, "missing_cfg_file", None)) and error.options:
         group, _, wrong = wrong.rpartition("/")
         near, form = difflib.get_close_matches(wrong, error.options, 3, 0.5), f"{group}={{}}"
@@ -142,10 +150,28 @@ def _meant(error: Exception, name: str) -> str:
             settings = OmegaConf.to_container(composed(given, name))
         except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
             return ""
-        near = difflib.get_close_matches(wrong, [*_keys(settings), *os.listdir(CONF)], 3)
+        keys = [*_keys(settings), *(path.name for path in Path(CONF).iterdir() if path.is_dir())]
+        parent, _, leaf = wrong.rpartition(".")
+        beside = {
+            name: key for key in keys for above, _, name in [key.rpartition(".")] if above == parent and name[0] != "_"
+        }
+        near = [beside[name] for name in difflib.get_close_matches(leaf, beside, 3)]
+        if not near and parent in keys:
+            return f"{parent} has {', '.join(sorted(beside)) or 'nothing to set'}"
+        near = near or difflib.get_close_matches(wrong, keys, 3)
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _quoted(override: str) -> str:
+    """How a setting is written whose value Hydra's grammar does not take as it stands, such as a path with a space."""
+    key, _, value = override.partition("=")
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+    if not value or value[0] in "[{'\"":
+        return ""
+    return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: \"{key}='{value}'\""
 
 
 def _nulled() -> str | None:

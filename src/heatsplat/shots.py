@@ -242,7 +242,13 @@ def write_shot(
                 written.append(output_dir / "figures" / f"{stem}.{figures}")
                 write_figure(written[-1], panels, title)
     written.append(output_dir / "frames.csv")
-    with open(written[-1], "w", newline="", encoding="utf-8") as file:
+    _write_table(written[-1], rows)
+    return written
+
+
+def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, float]]) -> None:
+    """Writes what is known of each frame, and warns of what no training view has seen."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(("frame", "time_s", "seen_share", "beyond_record_s"))
         table.writerows(rows)
@@ -250,6 +256,5 @@ def write_shot(
     if unseen >= 0.0005:
         log.warning(
             "%.1f %% of the pixels show what no training view has seen: NaN in TIFF, hatched in pictures, by frame in %s "
-            "(unseen=keep writes what the model makes of them)", 100 * unseen, written[-1],
+            "(unseen=keep writes what the model makes of them)", 100 * unseen, path,
         )  # fmt: skip
-    return written

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
-from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.physics.noise import noise_of_views
 from heatsplat.shots import at_time, sightings
 from heatsplat.thermal.base import Query
@@ -162,12 +162,8 @@ class Uncertainty:
     def deviation(self, frame: Frame) -> Tensor:
         """Standard deviation [H, W] of the temperature in each pixel of a frame."""
         variance = self._variances(frame, (self.stretch,)) @ self.shares
-        unseen = ~covered(frame.camera, self._depth(frame), self._sightings)
+        unseen = ~covered(frame.camera, self.module.depth(frame), self._sightings)
         return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
-
-    def of_gaussians(self) -> Tensor:
-        """Standard deviation [N] of the temperature of each Gaussian, as far as it is a matter of who saw it."""
-        return self._known(self.stretch).sqrt().mul(self.unit).float()
 
     def of_attributes(self, frame: Frame) -> dict[str, Tensor]:
         """Standard deviations [N] of what the thermal model tells of every Gaussian at the time of a frame, by name.
@@ -350,14 +346,9 @@ class Uncertainty:
             found.append(rows[counted][::every])
         return found
 
-    @torch.no_grad()
-    def _depth(self, frame: Frame) -> Tensor:
-        output = self.module.render(frame, depth=True)
-        return surface_depth(output.depth, output.alpha[0]).cpu()
-
     @cached_property
     def _sightings(self) -> list[Sighting]:
-        return sightings(self.module.scene, self._depth)
+        return sightings(self.module.scene, self.module.depth)
 
 
 def _only(rows: Tensor, stretch: int) -> Tensor:

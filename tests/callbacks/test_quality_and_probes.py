@@ -129,6 +129,22 @@ def test_a_clean_image_is_compared_with_what_it_is_compared_with():
     ]
 
 
+@pytest.mark.parametrize(("known", "told"), [(True, "known to be without it"), (False, "the recorded image")])
+def test_scores_of_a_clean_image_say_what_it_is_scored_against(tmp_path, known, told):
+    scene = wall()
+    if known:
+        decoded = [replace(view, clean=view.thermal) for view in scene.test]
+        scene = replace(scene, test=ViewSet(scene.test.frames, decoded.__getitem__))
+
+    class Flawed(FakeModule):
+        def test_step(self, view, batch_idx):
+            return super().test_step(view, batch_idx) | {"companions": {"clean": view.thermal}}
+
+    module = Flawed(scene, tmp_path)
+    evaluate(module, trainer(tmp_path, [QualityMetrics(lpips_net=None)], logger=False))
+    assert module.results.test["clean_mae_c"] == 0.0 and told in module.results.definitions["clean_..."]
+
+
 def test_names_are_unique():
     scene = wall()
     frames = [*scene.train.frames, *scene.test.frames]

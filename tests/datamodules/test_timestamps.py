@@ -1,3 +1,6 @@
+import re
+from datetime import datetime, timedelta
+
 import pytest
 
 from heatsplat.contracts import SceneError
@@ -8,6 +11,7 @@ from heatsplat.datamodules.timestamps import (
     time_by_pattern,
     times_from_csv,
     unrolled_midnight,
+    zone_of,
 )
 
 
@@ -20,6 +24,17 @@ def test_nine_digits_are_hours_minutes_seconds_and_thousandths():
 def test_digits_that_are_no_time_of_day_are_refused(digits):
     with pytest.raises(ValueError, match="is no"):
         seconds_of_day(digits)
+
+
+@pytest.mark.parametrize("name", ["+02:00", "+0200", "Africa/Maputo"])
+def test_zones_are_offsets_or_names(name):
+    assert datetime(2024, 1, 11, 12, tzinfo=zone_of(name, "zone")).utcoffset() == timedelta(hours=2)
+
+
+@pytest.mark.parametrize("name", ["", "+99:00", "Mars/Crater", "../zone"])
+def test_what_is_no_zone_is_refused_with_its_setting(name):
+    with pytest.raises(SceneError, match=f"weather_zone={re.escape(name)} is no time zone"):
+        zone_of(name, "weather_zone")
 
 
 def test_a_recording_over_midnight_continues():

@@ -173,7 +173,7 @@ def test_bad_tables_are_refused_by_line_and_column(table, lines, message):
 def test_a_missing_table_and_a_bad_zone_are_named(tmp_path, table):
     with pytest.raises(SceneError, match="there is no weather table"):
         read_weather(tmp_path / "none.csv")
-    with pytest.raises(SceneError, match="weather_zone=Mars/Crater is no time zone"):
+    with pytest.raises(SceneError, match="weather_zone=Mars/Crater is no time zone; give UTC"):
         read_weather(table("time,air_c", "2024-07-11T06:00,1", "2024-07-11T07:00,1"), zone="Mars/Crater")
 
 

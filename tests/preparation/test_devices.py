@@ -71,8 +71,8 @@ def test_frames_are_of_one_camera_where_nothing_that_they_say_of_it_differs(othe
 
 def test_a_camera_is_told_by_what_its_files_say():
     (one,) = devices_of([frame("a"), frame("b", make="FLIR", model="T640", serial="7", focal_mm=13.1)])
-    assert one.label == "FLIR T640 7, 8x6 pixels, 13.1 mm" and [f.name for f in one.frames] == ["a", "b"]
-    assert devices_of([frame("a", size=None)])[0].label == "unknown"
+    assert one.label == "FLIR T640 7, 8x6 pixels, focal length 13.1 mm" and [f.name for f in one.frames] == ["a", "b"]
+    assert devices_of([frame("a", size=None)])[0].label == "unknown camera"
 
 
 @pytest.mark.parametrize("cut", [False, True], ids=["other size", "other lens"])
@@ -98,8 +98,8 @@ def test_the_doctor_looks_at_each_camera_s_files(tmp_path):
     write_two(tmp_path / "files", cut=True)
     found = check(str(tmp_path / "files"), tmp_path)
     assert sorted(one.what[: one.what.index("pixels differ")] for one in found) == [
-        "Synthetic Thermal 12, 160x128 pixels, 2.16 mm: 6 ",
-        "Synthetic Thermal 18, 160x128 pixels, 3.23 mm: 7 ",
+        "Synthetic Thermal 12, 160x128 pixels, focal length 2.16 mm: 6 ",
+        "Synthetic Thermal 18, 160x128 pixels, focal length 3.23 mm: 7 ",
     ]
 
 

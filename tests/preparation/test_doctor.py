@@ -43,6 +43,8 @@ def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
         with caplog.at_level("INFO"):
             assert check(str(tmp_path / folder), tmp_path) == []
         assert ("once they are known" in caplog.text) == told
+        assert ("8 frames of Synthetic Thermal 12, 64x52 pixels" in caplog.text) == told
+        assert ("taken for kelvin x 100" in caplog.text) == told
 
 
 def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_prepared(tmp_path):

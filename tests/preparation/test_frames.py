@@ -29,6 +29,12 @@ def test_frames_of_flir_come_in_the_order_of_their_times_with_all_that_their_fil
     assert (first.temperature() > temperatures(0) + 0.1).any()  # the conditions of the file count
 
 
+def test_frames_without_times_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    found = read_recording(write_images(tmp_path, {f"{name}.tiff": FLOATS for name in ("b 10", "b 2", "b 09", "a3")}))
+    assert [frame.name for frame in found.frames] == ["a3", "b 2", "b 09", "b 10"]
+    assert any("4 of 4 frames have no time" in note for note in found.notes)
+
+
 def test_sequences_have_a_frame_each(tmp_path):
     frames = read_frames(write_sequence(tmp_path / "flight.seq").parent)
     assert [frame.name for frame in frames] == [f"flight_{i:06d}" for i in range(4)]

@@ -1,10 +1,12 @@
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import succeeds
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from recordings import write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
@@ -36,6 +38,20 @@ def poses(frames, target):
     seen = np.random.default_rng(1).uniform(-0.5, 0.5, (30, 3))
     write_model(target / "sparse" / "0", cameras, [PINHOLE], seen, np.full((len(seen), 3), 128))
     return Section("Poses", [f"{len(frames)} of {len(frames)}"])
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [("scene_2", "data.root={}"), ("Flug über Köln, 2", "\"data.root='{}'\"")],
+    ids=["plain", "quoted"],
+)
+def test_the_command_that_trains_can_be_typed_as_it_is_shown(tmp_path, caplog, name, shown):
+    with caplog.at_level("INFO"):
+        prepare(str(write_flir(tmp_path / "files", 2)), tmp_path / name, **PLAIN, poses=poses)
+    word = shown.format(tmp_path / name)
+    assert f"python src/train.py data=colmap {word}\n" in caplog.text
+    (override,) = OverridesParser.create().parse_overrides(shlex.split(word))
+    assert override.value() == str(tmp_path / name)
 
 
 def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_and_times(tmp_path):

@@ -16,7 +16,16 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"python src/(\w+)\.py((?:\\\n|[^\n`])*)")
 OVERRIDE = re.compile(r"[+~]{0,2}[\w./@]+=")
-MADE_ON_A_PAGE = ("method=linear_drift", "sensor=camera_gain", "data=my_flight")  # files that docs/extending.md adds
+# Files that docs/extending.md adds.
+MADE_ON_A_PAGE = (
+    "method=linear_drift",
+    "method=3dgs,linear_drift",
+    "sensor=camera_gain",
+    "density=unseen",
+    "loss=charbonnier",
+    "thermal=my_drift",
+    "data=my_flight",
+)
 
 
 def commands_of(path: Path) -> list[tuple[str, list[str]]]:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from commands import succeeds
 
+import heatsplat
+
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "extending.md").read_text()
 FILES = re.findall(r"^`([\w./]+)`\n\n```\w+\n(.*?)^```", TEXT, re.M | re.S)
@@ -32,15 +34,30 @@ def run(copy: Path, command: str) -> str:
     return printed
 
 
-def test_the_page_adds_a_model_a_sensor_part_and_a_data_set():
+def test_the_page_adds_one_of_each_kind():
     kinds = {path.rsplit("/", 1)[0] for path, _ in FILES}
-    assert kinds >= {"src/heatsplat/thermal", "src/heatsplat/sensors", "datamodules", "conf/thermal", "conf/data"}
+    assert kinds >= {"datamodules", "conf/data"}
+    assert kinds >= {f"src/heatsplat/{package}" for package in ("thermal", "sensors", "density", "losses")}
     assert not any((ROOT / path).exists() for path, _ in FILES), "the page must add files, not replace them"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_its_commands_run(command, copy):
     assert "psnr" in run(copy, command)
+
+
+def test_parts_outside_of_the_repository_are_trained_and_loaded(tmp_path, monkeypatch):
+    content = dict(FILES)
+    (tmp_path / "conf" / "thermal").mkdir(parents=True)
+    (tmp_path / "my_heat.py").write_text(content["src/heatsplat/thermal/linear_drift.py"])
+    settings = content["conf/thermal/linear_drift.yaml"].replace("heatsplat.thermal.linear_drift", "my_heat")
+    (tmp_path / "conf" / "thermal" / "my_drift.yaml").write_text(settings)
+    monkeypatch.syspath_prepend(tmp_path)
+    quick = ["data.scene=cooling", "data.size=tiny", "max_steps=3", "threads=1", "test=false", "doctor=false"]
+    config = heatsplat.compose([f"hydra.searchpath=[{tmp_path}/conf]", "method=3dgs", "thermal=my_drift", *quick])
+    heatsplat.train(config, tmp_path / "run")
+    trained = heatsplat.load(tmp_path / "run" / "checkpoints" / "last.ckpt", trust=["my_heat.LinearDrift"])
+    assert type(trained.module.thermal).__name__ == "LinearDrift"
 
 
 def test_its_data_set_loads(copy, tmp_path):

@@ -64,7 +64,9 @@ def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
 @pytest.mark.parametrize(
     ("override", "told"),
     [
-        ("max_steps=-1", "max_steps must be 1 or more, got -1"),
+        ("max_steps=-1", "max_steps must be a whole number, 1 or more, got -1"),
+        ("max_steps=1e4", "max_steps must be a whole number, 1 or more, got 10000.0"),
+        ("seed=abc", "seed must be a whole number, 0 or more, got abc"),
         ("max_steps=0", "max_steps must be"),
         ("threads=0", "threads must be 1 to"),
         ("threads=5000", "threads must be 1 to .*, got 5000"),

@@ -83,6 +83,14 @@ def test_classes_of_registered_packages_and_those_that_the_user_names_may_be_bui
     own = composed | {"thermal": {"_target_": "my_package.heat.Mine"}}
     with pytest.raises(SceneError, match=r"trust=\[my_package\.heat\.Mine\]"):
         trust.trusted(own, "own.ckpt")
+    several = own | {"density": {"_target_": "my_package.Rule"}, "loss": {"_target_": "my_package.heat.Mine"}}
+    with pytest.raises(SceneError, match=r"_target_ is .*trust=\[my_package\.heat\.Mine,my_package\.Rule\]"):
+        trust.trusted(several, "own.ckpt")
+    with pytest.raises(
+        SceneError, match=r"sent\.ckpt needs my_package\.heat\.Mine, which Python does not find .* PYTHONPATH"
+    ):
+        built = own | {"module": composed["module"] | {"thermal": own["thermal"]}}
+        run.load(stored(tmp_path, built), trust=["my_package.heat.Mine"])
     assert trust.trusted(own, "own.ckpt", ["my_package.heat.Mine"])
 
     class Entry:

@@ -13,7 +13,7 @@ from running import compose_run
 
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
-from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, row_name
+from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, row_names, settings_of
 from heatsplat.studies.published import figures, quoted
 from heatsplat.studies.sweeps import collect, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
@@ -80,8 +80,21 @@ def test_a_folder_without_jobs_has_no_table(tmp_path):
 
 
 def test_a_job_of_a_grid_is_named_by_what_it_sets():
-    assert row_name({"method": "etgs", "seed": "1", "thermal.frequencies": "8"}) == "etgs thermal.frequencies=8"
-    assert row_name({"seed": "1", "data.scene": "cooling"}) == "run"
+    jobs = [
+        {"method": "etgs", "seed": "1", "max_steps": "9", "thermal.frequencies": "8"},
+        {"method": "etgs", "seed": "1", "max_steps": "9", "thermal.frequencies": "24"},
+        {"method": "3dgs", "seed": "1", "max_steps": "9"},
+    ]
+    assert row_names(jobs) == [("etgs thermal.frequencies=8", ""), ("etgs thermal.frequencies=24", ""), ("3dgs", "")]
+    assert row_names([{"seed": "1", "data.scene": "cooling"}]) == [("run", "")]
+
+
+def test_what_all_rows_have_is_told_once(tmp_path):
+    for number, method in enumerate(("etgs", "3dgs")):
+        job(tmp_path, number, [f"method={method}", "max_steps=9", "seed=0", "threads=1"], 30.0)
+    write_sweep(tmp_path)
+    text = (tmp_path / "table.md").read_text()
+    assert "All rows: `max_steps=9`." in text and "| etgs | 1 |" in text and "| 3dgs | 1 |" in text
 
 
 def test_what_makes_no_other_recipe_is_not_in_a_name():
@@ -94,9 +107,8 @@ def test_what_makes_no_other_recipe_is_not_in_a_name():
         "table.scenes=[wall]",
         "threads=1",
     )
-    assert row_name(dict(text.partition("=")[::2] for text in ("method=etgs", *same))) == "etgs"
-    one, other = {"b": "1", "a": "2"}, {"a": "2", "b": "1"}
-    assert row_name(one) == row_name(other) == "a=2 b=1"
+    assert settings_of(dict(text.partition("=")[::2] for text in ("method=etgs", *same))) == []
+    assert settings_of({"b": "1", "a": "2"}) == settings_of({"a": "2", "b": "1"}) == ["a=2", "b=1"]
 
 
 def test_what_runs_may_differ_in_when_they_go_on_and_what_folders_leave_out_makes_no_row():

@@ -153,6 +153,13 @@ class QualityMetrics(pl.Callback):
         results.definitions["scored"] = (
             f"the image that the camera would record, clamped to [0, 1], {module.modality}; mean of {count} test images"
         )
+        if "clean" in self._companions:
+            known = module.scene.test[0].clean is not None
+            results.definitions["clean_..."] = "the image without what the camera adds, scored against " + (
+                "one that is known to be without it"
+                if known
+                else "the recorded image, for no other is known: errors hold what the camera added"
+            )
         if self._scorer.threshold is not None:
             results.definitions["scene_threshold_c"] = module.scene.thermal_range.to_celsius(self._scorer.threshold)
         if not count:

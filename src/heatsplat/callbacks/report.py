@@ -171,10 +171,10 @@ def hyperparameters(config: Mapping[str, Any]) -> dict[str, Any]:
     def add(path: str, value: Any) -> None:
         if isinstance(value, Mapping):
             for key, item in value.items():
-                add(
-                    f"{path}.{key}" if key != "_target_" else path,
-                    item if key != "_target_" else str(item).split(".")[-1],
-                )
+                if key == "_target_":
+                    add(path, str(item).split(".")[-1])
+                else:
+                    add(f"{path}.{key}", item)
         else:
             flat[path] = value if isinstance(value, (int, float, str, bool)) else str(value)
 
@@ -215,9 +215,12 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
     lines += ["## Scores and cost", "", *table]
-    missing = [(f"{s}.{n}", reasons[f"{s}.{n}"]) for s in ("test", "cost") for n in content[s] if f"{s}.{n}" in reasons]
+    missing: dict[str, list[str]] = {}
+    for name in (f"{part}.{score}" for part in ("test", "cost") for score in content[part]):
+        if name in reasons:
+            missing.setdefault(reasons[name], []).append(f"`{name}`")
     if missing:
-        lines += ["", "Not available:", "", *(f"- `{name}`: {reason}" for name, reason in missing)]
+        lines += ["", "Not available:", "", *(f"- {', '.join(names)}: {reason}" for reason, names in missing.items())]
     if (folder / VIEWER_FILE).exists():
         lines += ["", f"Interactive 3D view with temperatures: [{VIEWER_FILE}]({VIEWER_FILE})."]
     if pictures:

@@ -30,17 +30,6 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def shortest_axes(quats: Tensor, scales: Tensor) -> Tensor:
-    """Directions [n, 3] of the shortest axes of ellipsoids: the normals of flat ones, of either sign.
-
-    Args:
-        quats: [n, 4] wxyz of any length but zero.
-        scales: [n, 3] semi-axes or their logarithms.
-    """
-    shortest = scales.argmin(1)[:, None, None].expand(-1, 3, 1)
-    return quats_to_matrices(quats).gather(2, shortest).squeeze(2)
-
-
 def matrices_to_quats(matrices: Tensor) -> Tensor:
     """Unit quaternions [..., 4] wxyz, w >= 0, of rotation matrices [..., 3, 3].
 

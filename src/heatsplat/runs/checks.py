@@ -54,8 +54,9 @@ def _check_ranges(config: Mapping[str, Any]) -> None:
     threads = config["threads"]
     if threads is not None and not 1 <= threads <= most:
         raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
-    if not config["max_steps"] >= 1:
-        raise SceneError(f"max_steps must be 1 or more, got {config['max_steps']}")
+    for key, least in (("max_steps", 1), ("seed", 0)):
+        if not isinstance(config[key], int) or config[key] < least:
+            raise SceneError(f"{key} must be a whole number, {least} or more, got {config[key]}")
     for key, rate in _rates(config):
         if isinstance(rate, int | float) and not rate >= 0:
             raise SceneError(f"{key} is a learning rate and must be 0 or more, got {rate}")

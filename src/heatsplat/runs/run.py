@@ -6,6 +6,7 @@ A configuration is a dict of plain containers, and every step of ``begin`` retur
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from torch import Tensor
 from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
-from heatsplat.geometry.coverage import Sighting, covered, surface_depth
+from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
@@ -193,11 +194,9 @@ class Trained:
         """Which pixels of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
         return covered(frame.camera, self.depth(frame), self._sightings)
 
-    @torch.no_grad()
     def depth(self, frame: Frame) -> Tensor:
         """Camera z [H, W] of the surface in a frame, in world units; infinite where there is none."""
-        output = self.module.render(frame, depth=True)
-        return surface_depth(output.depth, output.alpha[0]).cpu()
+        return self.module.depth(frame)
 
     @cached_property
     def _sightings(self) -> list[Sighting]:
@@ -269,6 +268,12 @@ def _naming(checkpoint: Path | str) -> Iterator[None]:
         raise SceneError(f"{checkpoint}: {error}") from error
     except Exception as error:
         said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        absent = re.search(r"Error locating target '([\w.]+)'", said)
+        if absent and not absent[1].startswith("heatsplat."):
+            raise SceneError(
+                f"{checkpoint} needs {absent[1]}, which Python does not find here: install its package, or set PYTHONPATH to the "
+                "folder that holds it"
+            ) from error
         raise SceneError(
             f"{checkpoint} does not fit this heatsplat ({said}): it is of another version, or not as heatsplat wrote it"
         ) from error

@@ -42,25 +42,31 @@ def trusted(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[
     if not isinstance(config, dict):
         raise SceneError(f"{path} holds no configuration to build from; is it a checkpoint of heatsplat?")
     kept = {key: value for key, value in config.items() if key not in NOT_BUILT}
+    unknown: dict[str, str] = {}
     try:
-        found = next(_foreign(kept, "", vocabulary() | set(trust)), None)
+        found = list(_foreign(kept, "", vocabulary() | set(trust), unknown))
     except RecursionError:
-        found = "its configuration contains itself"
-    if found is not None:
-        raise SceneError(f"{path} is not loaded: {found}")
+        found = ["its configuration contains itself"]
+    if found:
+        raise SceneError(f"{path} is not loaded: {found[0]}")
+    if unknown:
+        key, target = next(iter(unknown.items()))
+        raise SceneError(
+            f"{path} is not loaded: {key}._target_ is {target!r}. From a checkpoint come only classes that heatsplat's "
+            f"configurations name, or that an installed package registers under the entry points '{ENTRY_POINTS}'; if you know "
+            f"these and who sent them: trust=[{','.join(dict.fromkeys([*trust, *unknown.values()]))}]"
+        )
     return kept
 
 
-def _foreign(value: Any, key: str, allowed: Collection[str]) -> Iterator[str]:
-    """What is wrong with a value of a configuration and all in it, in words."""
+def _foreign(value: Any, key: str, allowed: Collection[str], unknown: dict[str, str]) -> Iterator[str]:
+    """What is wrong with a value and all in it, in words; classes that are not allowed go to ``unknown``, by key."""
     if isinstance(value, Mapping):
         target = value.get("_target_")
-        if "_target_" in value and not (isinstance(target, str) and target in allowed):
-            yield (
-                f"{key}._target_ is {target!r}. From a checkpoint come only classes that heatsplat's configurations name, or "
-                f"that an installed package registers under the entry points '{ENTRY_POINTS}'; if you know this one and who "
-                f"sent it: trust=[{target}]"
-            )
+        if "_target_" in value and not isinstance(target, str):
+            yield f"{key}._target_ is {target!r}"
+        elif "_target_" in value and target not in allowed:
+            unknown[key] = target
         elif "_target_" in value and target.rpartition(".")[2][0].islower() and value.get("_partial_") is not True:
             yield f"{key}._target_ is the function {target}, which would be called"
         for name, item in value.items():
@@ -69,10 +75,10 @@ def _foreign(value: Any, key: str, allowed: Collection[str]) -> Iterator[str]:
             elif str(name).startswith("_") and name not in ("_target_", "_partial_"):
                 yield f"{key}.{name} is no setting of a part"
             else:
-                yield from _foreign(item, f"{key}.{name}".lstrip("."), allowed)
+                yield from _foreign(item, f"{key}.{name}".lstrip("."), allowed, unknown)
     elif isinstance(value, list | tuple):
         for i, item in enumerate(value):
-            yield from _foreign(item, f"{key}[{i}]", allowed)
+            yield from _foreign(item, f"{key}[{i}]", allowed, unknown)
     elif isinstance(value, str):
         if "${" in value:
             yield f"{key} is the interpolation {value!r}"

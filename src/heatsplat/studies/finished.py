@@ -136,16 +136,16 @@ def reason_of(folder: Path) -> str:
 def row_names(jobs: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
     """For each job the name of its row, and the settings that not all jobs of a row of this name have ("" for none).
 
-    A job without a named row has its settings for a name (``row_name``).
+    A job without a named row is named by its method and by the settings that not all such jobs have.
 
     Args:
         jobs: overrides of each: key -> value.
     """
     names = [named_row(overrides) for overrides in jobs]
-    settings = [[*_method(overrides), *settings_of(overrides)] for overrides in jobs]
+    settings = [[*(_method(o) if name else []), *settings_of(o)] for o, name in zip(jobs, names, strict=True)]
     others = [" ".join(words) for words in unshared(names, settings)]
     return [
-        (name, other) if name else (row_name(overrides), "")
+        (name, other) if name else (" ".join([*_method(overrides), other]).strip() or "run", "")
         for overrides, name, other in zip(jobs, names, others, strict=True)
     ]
 
@@ -162,11 +162,6 @@ def named_row(overrides: Mapping[str, str]) -> str:
     """Name of the row that a job was given (``row=``), empty for none."""
     name = overrides.get("row", "").strip("'\"")
     return "" if name == "null" else name
-
-
-def row_name(overrides: Mapping[str, str]) -> str:
-    """Name of a job without a named row: its overrides, method first, without those that tell seeds and places apart."""
-    return " ".join([*_method(overrides), *settings_of(overrides)]) or "run"
 
 
 def _method(overrides: Mapping[str, str]) -> list[str]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
-from heatsplat.studies.finished import Runs, read_runs, row_names
+from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
 from heatsplat.studies.recorded import OVERRIDES
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
@@ -104,7 +104,10 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     if failed:
         lines += ["", f"Jobs without a result: {len(failed)}", "", *failed]
     scenes = ", ".join(sorted({row.scene for row in rows}))
-    return "\n".join([f"# Sweep on {scenes}", "", "Mean ± standard deviation over seeds.", "", *lines, ""])
+    jobs = [set(settings_of(overrides)) for row in rows for overrides in row.table["overrides"]]
+    shared = sorted(set.intersection(*jobs))
+    about = "Mean ± standard deviation over seeds." + (f" All rows: `{' '.join(shared)}`." if shared else "")
+    return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
 
 
 def _records(rows: Sequence[Runs], paper: Printed) -> list[dict[str, Any]]:

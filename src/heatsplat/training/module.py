@@ -18,7 +18,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
-from heatsplat.geometry.coverage import gap_free, seen_means
+from heatsplat.geometry.coverage import gap_free, seen_means, surface_depth
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
@@ -443,6 +443,12 @@ class SplatTraining(pl.LightningModule):
         images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
+
+    @torch.no_grad()
+    def depth(self, frame: Frame) -> Tensor:
+        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none."""
+        output = self.render(frame, depth=True)
+        return surface_depth(output.depth, output.alpha[0]).cpu()
 
     @contextmanager
     def showing(self, splats: Splats) -> Iterator[None]:
