@@ -39,16 +39,17 @@ def without(preset: Preset, effect: str) -> Scene:
     if effect not in preset.effects:
         raise SceneError(f"the scene shows {', '.join(sorted(preset.effects)) or 'no effect'}, not {effect}")
     if effect == "relaxation":
-        return _at_rest(_scene_of(preset))
+        return _at_rest(scene_of(preset))
     known = {**_OUTSIDE, **_SURFACES, **_CAMERA}
     if effect not in known:
         raise SceneError(f"nobody knows the scene without {effect}; known are relaxation, {', '.join(known)}")
     if effect in _CAMERA:
-        return _scene_of(replace(preset, flaws=_CAMERA[effect](preset, preset.flaws)))
-    return _scene_of(known[effect](preset))
+        return scene_of(replace(preset, flaws=_CAMERA[effect](preset, preset.flaws)))
+    return scene_of(known[effect](preset))
 
 
-def _scene_of(preset: Preset) -> Scene:
+def scene_of(preset: Preset) -> Scene:
+    """The solved scene of a preset, in a room or under the sky."""
     return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else Scene(preset)
 
 
