@@ -18,8 +18,8 @@ def strengths(recorded: Synthetic) -> dict[str, float]:
     """Root mean square of what each effect that a drawn scene shows changes in noise-free training images, in standard deviations
     of the noise of a pixel, by name.
 
-    It is taken over the tracks of scene points that verdicts look at, beside a level for each point, which any model has; over all
-    pixels where there are no tracks.
+    It is taken over the tracks of scene points that verdicts look at, beside a level for each point, which any model has; over
+    all pixels where there are no tracks.
     """
     scene, preset = recorded.scene, recorded.drawn.preset
     seen = observe(scene)

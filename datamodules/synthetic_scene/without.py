@@ -68,9 +68,7 @@ def _at_rest(scene: Scene) -> Scene:
 def _no_pane(preset: Preset) -> Preset:
     panes = {one.name for one in preset.surfaces if one.transmits}
     surfaces = tuple(one for one in preset.surfaces if one.name not in panes)
-    return replace(
-        preset, surfaces=surfaces, start_k={k: v for k, v in preset.start_k.items() if k not in panes}
-    )
+    return replace(preset, surfaces=surfaces, start_k={k: v for k, v in preset.start_k.items() if k not in panes})
 
 
 def _each(preset: OutdoorPreset, changed: Callable[[OutdoorSurface], OutdoorSurface]) -> OutdoorPreset:

@@ -18,7 +18,9 @@ def images(scene, bounds=None):
     return torch.from_numpy(recording.celsius), recording.thermal_range
 
 
-@pytest.mark.parametrize(("preset", "other"), [("drifting", "static"), ("uneven", "static"), ("dark_corners", "static")])
+@pytest.mark.parametrize(
+    ("preset", "other"), [("drifting", "static"), ("uneven", "static"), ("dark_corners", "static")]
+)
 def test_without_its_flaw_a_camera_sees_what_is_there(preset, other):
     flawless, bounds = images(scene_of(PRESETS[other]))
     (effect,) = PRESETS[preset].effects

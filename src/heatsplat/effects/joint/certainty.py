@@ -7,7 +7,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from heatsplat.effects.joint.courses import ANY, common_courses
@@ -229,8 +228,8 @@ class Certainty:
         return bool(changing) and all(self._is_clear(more.plus(ANY, one.kind(ANY)), one) for one in changing)
 
     def _may_be_change(self, name: str) -> str:
-        """That a change of the scene which the record cannot follow may pass for an effect; empty where none can. What single images
-        have in common may be one however well it explains them."""
+        """That a change of the scene which the record cannot follow may pass for an effect; empty where none can. What single
+        images have in common may be one however well it explains them."""
         return self._unfollowed if self.fit.data.effects[name].term.single_images else self.unseen_changes
 
     def _doubt(self, name: str, more: Model, less: Model, held_out: HeldOut) -> str:

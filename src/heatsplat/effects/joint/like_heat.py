@@ -1,4 +1,4 @@
-"""What single images have in common may go a way over time that a scene goes by itself: whether it does, and whether by chance."""
+"""What single images have in common may go over time as a scene by itself does: whether it does, and whether by chance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FREE = 4  # frames that heat's own numbers must leave
 
 
 def may_be_heat(fit: Fit, model: Model, name: str) -> bool:
-    """Whether what an effect of single images adds goes over time as a scene may, of which the model says that nothing changes it."""
+    """Whether what an effect of single images adds goes over time as a scene may that, by the model, does not change."""
     heat = _heat(fit, model, name)
     if heat is None:
         return False
@@ -42,8 +42,8 @@ def is_heat(fit: Fit, model: Model, name: str) -> bool:
 
 
 def _heat(fit: Fit, model: Model, name: str) -> Tensor | None:
-    """Courses [F, k] of a scene that changes by itself, with a level; None where the effect is none of single images, and where the
-    model has the scene change anyhow."""
+    """Courses [F, k] of a scene that changes by itself, with a level; None where the effect is none of single images, and where
+    the model has the scene change anyhow."""
     data = fit.data
     if name not in model.names or not data.effects[name].term.single_images or data.span_s <= 0:
         return None
