@@ -46,11 +46,19 @@ the others.
 
 - It gains at least 0.3 dB, and 3.5 standard errors over the images.
 - Images with shuffled residuals do not gain as much.
-- A change common to an image is common to all of its points.
+- A change common to an image is common to all of its points: what one half of the points says of each image explains at least
+  half as much of the other half as all points together do. Effects of the whole record, such as a fixed pattern, keep what all
+  points say of them.
 - If there are too few frames to follow the scene, or the weather describes its changes only roughly, the effect must gain
   this much in addition to a generic change of the scene: one or two time courses, scaled separately for each point.
 - An effect that gains less than 0.1 dB is absent; so is a change over time if no such course gains more.
-- A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt.
+- A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt, or if
+  it is worth its parameters and explains held-out observations, but too few of them.
+- Heat takes the place of offsets and gains of single images if these go over time as heat does, closer than 99 of 100 random
+  walks (`effects/joint/like_heat.py`). Numbers for each image cost less than numbers for each point, so that the criterion alone
+  preferred a drifting camera to a scene that cools alike.
+- In records with too few frames to follow the scene, changes of single images have to outdo a generic change however well they
+  explain the images, and heat stays undecided while they are.
 
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms

@@ -150,8 +150,8 @@ class Certainty:
         lacking, in_time = self._lacking(name), self.fit.data.effects[name].term.in_time
         if not lacking:
             return ""
-        if in_time and any(one in self.doubts for one in self._of_single_images):
-            return lacking  # what they explain may be what heat does
+        if in_time and any(one in self.doubts and self._counts(one) for one in self._of_single_images):
+            return lacking  # heat may be in its place
         if self.explained:
             return ""
         if in_time:
