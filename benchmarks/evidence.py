@@ -150,7 +150,7 @@ class Outcome:
         scene, size, seed: which one.
         present: names of the effects that it shows in truth.
         verdicts: by name.
-        seconds: what deciding took.
+        seconds: of processor time that deciding took.
         conditions: in which it was recorded.
         strengths: of the effects that it shows, by name (``benchmarks.strengths``); of scenes that are drawn at random only.
     """
@@ -266,9 +266,9 @@ def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Ou
         raise SceneError(
             f"scene '{recorded.name}' does not say in its notes which effects it shows; judge synthetic ones"
         )
-    start = time.perf_counter()
+    start = time.process_time()
     verdicts = decide(recorded)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     conditions = tuple(name for name, holds in CONDITIONS.items() if holds(recorded))
     strong = strengths(module) if scene.startswith(DRAWN) else {}
     return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, seconds, conditions, strong)
@@ -420,7 +420,7 @@ def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"\n## {title}\n",
         f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % cannot be told, {wrong} % are "
         f"wrong ({len(sought)} verdicts concern effects whose metadata are present). {clean} of {len(outcomes)} scenes have no "
-        f"wrong verdict. A scene's verdicts took {seconds:.1f} s (median, one thread).\n",
+        f"wrong verdict. A scene's verdicts took {seconds:.1f} s of processor time (median).\n",
         *markdown_table(head, rows),
         "",
     ]
