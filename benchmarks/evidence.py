@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 
+from benchmarks.strengths import strengths
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.training.machine import cores
@@ -41,11 +46,19 @@ the others.
 
 - It gains at least 0.3 dB, and 3.5 standard errors over the images.
 - Images with shuffled residuals do not gain as much.
-- A change common to an image is common to all of its points.
+- A change common to an image is common to all of its points: what one half of the points says of each image explains at least
+  half as much of the other half as all points together do. Effects of the whole record, such as a fixed pattern, keep what all
+  points say of them.
 - If there are too few frames to follow the scene, or the weather describes its changes only roughly, the effect must gain
   this much in addition to a generic change of the scene: one or two time courses, scaled separately for each point.
 - An effect that gains less than 0.1 dB is absent; so is a change over time if no such course gains more.
-- A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt.
+- A rejected effect is in doubt only if it explains the held-out observations as well as an effect that is itself in doubt, or if
+  it is worth its parameters and explains held-out observations, but too few of them.
+- Heat takes the place of offsets and gains of single images if these go over time as heat does, closer than 99 of 100 random
+  walks (`effects/joint/like_heat.py`). Numbers for each image cost less than numbers for each point, so that the criterion alone
+  preferred a drifting camera to a scene that cools alike.
+- In records with too few frames to follow the scene, changes of single images have to outdo a generic change however well they
+  explain the images, and heat stays undecided while they are.
 
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms
@@ -103,6 +116,13 @@ Nothing else changes. The file states:
 `thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` needs a case for each effect, to check that nothing of it
 remains when it is off.
 """
+PICTURE = "verdicts_by_strength.png"
+STRENGTH_NOTE = f"""Do the wrong and the undecided verdicts matter? Each effect was taken out of the truth of its scene
+(`synthetic_scene/without.py`) and the scene was filmed again without noise. *Strength* is the root mean square of the difference
+of training images, along the tracks of scene points and beside a level for each point, in standard deviations of the noise of a
+pixel. Only effects that are there have one. An error of poses, and what other effects could explain instead, are not in it:
+
+![verdicts by strength](pictures/{PICTURE})"""
 DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
 CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
     "indoor": lambda scene: scene.weather is None,
@@ -116,6 +136,8 @@ CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
     "poses off by half a pixel or more": lambda scene: scene.notes["pose_error_px"] >= 0.5,
     "with gain control": lambda scene: "agc" in scene.notes["effects"],
 }
+# Strengths of effects, in standard deviations of the noise of a pixel, between which verdicts are counted together.
+STRENGTHS = (0.0, 1.0, 3.0, 10.0, 30.0, math.inf)
 MISSED, TAKEN, UNTOLD = (attrgetter(name) for name in ("missed", "taken", "untold"))
 COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
 
@@ -128,8 +150,9 @@ class Outcome:
         scene, size, seed: which one.
         present: names of the effects that it shows in truth.
         verdicts: by name.
-        seconds: what deciding took.
+        seconds: of processor time that deciding took.
         conditions: in which it was recorded.
+        strengths: of the effects that it shows, by name (``benchmarks.strengths``); of scenes that are drawn at random only.
     """
 
     scene: str
@@ -139,6 +162,7 @@ class Outcome:
     verdicts: Mapping[str, Verdict]
     seconds: float
     conditions: tuple[str, ...] = ()
+    strengths: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def found(self) -> frozenset[str]:
@@ -188,7 +212,8 @@ def run(
         seeds: of the recordings of each.
         unseen: of further ones, which no threshold was set on; they are counted apart.
         drawn: first number and count of scenes that are drawn at random, by what they are called; they are of the first size.
-        document: file that is written besides; None for none.
+        document: file that is written besides, and in "pictures" beside it how verdicts go with the strength of effects; None
+            for none.
         jobs: recordings that are worked on side by side, with one thread each; None: one for each core.
     """
     numbers = {name: range(first, first + count) for name, (first, count) in (drawn or {}).items()}
@@ -206,8 +231,12 @@ def run(
             log.info("    %s", outcome.verdicts[name].reason)
     outcomes = [_read(path) for path in known.values()]
     text = written(outcomes, frozenset(unseen), numbers)
+    figure = picture([one for one in outcomes if one.strengths])
     for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
         path.write_text(text, encoding="utf-8")
+        if figure is not None:
+            (path.parent / "pictures").mkdir(exist_ok=True)
+            write_png(path.parent / "pictures" / PICTURE, figure_picture(figure))
     log.info("%s", text)
     return text
 
@@ -231,16 +260,18 @@ def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Ou
     Raises:
         SceneError: nobody knows what effects the scene shows.
     """
-    recorded = data(scene=scene, size=size, scene_seed=seed).scene
+    module = data(scene=scene, size=size, scene_seed=seed)
+    recorded = module.scene
     if "effects" not in recorded.notes:
         raise SceneError(
             f"scene '{recorded.name}' does not say in its notes which effects it shows; judge synthetic ones"
         )
-    start = time.perf_counter()
+    start = time.process_time()
     verdicts = decide(recorded)
-    seconds = time.perf_counter() - start
+    seconds = time.process_time() - start
     conditions = tuple(name for name, holds in CONDITIONS.items() if holds(recorded))
-    return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, seconds, conditions)
+    strong = strengths(module) if scene.startswith(DRAWN) else {}
+    return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, seconds, conditions, strong)
 
 
 def _plain(outcome: Outcome) -> dict[str, Any]:
@@ -305,7 +336,56 @@ def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
         if these:
             rows.append((condition, len(these), *_shares(these)))
     head = ("recording", "scenes", "right %", "cannot be told %", "wrong %")
-    return [*_by_effect(title, outcomes), *markdown_table(head, rows)]
+    return [*_by_effect(title, outcomes), *markdown_table(head, rows), *_by_strength(outcomes)]
+
+
+def groups_by_strength(outcomes: Sequence[Outcome]) -> list[tuple[float, float, int, int, int, int]]:
+    """Of the effects that are there: between which strengths they are, and how many of them are found, told absent, undecided but
+    simulated, and undecided and left out."""
+    pairs = [(one, name, strength) for one in outcomes for name, strength in one.strengths.items()]
+    groups = []
+    for low, high in itertools.pairwise(STRENGTHS):
+        these = [(one, name) for one, name, strength in pairs if low <= strength < high]
+        found = sum(name in one.found - one.untold for one, name in these)
+        missed = sum(name in one.missed for one, name in these)
+        kept = sum(name in one.found & one.untold for one, name in these)
+        if these:
+            groups.append((low, high, found, missed, kept, len(these) - found - missed - kept))
+    return groups
+
+
+def _by_strength(outcomes: Sequence[Outcome]) -> list[str]:
+    """How verdicts on effects that are there go with their strength."""
+    rows = []
+    for low, high, *counts in groups_by_strength(outcomes):
+        shares = (f"{100 * count / sum(counts):.0f}" for count in counts)
+        rows.append((_between(low, high), sum(counts), *shares))
+    head = ("strength", "effects", "found %", "missed %", "undecided, simulated %", "undecided, left out %")
+    return ["", STRENGTH_NOTE, "", *markdown_table(head, rows)] if rows else []
+
+
+def _between(low: float, high: float) -> str:
+    return f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} and more"
+
+
+def picture(outcomes: Sequence[Outcome]) -> Figure | None:
+    """How verdicts on effects that are there go with their strength; None where no strength is known."""
+    groups = groups_by_strength(outcomes)
+    if not groups:
+        return None
+    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
+    axis, below = figure.subplots(), [0.0] * len(groups)
+    kinds = {"found": "C2", "missed": "C3", "undecided, simulated": "0.6", "undecided, left out": "0.85"}
+    for column, (name, color) in enumerate(kinds.items(), start=2):
+        shares = [100.0 * group[column] / sum(group[2:]) for group in groups]
+        axis.bar(range(len(groups)), shares, bottom=below, color=color, label=name)
+        below = [low + share for low, share in zip(below, shares, strict=True)]
+    labels = [f"{_between(low, high)}\n({sum(counts)} effects)" for low, high, *counts in groups]
+    axis.set_xticks(range(len(groups)), labels, fontsize=8)
+    axis.set_xlabel("strength, in standard deviations of the noise of a pixel")
+    axis.set_ylabel("% of the effects that are there")
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
 
 
 def _shares(outcomes: Sequence[Outcome]) -> tuple[str, str, str]:
@@ -340,7 +420,7 @@ def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"\n## {title}\n",
         f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % cannot be told, {wrong} % are "
         f"wrong ({len(sought)} verdicts concern effects whose metadata are present). {clean} of {len(outcomes)} scenes have no "
-        f"wrong verdict. A scene's verdicts took {seconds:.1f} s (median, one thread).\n",
+        f"wrong verdict. A scene's verdicts took {seconds:.1f} s of processor time (median).\n",
         *markdown_table(head, rows),
         "",
     ]

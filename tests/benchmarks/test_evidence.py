@@ -1,10 +1,12 @@
 """Verdicts against truth on small synthetic scenes, and the page that tells of them."""
 
+import json
+import math
 from functools import partial
 
 import pytest
 
-from benchmarks.evidence import Outcome, outcome_of, run, written
+from benchmarks.evidence import Outcome, groups_by_strength, outcome_of, picture, run, written
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
@@ -69,9 +71,26 @@ def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path):
     assert asked == ["static", "drawn_2", "drawn_5"]
     assert "scenes drawn at random, looked at (drawn_2 to drawn_2)" in text
     assert "scenes drawn at random, unseen (drawn_5 to drawn_5)" in text
+    kept = [json.loads(path.read_text()) for path in (tmp_path / "verdicts").glob("drawn_*.json")]
+    assert [one["strengths"].keys() == set(one["present"]) for one in kept] == [True, True]
     (tmp_path / "verdicts" / "drawn_5_tiny_5.json").unlink()
     assert run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1).split("took")[0] == text.split("took")[0]
     assert asked[3:] == ["drawn_5"]
+
+
+def test_verdicts_are_counted_by_the_strength_of_effects():
+    verdicts = {effect.name: Verdict(effect.name, False, None, None, "") for effect in CATALOGUE}
+    verdicts["agc"] = Verdict("agc", True, 3.0, 1.0, "", told=False)
+    verdicts["tone"] = Verdict("tone", False, 3.0, 1.0, "", told=False)
+    verdicts["relaxation"] = Verdict("relaxation", True, 3.0, 1.0, "")
+    strengths = {"agc": 2.0, "tone": 2.5, "relaxation": 50.0, "frame_offset": 0.5}
+    outcome = Outcome("drawn_0", "tiny", 0, frozenset(strengths), verdicts, 0.1, (), strengths)
+    assert groups_by_strength([outcome]) == [
+        (0.0, 1.0, 0, 1, 0, 0), (1.0, 3.0, 0, 0, 1, 1), (30.0, math.inf, 1, 0, 0, 0),
+    ]  # fmt: skip
+    text = written([outcome], drawn={"all": range(1)})
+    assert "| 1 to 3 | 2 | 0 | 0 | 50 | 50 |" in text and "| 30 and more | 1 | 100 | 0 | 0 | 0 |" in text
+    assert picture([outcome]) is not None and picture([]) is None
 
 
 def test_what_cannot_be_told_counts_once_though_it_is_simulated():

@@ -10,10 +10,11 @@ from effects.tracks import COOLING, DRIFTING, FRAMES, NOTHING, PASSED, POINTS, d
 from heatsplat.effects.joint.certainty import MIN_DB, ROUGH, Certainty
 from heatsplat.effects.joint.courses import ANY
 from heatsplat.effects.joint.evidence import gained
-from heatsplat.effects.joint.fit import fit_of
+from heatsplat.effects.joint.fit import Fit, fit_of
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.physical import agc, frame_offset
 from heatsplat.effects.physical.attenuation import with_distance
+from heatsplat.effects.physical.frame_offset import common_to_all
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +71,34 @@ def test_a_drift_that_goes_as_heat_may_be_heat():
     cooling = Certainty(fit_to(levels() + 0.1 * torch.exp(-3 * PASSED)), Model.of(frame_offset=1))
     assert "goes over time as a scene may" in cooling.doubts["frame_offset"]
     assert {"relaxation", "harmonic_source"} <= set(cooling.doubts)
+
+
+def test_offsets_are_common_to_all_though_most_of_what_is_left_is_something_else():
+    """Half of the points are placed badly, so that offsets explain little of what they leave."""
+    bad = 0.2 * (torch.arange(POINTS)[:, None] % 2) * drawn(POINTS, FRAMES, seed=16)
+    fit = fit_to(DRIFTING + bad)
+    assert common_to_all(fit, Model.of(frame_offset=1), NOTHING)
+    lit = fit_to(levels() + bad + 0.05 * (drawn(POINTS, 1, seed=11) > 0) * drawn(FRAMES, seed=9))
+    assert not common_to_all(lit, Model.of(frame_offset=1), NOTHING)
+
+
+def test_offsets_that_few_frames_cannot_tell_from_heat_leave_it_open():
+    """Few frames see half of the points lit: offsets explain much, and whether anything changes cannot be told."""
+    lit = drawn(POINTS, 1, seed=11) > 0
+    data = data_of(levels() + 0.05 * lit * drawn(FRAMES, seed=9))
+    data.tracks.weights[:, [f for f in range(FRAMES) if f not in (0, 4, 9, 13, 18, 22, 27)]] = 0
+    certainty = Certainty(fit_of(data), Model.of(frame_offset=1))
+    assert "frame_offset" in certainty.doubts
+    assert "are needed" in certainty.few("relaxation") and "are needed" in certainty.few("harmonic_source")
+
+
+def test_what_is_left_out_is_undecided_only_if_it_may_gain_where_it_was_not_fitted(monkeypatch):
+    certainty = Certainty(fit_to(DRIFTING), NOTHING)
+    monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)
+    assert certainty.undecided(Model.of(frame_offset=1), "frame_offset")
+    still = Certainty(fit_to(levels()), NOTHING)
+    monkeypatch.setattr("heatsplat.effects.joint.certainty.worthwhile", lambda *_: True)
+    assert not still.undecided(Model.of(frame_offset=1), "frame_offset")
 
 
 def test_beside_a_rough_weather_record_a_camera_has_to_outdo_any_change():

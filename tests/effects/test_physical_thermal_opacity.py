@@ -9,7 +9,7 @@ from heatsplat.effects.physical import thermal_opacity
 
 
 @pytest.mark.parametrize(
-    ("points", "apart", "told"), [(0, 0, True), (1, 0, False), (2, 0, True), (8, 3, True), (8, 5, False)]
+    ("points", "apart", "told"), [(0, 0, True), (1, 0, True), (1, 1, False), (2, 0, True), (8, 3, True), (8, 5, False)]
 )
 def test_few_votes_tell_where_so_few_of_them_differ(monkeypatch, points, apart, told):
     thermal, visible = torch.ones(points), torch.ones(points)

@@ -7,7 +7,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from heatsplat.effects.joint.courses import ANY, common_courses
@@ -15,6 +14,7 @@ from heatsplat.effects.joint.data import MIN_FREE
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.held_out import HeldOut, compared, shuffled, squares_of
 from heatsplat.effects.joint.least_squares import own_part
+from heatsplat.effects.joint.like_heat import may_be_heat
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import candidates, grown, worthwhile
 from heatsplat.effects.joint.terms import Own
@@ -29,7 +29,6 @@ SHUFFLES, NO_CHANCE = 8, 30.0  # gains from which it is not asked whether chance
 EXPLAINED, OF_POINTS, EVEN = 1.6, 0.9, 0.33
 
 ROUGH = "heat that goes another way than the weather record says may do it; more frames would tell"
-LIKE_HEAT = 0.9  # share of the variance of a course over time that heat explains from which it may be heat
 COURSES = 2  # that points share stand for any change of a scene
 
 
@@ -84,7 +83,7 @@ class Certainty:
         for name in sorted(sure.names) if found else ():
             in_time = self.fit.data.effects[name].term.in_time
             if not in_time and not self._beside_changes(name, sure, self.fit.without(sure, name)):
-                found[name] = self.unseen_changes or ROUGH
+                found[name] = self._may_be_change(name) or ROUGH
         for name in sorted(self.model.names):
             for rivals in self.fit.data.effects[name].term.rivals:
                 if not self._counts(name) or self._outdoes(name, rivals):
@@ -120,8 +119,10 @@ class Certainty:
         return self._worths[more, less]
 
     def undecided(self, more: Model, name: str) -> bool:
-        """Whether an effect that was left out is worth what it costs, though not by enough to be taken in."""
-        return self.fit.gain(more, self.model) > 1.0 and worthwhile(self.fit, more, self.model, name)
+        """Whether an effect that was left out is worth what it costs, though not by enough to be taken in, and may explain
+        observations that it was not fitted to."""
+        worth = self.fit.gain(more, self.model) > 1.0 and worthwhile(self.fit, more, self.model, name)
+        return worth and self._shows(more, self.model)
 
     def clear(self, more: Model, name: str) -> bool:
         """Whether an effect that was left out for its size is clear on held-out observations, and no small thing but beside what
@@ -146,9 +147,14 @@ class Certainty:
     def few(self, name: str) -> str:
         """That the record has too few frames to tell an effect that was left out, and how many are needed; empty where it has
         enough, and where nothing is left that it could explain."""
-        if self.explained or not (lacking := self._lacking(name)):
+        lacking, in_time = self._lacking(name), self.fit.data.effects[name].term.in_time
+        if not lacking:
             return ""
-        if self.fit.data.effects[name].term.in_time:
+        if in_time and any(one in self.doubts and self._counts(one) for one in self._of_single_images):
+            return lacking  # heat may be in its place
+        if self.explained:
+            return ""
+        if in_time:
             return lacking if self._changes else ""
         tried = [more for other, more in candidates(self.fit, self.model) if other == name]
         return lacking if not tried or any(self._shows(more, self.model) for more in tried) else ""
@@ -156,12 +162,22 @@ class Certainty:
     @cached_property
     def unseen_changes(self) -> str:
         """That the scene may change in ways that the record has too few frames to follow; empty where it cannot."""
+        return self._unfollowed if not self.explained and self._changes else ""
+
+    @cached_property
+    def _unfollowed(self) -> str:
+        """In which ways a scene may change that the record has too few frames to follow; empty where it can follow all."""
         effects = self.fit.data.effects.items()
         changing = [name for name, one in effects if one.term.in_time and name not in self.model.names]
         why = [(name, lacking) for name in changing if (lacking := self._lacking(name))]
-        if not why or self.explained or not self._changes:
+        if not why:
             return ""
         return f"it may as well be {' or '.join(name for name, _ in why)}: {why[-1][1]}"
+
+    @property
+    def _of_single_images(self) -> list[str]:
+        """Names of the effects that were taken in and whose numbers belong to single images."""
+        return [name for name in self.model.names if self.fit.data.effects[name].term.single_images]
 
     def _lacking(self, name: str) -> str:
         data = self.fit.data
@@ -201,20 +217,26 @@ class Certainty:
         """Whether an effect is clear however the scene may change, where its changes are not known well: a camera's change of
         single images explains them as well as any course over time of which each point has its own measure would, and other
         effects gain beside that."""
-        if ANY in less.names or self.fit.data.drivers is None and not self.unseen_changes:
+        unfollowed, rough = self._may_be_change(name), self.fit.data.drivers is not None
+        if ANY in less.names or not rough and not unfollowed:
             return True
         changing = self._changing(less)
         if self.fit.data.effects[name].term.single_images:
-            if self.unseen_changes and self.fit.data.drivers is not None:
+            if unfollowed and rough:
                 return False  # surfaces under the sky change alike
             return bool(changing) and all(self._compared(more, one).db > 0 for one in changing)
         return bool(changing) and all(self._is_clear(more.plus(ANY, one.kind(ANY)), one) for one in changing)
 
+    def _may_be_change(self, name: str) -> str:
+        """That a change of the scene which the record cannot follow may pass for an effect; empty where none can. What single
+        images have in common may be one however well it explains them."""
+        return self._unfollowed if self.fit.data.effects[name].term.single_images else self.unseen_changes
+
     def _doubt(self, name: str, more: Model, less: Model, held_out: HeldOut) -> str:
         fit, term = self.fit, self.fit.data.effects[name].term
         if not term.in_time and not self._beside_changes(name, more, less):
-            return self.unseen_changes or ROUGH
-        if self._like_heat(name):
+            return self._may_be_change(name) or ROUGH
+        if may_be_heat(self.fit, self.model, name):
             return "it goes over time as a scene may that cools or warms; frames that come back to a place later would tell"
         for rule, why in term.told_by:
             if not rule(fit, more, less):
@@ -231,25 +253,6 @@ class Certainty:
             if chance.gain(more, less) > gain:
                 return "images that are shuffled gain as much; more frames, or less noise, would tell"
         return ""
-
-    def _like_heat(self, name: str) -> bool:
-        """Whether what single images have in common goes a way over time that a scene by itself may go, and none does."""
-        data, model = self.fit.data, self.model
-        if not data.effects[name].term.single_images or data.span_s <= 0:
-            return False
-        known = [
-            one for one, e in data.effects.items() if e.term.in_time and one != ANY and not e.term.numbers(data, 1)
-        ]
-        if not known or set(known) & model.names:
-            return False
-        ones = torch.ones(data.frames, 1, dtype=torch.float64)
-        basis = torch.cat([ones, *(self.fit.basis(one, 1) for one in known)], 1)
-        added = self.fit.contributions(model)[name] * (self.fit.weights > 0)
-        course = torch.linalg.svd(added, full_matrices=False).Vh[0]
-        left = course - basis @ torch.linalg.lstsq(basis, course).solution
-        free = data.frames - basis.shape[1]
-        share = float((left**2).sum()) / max(free, 1) / float(course.var())
-        return free <= 0 or share < 1.0 - LIKE_HEAT
 
     def _outdoes(self, name: str, rivals: tuple[str, ...]) -> bool:
         """Whether a selected effect is clearly better than others in its place; so it is where those cannot be had."""
@@ -285,8 +288,12 @@ class Certainty:
                 if asked and start.gain(more, less) > 1.0 and worthwhile(start, more, less, name):
                     found |= set() if self._is_clear(self.model, more) else {name}
         there = self._shows if counts else self._is_clear
+        # What gains little, and is none of single images, gives no way to heat that shows as clearly beside it.
+        small = not counts and not any(effects[name].term.single_images for name in doubts)
+        if small and any(there(one, self.model) for one in self._changing(self.model)):
+            return found
         changing = self._changing(less) if doubts else []
-        heat = bool(doubts) and not changing or any(self._like_heat(name) for name in doubts)
+        heat = bool(doubts) and not changing or any(may_be_heat(self.fit, self.model, name) for name in doubts)
         if heat or any(there(one, less) and not self._is_clear(self.model, one) for one in changing):
             found |= {name for name, one in effects.items() if one.term.in_time} - {ANY, *self.model.names}
         return found

@@ -16,6 +16,7 @@ from collections.abc import Collection
 
 from heatsplat.effects.joint.courses import ANY
 from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.like_heat import is_heat
 from heatsplat.effects.joint.model import Model
 
 # Share of the changes that any effect must exceed where a weather record, whose answers are rough, explains them.
@@ -47,7 +48,30 @@ def selected(start: Fit) -> tuple[Fit, Model]:
             ends.append(model)
     model = min(ends, key=lambda end: start.linearised(end).linearised(end).quality(end).bic)
     fit = start.accepted(model).accepted(model)
-    return grown(fit, pruned(fit, model), effects)
+    fit, model = grown(fit, pruned(fit, model), effects)
+    return warmed(start, fit, model)
+
+
+def warmed(start: Fit, fit: Fit, model: Model) -> tuple[Fit, Model]:
+    """The model with heat in the place of what single images have in common, where that goes as heat does.
+
+    A number for each image costs less than numbers for each point and explains as much where all points cool alike, but that a
+    sensor walks such a way is improbable.
+    """
+    effects = fit.data.effects
+    single = [name for name in model.names if effects[name].term.single_images]
+    if not any(is_heat(fit, model, name) for name in single):
+        return fit, model
+    changing = [name for name, one in effects.items() if one.term.in_time and one.stands_on is None]
+    # A curve shows only along what single images have in common.
+    beside = model.minus({*single, "tone"})
+    for name in changing:
+        kinds = effects[name].term.kinds(fit)
+        if kinds:
+            other = start.accepted(beside.plus(name, kinds[0])).accepted(beside.plus(name, kinds[0]))
+            if earns(other, beside.plus(name, kinds[0]), beside, name):
+                return grown(other, pruned(other, beside.plus(name, kinds[0])), effects)
+    return fit, model
 
 
 def candidates(fit: Fit, model: Model) -> list[tuple[str, Model]]:

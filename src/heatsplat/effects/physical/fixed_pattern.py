@@ -21,6 +21,7 @@ from heatsplat.effects.physical import relaxation, vignetting
 NODES, NODES_FEW = 7, 5  # along the sides of the grids on which a pattern is looked for
 MANY = 10_000  # observations from which the finer grid pays
 SURE = 8.0  # gain above which it is no error of what else is fitted
+FIFTH_DB = 1.0  # nor is a fifth of all that the others leave
 WELL_SEEN = 2.5  # observations of a point for each of its own numbers before a driven scene is taken for granted
 
 
@@ -40,7 +41,8 @@ def evidence(inspected: Inspection) -> Evidence:
     found = "places in the image differ" + (" beside the falloff" if fades else "") + " by"
     if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
         evidence = judged(inspected, "fixed_pattern", found, more, less)
-        if evidence.told and evidence.statistic < SURE:
+        much = fit.data.drivers is None and evidence.gain_db is not None and evidence.gain_db > FIFTH_DB
+        if evidence.told and evidence.statistic < SURE and not much:
             return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")
         return evidence
     return Evidence(0.0, f"{found} {beside(fit.effect_size(more, less))}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,7 +18,9 @@ from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
 
 NOT_COMMON = "what images have in common is not common to all points; more frames would tell heat from the camera"
-IN_COMMON = 0.15  # share of what half of the points leave that the other half has to explain
+IN_COMMON = (
+    0.5  # share of what numbers of all points explain of one half of them that those of the other half have to explain
+)
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -54,19 +57,33 @@ def in_common(fit: Fit, more: Model, less: Model) -> bool:
 def common_to_all(fit: Fit, more: Model, less: Model) -> bool:
     """Whether what the points that change most say of every image holds for those that change least, and conversely.
 
-    A sensor changes all points alike; a lamp does not.
+    A sensor changes all points alike; a lamp does not. Each half has to explain the other about as well as both together do:
+    whatever else is left, such as what misplaced cameras make of edges, counts for neither. Effects that are not of single
+    images keep what all points say of them.
     """
     weights, values = fit.weights, fit.data.tracks.values
     used = weights > 0
     mean = (values * used).sum(1) / used.sum(1).clamp_min(1)
     change = (((values - mean[:, None]) ** 2 * used).sum(1) / used.sum(1).clamp_min(1)).sqrt()
     loud = change > change[used.any(1)].median()
-    before = weights * fit.residuals(less) ** 2 / fit.trust[:, None]
-    own, basis = fit.own(more)
-    for known, asked in ((loud, ~loud), (~loud, loud)):
-        left = own - sum(fit.contributions(more, weights * known[:, None]).values())
-        after = weights * (left - own_part(basis, left, weights)) ** 2 / fit.trust[:, None]
-        if float(after[asked].sum()) > (1.0 - IN_COMMON) * float(before[asked].sum()):
+    shared = fit.terms(more, Shared)
+    held = [name for name, one in shared.items() if not one.term.single_images]
+    added = fit.contributions(more)
+    tracks = replace(fit.data.tracks, values=values - sum(added[name] for name in held))
+    known_to_all = {name: value for name, value in fit.known.items() if name not in held}
+    rest, beside = more.minus(held), replace(fit, data=replace(fit.data, tracks=tracks), known=known_to_all)
+    own, basis = beside.own(rest)
+
+    def left(known: Tensor) -> Tensor:
+        """Weighted squares [P] that the numbers of the points ``known`` [P] leave."""
+        values = own - sum(beside.contributions(rest, weights * known[:, None]).values())
+        return (weights * (values - own_part(basis, values, weights)) ** 2 / fit.trust[:, None]).sum(1)
+
+    before = (weights * fit.residuals(less) ** 2 / fit.trust[:, None]).sum(1)
+    together = left(torch.ones_like(loud))
+    for known in (loud, ~loud):
+        explained, possible = ((before - after)[~known].sum() for after in (left(known), together))
+        if explained < IN_COMMON * possible or possible <= 0:
             return False
     return True
 

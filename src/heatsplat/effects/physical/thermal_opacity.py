@@ -43,7 +43,8 @@ def evidence(inspected: Inspection) -> Evidence:
     if n < MIN_VOTES:
         why = f"{n} points lie behind others so that both modalities could tell them apart"
         told = (
-            n == 0 or sum(math.comb(n, k) * PRESENT**k * (1 - PRESENT) ** (n - k) for k in range(apart + 1)) < UNLIKELY
+            apart == 0
+            or sum(math.comb(n, k) * PRESENT**k * (1 - PRESENT) ** (n - k) for k in range(apart + 1)) < UNLIKELY
         )
         return Evidence(0.0, why if told else f"cannot be told: {why}, {MIN_VOTES} are needed", told=told)
     usual = STRAY * n

@@ -1,0 +1,44 @@
+"""What single images have in common, beside what heat would make of it."""
+
+import pytest
+import torch
+from effects.tracks import FRAMES, NOTHING, PASSED, data_of, drawn, fit_to, levels
+
+from heatsplat.effects.joint.fit import fit_of
+from heatsplat.effects.joint.like_heat import is_heat, may_be_heat
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.joint.selection import selected
+
+OFFSETS = Model.of(frame_offset=1)
+COOLING_ALIKE = levels() + 0.1 * torch.exp(-3 * PASSED)
+
+
+def walking(seed):
+    return levels() + 0.01 * drawn(FRAMES, seed=seed).cumsum(0)
+
+
+def test_a_scene_that_cools_alike_is_taken_for_heat_though_offsets_cost_less():
+    fit = fit_to(COOLING_ALIKE)
+    assert may_be_heat(fit, OFFSETS, "frame_offset") and is_heat(fit, OFFSETS, "frame_offset")
+    _, model = selected(fit)
+    assert model.names == {"relaxation"}
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_a_sensor_that_walks_is_not_taken_for_heat(seed):
+    fit = fit_to(walking(seed))
+    assert not is_heat(fit, OFFSETS, "frame_offset")
+    _, model = selected(fit)
+    assert model.names == {"frame_offset"}
+
+
+def test_what_a_model_explains_by_heat_or_lacks_is_no_heat_in_disguise():
+    fit = fit_to(COOLING_ALIKE)
+    assert not may_be_heat(fit, NOTHING, "frame_offset")
+    assert not may_be_heat(fit, OFFSETS.plus("relaxation"), "frame_offset")
+    assert not may_be_heat(fit, Model.of(fixed_pattern=1), "fixed_pattern")
+
+
+def test_a_weather_record_is_too_rough_to_tell():
+    fit = fit_of(data_of(COOLING_ALIKE, drivers=torch.exp(-3 * PASSED)[:, None]))
+    assert may_be_heat(fit, OFFSETS, "frame_offset") and not is_heat(fit, OFFSETS, "frame_offset")
