@@ -16,7 +16,7 @@ ADDED = 512  # more at a turn: those with the worst errors
 TURNS = 4  # how often, at most
 CHECKS = 32  # moments between the samples at which nothing was fitted, and
 ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
-GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
+GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, in time or among the samples by turns
 AMPLIFIED = 8.0  # what errors at the moments that tell coefficients may grow by elsewhere
 OVERSAMPLED = 16  # of the subspace in which singular vectors are sought: more than are wanted, and
 TURNED = 2  # how often it is turned towards the values
@@ -142,7 +142,7 @@ def time_basis(
             for place in _telling(curves, torch.stack(told, 1) if told else curves[:, :0]):
                 fitted[times[place].item()] = found_at(times[place].item())
         basis = _fit(basis, fitted)
-        checks = [first_s + (i * GOLDEN) % 1.0 * (last_s - first_s) for i in range(checked + 1, checked + CHECKS + 1)]
+        checks = _between(times, range(checked + 1, checked + CHECKS + 1))
         checks += [a + share * (b - a) for a, b in rough[: ROUGHEST // 2] for share in (0.25, 0.75)]
         checked += CHECKS
         fitted |= {moment: found_at(moment) for moment in checks}
@@ -216,6 +216,19 @@ class _Samples:
         """Moments [T], float64 and increasing, and the values [n, T] at each."""
         times = sorted(self.seen)
         return torch.tensor(times, dtype=torch.float64), torch.stack([self.seen[moment] for moment in times], dim=1)
+
+
+def _between(times: Tensor, numbers: Iterable[int]) -> list[float]:
+    """Moments by number: odd ones evenly in time, even ones evenly among samples [T], which lie closer where values bend."""
+    found = []
+    for number in numbers:
+        share = (number * GOLDEN) % 1.0
+        if number % 2:
+            found.append((times[0] + share * (times[-1] - times[0])).item())
+        else:
+            place = share * (len(times) - 1)
+            found.append(torch.lerp(times[int(place)], times[int(place) + 1], place % 1.0).item())
+    return found
 
 
 def _curves(values: Tensor, level: Tensor, tolerance: float, most: int, errors: Callable) -> Tensor:
