@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.export.basis import _directions, constant_basis, rounded, steps_of, time_basis
+from heatsplat.export.basis import _curves, _directions, _telling, constant_basis, rounded, steps_of, time_basis
 
 COUNT = 200
 
@@ -17,8 +17,9 @@ def bodies(seed: int = 0):
     rates = torch.logspace(-2, 1, COUNT)
     start, gains = torch.rand(COUNT, generator=generator), 0.1 * torch.randn(COUNT, 2, generator=generator)
 
-    def values_at(time: float) -> torch.Tensor:
-        return start * torch.exp(-rates * time) + gains[:, 0] * math.sin(3 * time) + gains[:, 1] * math.cos(7 * time)
+    def values_at(time: float, ids: torch.Tensor | None = None) -> torch.Tensor:
+        values = start * torch.exp(-rates * time) + gains[:, 0] * math.sin(3 * time) + gains[:, 1] * math.cos(7 * time)
+        return values if ids is None else values[ids]
 
     return values_at
 
@@ -26,7 +27,7 @@ def bodies(seed: int = 0):
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 def test_the_worst_error_is_below_what_was_asked_and_is_told(tolerance):
     values_at = bodies()
-    basis = time_basis(values_at, 0.0, 4.0, tolerance)
+    basis = time_basis(values_at, COUNT, 0.0, 4.0, tolerance)
     assert 0 < basis.worst <= tolerance
     errors = [(basis.at(time) - values_at(time)).abs().max().item() for time in torch.linspace(0, 4, 321).tolist()]
     assert max(errors) <= 1.5 * tolerance  # moments at which it never looked
@@ -35,7 +36,7 @@ def test_the_worst_error_is_below_what_was_asked_and_is_told(tolerance):
 
 
 def test_a_kink_gets_samples_and_a_flat_stretch_does_not():
-    basis = time_basis(lambda time: torch.full((3,), max(time - 0.7, 0.0)), 0.0, 1.0, 1e-4)
+    basis = time_basis(lambda time, ids: torch.full((3,), max(time - 0.7, 0.0)), 3, 0.0, 1.0, 1e-4)
     assert basis.rank == 1
     near = ((basis.times_s - 0.7).abs() < 0.02).sum()
     assert near >= 4 and len(basis.times_s) < 60
@@ -48,45 +49,49 @@ def test_bends_that_are_known_are_samples():
     at = torch.rand(60, generator=generator, dtype=torch.float64).sort().values.tolist()
     heights = torch.randn(60, generator=generator, dtype=torch.float64).tolist()
 
-    def values_at(time: float) -> torch.Tensor:
+    def values_at(time: float, ids: torch.Tensor | None) -> torch.Tensor:
         return torch.tensor([float(np.interp(time, at, heights))])
 
-    known, unknown = (time_basis(values_at, 0.0, 1.0, 1e-3, 170, bends=bends) for bends in (at, ()))
+    known, unknown = (time_basis(values_at, 1, 0.0, 1.0, 1e-3, 170, bends=bends) for bends in (at, ()))
     assert set(at) <= set(known.times_s.tolist())
     moments = torch.linspace(0, 1, 397).tolist()
-    errors = [max((b.at(t) - values_at(t)).abs().item() for t in moments) for b in (known, unknown)]
+    errors = [max((b.at(t) - values_at(t, None)).abs().item() for t in moments) for b in (known, unknown)]
     assert errors[0] < 1e-3 < 0.1 < errors[1] and unknown.worst > 0.1  # where samples run out, the error is told
-    assert set(at) - set(time_basis(values_at, 0.0, 1.0, 1e-3, 100, bends=at).times_s.tolist())  # too many for it
+    assert set(at) - set(time_basis(values_at, 1, 0.0, 1.0, 1e-3, 100, bends=at).times_s.tolist())  # too many for it
 
 
 def test_errors_of_what_is_clipped_are_those_after_clipping():
-    def values_at(time: float) -> torch.Tensor:
+    def values_at(time: float, ids: torch.Tensor | None) -> torch.Tensor:
         return torch.tensor([0.5 + 0.1 * time, 5.0 + math.sin(40 * time)])
 
-    plain, clipped = (time_basis(values_at, 0.0, 1.0, 1e-4, 40, clipped=clipped) for clipped in (False, True))
+    plain, clipped = (time_basis(values_at, 2, 0.0, 1.0, 1e-4, 40, clipped=clipped) for clipped in (False, True))
     assert len(clipped.times_s) < len(plain.times_s) and clipped.worst < 1e-4 < plain.worst
 
 
 def test_what_does_not_change_has_no_curve():
     values = torch.rand(5)
-    for basis in (time_basis(lambda time: values, 0.0, 9.0, 0.01), constant_basis(values)):
+    for basis in (time_basis(lambda time, ids: values, 5, 0.0, 9.0, 0.01), constant_basis(values)):
         assert (basis.rank, basis.worst) == (0, 0.0)
         assert torch.equal(basis.at(3.0), values) and torch.equal(basis.at(None), values)
 
 
 def test_too_few_samples_or_curves_are_told_as_an_error():
     values_at = bodies()
-    assert time_basis(values_at, 0.0, 4.0, 1e-4, most_curves=2).worst > 1e-3
-    assert time_basis(values_at, 0.0, 4.0, 1e-6, most_times=40).worst > 1e-6
+    assert time_basis(values_at, COUNT, 0.0, 4.0, 1e-4, most_curves=2).worst > 1e-3
+    assert time_basis(values_at, COUNT, 0.0, 4.0, 1e-6, most_times=40).worst > 1e-6
 
 
 def test_coefficients_are_already_what_sixteen_bits_hold():
-    basis = time_basis(bodies(), 0.0, 4.0, 1e-3)
+    basis = time_basis(bodies(), COUNT, 0.0, 4.0, 1e-3)
     for column in basis.coefficients.unbind(1):
-        assert torch.allclose(rounded(column), column, rtol=1e-6, atol=0)
+        assert torch.allclose(rounded(column, basis.step), column, rtol=1e-6, atol=0)
+    for row in basis.curves:
+        assert torch.allclose(rounded(row), row, rtol=1e-6, atol=0)
+    assert 0 < basis.step < 1e-3
     steps, size = steps_of(torch.tensor([0.0, -1.0, 0.5]))
     assert steps.tolist() == [0, -32767, 16384] and size == pytest.approx(1 / 32767)
     assert steps_of(torch.zeros(2))[0].tolist() == [0, 0]
+    assert steps_of(torch.tensor([0.0, -1.0, 0.26]), 0.1)[0].tolist() == [0, -10, 3]
 
 
 def test_curves_sought_in_a_subspace_are_the_singular_vectors():
@@ -96,3 +101,66 @@ def test_curves_sought_in_a_subspace_are_the_singular_vectors():
     best = torch.linalg.svdvals(values)[12:].norm()
     assert found.shape == (200, 12) and torch.allclose(found.T @ found, torch.eye(12), atol=1e-4)
     assert (values - values @ found @ found.T).norm() <= 1.001 * best
+
+
+def many(count: int, odd: tuple[int, ...]):
+    """Values of many bodies, smooth but for a few odd ones with a bump of their own, and how many were asked for at once."""
+    generator = torch.Generator().manual_seed(2)
+    rates, start = torch.rand(count, generator=generator) * 3, torch.rand(count, generator=generator)
+    asked: list[int] = []
+
+    def values_at(time: float, ids: torch.Tensor | None = None) -> torch.Tensor:
+        values = start * torch.exp(-rates * time) + 0.1 * math.sin(2 * time)
+        for number, one in enumerate(odd):
+            values[one] += math.exp(-((time - 0.5 - number) ** 2) / 0.01)
+        asked.append(count if ids is None else len(ids))
+        return values if ids is None else values[ids]
+
+    return values_at, asked
+
+
+def test_of_many_gaussians_few_are_sampled_and_the_odd_ones_are_found(monkeypatch):
+    monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 50)
+    monkeypatch.setattr("heatsplat.export.basis.ADDED", 20)
+    count = 3000
+    values_at, asked = many(count, odd=(7, 1234, 2999))
+    basis = time_basis(values_at, count, 0.0, 4.0, 1e-3, 513)
+    whole = sum(number == count for number in asked)
+    assert whole < 250 < len(basis.times_s) < len(asked) - whole  # most samples are of few Gaussians
+    every = torch.linspace(0, 4, 801).tolist()
+    errors = torch.stack([(basis.at(time) - values_at(time)).abs() for time in every]).amax(0)
+    assert basis.worst <= 1e-3 and errors.max() <= 1.5e-3
+    alone = time_basis(many(count, odd=())[0], count, 0.0, 4.0, 1e-3, 513)
+    assert alone.rank < basis.rank  # the odd ones have curves
+
+
+def test_what_is_not_found_in_time_is_told(monkeypatch):
+    monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 50)
+    monkeypatch.setattr("heatsplat.export.basis.TURNS", 1)
+    values_at, _ = many(3000, odd=(7, 1234, 2999))
+    assert time_basis(values_at, 3000, 0.0, 4.0, 1e-3, 513).worst > 0.1
+
+
+def test_weights_make_the_largest_error_smaller():
+    values = torch.randn(400, 60, generator=torch.Generator().manual_seed(1)) * 0.6 ** torch.arange(60.0)
+    values[0, 40:] += 0.05  # one row that the others hardly need
+    level = values.mean(1, keepdim=True)
+
+    def errors(found, true):
+        return (found - true).abs()
+
+    plain = _directions(values - level, 6)
+    weighed = _curves(values, level, 0.1, 6, errors)
+    worst = [((values - level) @ one @ one.T - (values - level)).abs().max() for one in (plain, weighed.T)]
+    assert len(weighed) == 6 and worst[1] < 0.9 * worst[0]
+
+
+def test_moments_that_tell_the_curves_apart():
+    times = torch.linspace(0, 1, 300, dtype=torch.float64)
+    curves = torch.linalg.qr(torch.stack([times**power for power in range(9)], dim=1))[0].T[1:].float()
+    every = torch.cat([torch.full((1, 300), 300**-0.5), curves]).double()
+    found = _telling(curves, curves[:, :0])
+    assert len(set(found)) == len(found) < 60
+    assert torch.linalg.svdvals(every[:, found])[-1] >= 1 / 8
+    more = _telling(curves, curves[:, found[:9]])  # what is known counts
+    assert len(more) <= len(found) - 9 + 2 and torch.linalg.svdvals(every[:, found[:9] + more])[-1] >= 1 / 8

@@ -35,6 +35,11 @@ def test_what_cannot_be_seen_or_read_is_said(cooling, tmp_path):
     (tmp_path / "no.ply").write_text("nothing")
     with pytest.raises(SceneError, match=r"no.ply cannot be read as a mesh"):
         Mesh(str(tmp_path / "no.ply")).write(cooling, tmp_path / "a.ply")
+    (tmp_path / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"
+    )
+    with pytest.raises(SceneError, match=r"points.ply has no faces: a mesh is made of triangles"):
+        Mesh(str(tmp_path / "points.ply")).write(cooling, tmp_path / "a.ply")
     far = trimesh.creation.box()
     far.apply_translation([1e4, 0, 0])
     far.export(tmp_path / "far.ply")

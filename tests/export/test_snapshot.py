@@ -7,6 +7,7 @@ import torch
 from exported import started
 
 from heatsplat.export.snapshot import snapshot
+from heatsplat.shots import at_time
 
 TOLERANCE = 0.05
 
@@ -85,3 +86,53 @@ def test_visible_light_comes_with_its_own_opacity(tmp_path):
     assert seen.colours.shape == (len(seen.means), 3) and 0 <= seen.colours.min() <= seen.colours.max() <= 1
     assert (seen.colour_opacities < seen.opacities).all()
     assert seen.attributes.keys() >= {"emissivity"}
+
+
+@pytest.mark.parametrize("method", ["energy_balance", "thermogs", "auto"])
+def test_of_many_gaussians_under_weather_few_are_examined(tmp_path, monkeypatch, method):
+    """Against the model itself, of all Gaussians at moments of no special kind."""
+    monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 100)
+    module = started(
+        tmp_path, f"method={method}", "data.scene=outdoor", *(["effects=none"] if method == "auto" else [])
+    )
+    with torch.no_grad():
+        draw = torch.Generator().manual_seed(0)
+        for name in set(module.splats.names) & {"log_rate", "raw_sun", "raw_wind", "initial_state"}:
+            rows = module.splats[name]
+            rows += 0.3 * torch.randn(rows.shape, generator=draw)
+    seen, scene = snapshot(module), module.scene
+    camera, frame = seen.layers[0], scene.train.frames[0]
+    assert camera.worst <= TOLERANCE
+    worst = 0.0
+    for share in torch.rand(40, generator=draw).tolist():
+        time_s = seen.start_s + share * (seen.end_s - seen.start_s)
+        true = scene.thermal_range.to_celsius(module.emissions(module.splats, at_time(scene, frame, time_s))[:, 0])
+        found = scene.thermal_range.to_celsius(shown(camera, time_s))
+        worst = max(worst, (found - true).abs().max().item())
+    assert worst <= 1.2 * TOLERANCE
+
+
+METHODS = (
+    "3dgs",
+    "etgs",
+    "ti3dgs",
+    "ravigs",
+    "thermalgs",
+    "hexplane_4dgs",
+    "thermal3dgs",
+    "ntr_gaussian",
+    "through_air",
+)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_some_gaussians_are_what_they_are_among_all(tmp_path, method):
+    scene = "outdoor" if method == "ntr_gaussian" else "glass" if method == "ravigs" else "cooling"
+    module = started(tmp_path, f"method={method}", f"data.scene={scene}")
+    frame, ids = module.scene.train.frames[3], torch.tensor([2, 5, 40])
+    with torch.no_grad():
+        sent = [module.emissions(module.splats, frame, some) for some in (None, ids)]
+        warm = [module.thermal.temperature(module.splats, frame.time_s or 0.0, some) for some in (None, ids)]
+    torch.testing.assert_close(sent[1], sent[0][ids])
+    if warm[0] is not None:
+        torch.testing.assert_close(warm[1], warm[0][ids])

@@ -269,7 +269,8 @@ def _surfaces_section(folder: Path) -> list[str]:
     when = "" if moment is None else f", {moment:.6g} s after the first training frame"
     note = (
         f"Connected surfaces seen by training views, as rendered by the model{when}: H the hottest, C the coldest. "
-        f"Centres are in scene coordinates. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
+        "Centres are in scene coordinates. What has no texture and is seen at a flat angle, such as bare ground, may lie less "
+        f"deep than it is shown. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
     )
     table = markdown_table(("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z"), rows, "lrrrr")
     picture = [f"![numbered surfaces]({SURFACES_PICTURE})", ""] if (folder / SURFACES_PICTURE).exists() else []

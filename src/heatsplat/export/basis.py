@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from scipy.linalg import qr
 from torch import Tensor
 
 FIRST = 17  # moments to begin with, evenly over the span; bends that are known come on top
-CHECKS = 7  # moments between the samples at which nothing was fitted, and
+EXAMINED = 1024  # Gaussians that are sampled over time at first, drawn among all, and
+ADDED = 512  # more at a turn: those with the worst errors
+TURNS = 4  # how often, at most
+CHECKS = 32  # moments between the samples at which nothing was fitted, and
 ROUGHEST = 8  # more, in the intervals that were roughest when the samples ran out
-GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, and on no sample
+GOLDEN = (5**0.5 - 1) / 2  # checks lie at its multiples: evenly, in time or among the samples by turns
+AMPLIFIED = 8.0  # what errors at the moments that tell coefficients may grow by elsewhere
 OVERSAMPLED = 16  # of the subspace in which singular vectors are sought: more than are wanted, and
-TURNS = 2  # how often it is turned towards the values
-ROWS = 16384  # Gaussians whose errors are looked at together
+TURNED = 2  # how often it is turned towards the values
+ROWS = 16384  # Gaussians that are fitted together
 STEPS = 32767  # of a coefficient of 16 bits, to each side
+WEIGHED = 4  # times that Gaussians with larger errors get more weight in the curves
+# Shares of the tolerance: between samples, for want of curves, of a step of coefficients; and what may be found at checks, of
+# which there are few.
+BENT, LACKING, ROUNDED, FOUND = 1 / 3, 1 / 3, 1 / 2, 0.7
+
+ValuesAt = Callable[[float, Tensor | None], Tensor]
 
 
 @dataclass(frozen=True)
@@ -28,10 +39,12 @@ class TimeBasis:
             nothing changes.
         offsets: [N] float32.
         coefficients: [N, r] float32.
-        curves: [r, T] float32.
-        worst: largest error found of any Gaussian, at all samples and at ``checks`` moments between them; where samples ran
-            out, some of these are where values bend most.
+        curves: [r, T] float32, rounded to 16 bits each.
+        worst: largest error that was found: of all Gaussians at ``checks`` moments between the samples at which nothing was
+            fitted (where samples ran out, some are where values bend most) and wherever something was; of those that were
+            examined at all samples.
         checks: how many these were.
+        step: coefficients are multiples of it, or of larger steps where 16 bits do not reach as far.
     """
 
     times_s: Tensor
@@ -40,6 +53,7 @@ class TimeBasis:
     curves: Tensor
     worst: float
     checks: int
+    step: float = 0.0
 
     @property
     def rank(self) -> int:
@@ -66,7 +80,8 @@ def constant_basis(values: Tensor) -> TimeBasis:
 
 
 def time_basis(
-    values_at: Callable[[float], Tensor],
+    values_at: ValuesAt,
+    count: int,
     first_s: float,
     last_s: float,
     tolerance: float,
@@ -77,13 +92,20 @@ def time_basis(
 ) -> TimeBasis:
     """The shortest basis whose worst error over all Gaussians and moments stays below ``tolerance``, as far as was looked.
 
-    Intervals are halved until their middle lies on the straight line between their ends to a third of the tolerance, the
-    worst first; the singular vectors of all samples, in the order of their values, are then taken until every residual is
-    below half of it. Coefficients have 16 bits and are measured as such. ``TimeBasis.worst`` says what was reached: where
-    ``most_times`` or ``most_curves`` ended it, that is more than the tolerance.
+    Some Gaussians are examined at many moments: intervals are halved until their middle lies on the straight line between
+    their ends to a third of the tolerance, the worst first. The curves are the singular vectors of what was found, in the
+    order of their values, as many as leave no more than another third. Coefficients of all Gaussians follow from few moments,
+    those that tell the curves apart best (pivots, then whatever helps the least certain combination; Drmac and Gugercin
+    2016, Zimmermann and Willcox 2016), by least squares. Then all are compared with the truth at moments at which nothing was
+    fitted, and those with the worst errors are examined too, until none are left. So values of all N are asked for some
+    hundred times, however many samples there are, and as many columns of N are kept.
+
+    Coefficients are rounded before they are compared. ``TimeBasis.worst`` says what was reached: where ``most_times``,
+    ``most_curves`` or TURNS ended it, that may be more than the tolerance.
 
     Args:
-        values_at: gives the values [N] at a moment in seconds.
+        values_at: gives the values at a moment in seconds, of the Gaussians whose numbers it gets [n], or of all.
+        count: N, how many there are.
         first_s, last_s: span of time.
         tolerance: in units of the values.
         most_times: samples at most.
@@ -96,64 +118,190 @@ def time_basis(
     inside = [moment for moment in bends if first_s < moment < last_s]
     if FIRST + len(inside) <= most_times // 2:
         moments = sorted({*moments, *inside})
-    seen = {moment: values_at(moment).detach().float().cpu() for moment in moments}
-    queue: list[tuple[float, float, float]] = []
 
-    def error_of(found: Tensor, true: Tensor) -> float:
-        return ((found.clamp(0, 1) - true.clamp(0, 1)) if clipped else found - true).abs().max().item()
+    def found_at(moment: float, ids: Tensor | None = None) -> Tensor:
+        return values_at(moment, ids).detach().float().cpu()
 
-    def halve(start: float, end: float) -> None:
-        middle = 0.5 * (start + end)
-        seen[middle] = values_at(middle).detach().float().cpu()
-        error = error_of(0.5 * (seen[start] + seen[end]), seen[middle])
-        if error > tolerance / 3:
-            heapq.heappush(queue, (-error, start, end))
+    def errors(found: Tensor, true: Tensor) -> Tensor:
+        return ((found.clamp(0, 1) - true.clamp(0, 1)) if clipped else found - true).abs()
 
-    if any(not torch.equal(seen[moments[0]], values) for values in seen.values()):
-        for start, end in zip(moments, moments[1:], strict=False):
+    drawn = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:EXAMINED].sort().values
+    samples = _Samples(found_at, drawn, moments, BENT * tolerance, most_times, errors)
+    fitted: dict[float, Tensor] = {}  # moment -> values of all
+    best, checked = None, 0
+    for _ in range(TURNS):
+        rough = samples.refine()
+        times, values = samples.table()
+        level = values.double().mean(1, keepdim=True).float()
+        curves = _rounded(_curves(values, level, LACKING * tolerance, most_curves, errors))
+        basis = TimeBasis(times, level[:, 0], values.new_zeros(0), curves, 0.0, 0, ROUNDED * tolerance)
+        if len(samples.ids) == count:
+            fitted = dict(samples.seen)
+        else:
+            told = [basis._curves_at(moment) for moment in fitted]
+            for place in _telling(curves, torch.stack(told, 1) if told else curves[:, :0]):
+                fitted[times[place].item()] = found_at(times[place].item())
+        basis = _fit(basis, fitted)
+        checks = _between(times, range(checked + 1, checked + CHECKS + 1))
+        checks += [a + share * (b - a) for a, b in rough[: ROUGHEST // 2] for share in (0.25, 0.75)]
+        checked += CHECKS
+        fitted |= {moment: found_at(moment) for moment in checks}
+        off = _errors(basis, fitted, errors)
+        known = errors(basis.offsets[samples.ids, None] + basis.coefficients[samples.ids] @ curves, values).amax(1)
+        basis = replace(basis, worst=max(off.max().item(), known.max().item()), checks=len(checks))
+        best = basis if best is None or basis.worst < best.worst else best
+        off[samples.ids] = 0.0
+        lacking = off.topk(min(ADDED, count)).indices
+        lacking = lacking[off[lacking] > 0.5 * tolerance]
+        if basis.worst <= FOUND * tolerance or not len(lacking):
+            break
+        samples.add(lacking)
+    return constant_basis(best.offsets) if not best.rank and best.worst == 0.0 else best
+
+
+class _Samples:
+    """Values of some Gaussians at moments that are as close as these need.
+
+    Args:
+        found_at: values at a moment of the Gaussians with these numbers.
+        ids: [n] their numbers.
+        moments: in increasing order, to begin with.
+        tolerance: how far the middle of an interval may be from the straight line between its ends.
+        most: moments at most.
+        errors: of values against true ones.
+    """
+
+    def __init__(
+        self, found_at: Callable, ids: Tensor, moments: Sequence[float], tolerance: float, most: int, errors: Callable
+    ) -> None:
+        self.found_at, self.ids, self.moments = found_at, ids, moments
+        self.tolerance, self.most, self.errors = tolerance, most, errors
+        self.seen = {moment: found_at(moment, ids) for moment in moments}
+
+    def add(self, ids: Tensor) -> None:
+        """Examines more Gaussians."""
+        self.ids = torch.cat([self.ids, ids])
+        for moment in sorted(self.seen):
+            self.seen[moment] = torch.cat([self.seen[moment], self.found_at(moment, ids)])
+
+    def refine(self) -> list[tuple[float, float]]:
+        """Halves intervals, the worst first. Returns those that are left when the samples run out, the worst first."""
+        queue: list[tuple[float, float, float]] = []
+        left: list[tuple[float, float]] = []
+
+        def halve(start: float, end: float) -> bool:
+            middle = 0.5 * (start + end)
+            if middle not in self.seen:
+                if len(self.seen) >= self.most:
+                    return False
+                self.seen[middle] = self.found_at(middle, self.ids)
+            line = 0.5 * (self.seen[start] + self.seen[end])
+            error = self.errors(line, self.seen[middle]).max().item()
+            if error > self.tolerance:
+                heapq.heappush(queue, (-error, start, end))
+            return True
+
+        if all(torch.equal(self.seen[self.moments[0]], values) for values in self.seen.values()):
+            return left
+        for start, end in zip(self.moments, self.moments[1:], strict=False):
             halve(start, end)
-        while queue and len(seen) + 2 <= most_times:
+        while queue:
             _, start, end = heapq.heappop(queue)
             middle = 0.5 * (start + end)
-            halve(start, middle)
-            halve(middle, end)
-    times = torch.tensor(sorted(seen), dtype=torch.float64)
-    samples = torch.stack([seen.pop(moment) for moment in times.tolist()], dim=1)
-    offsets = samples.double().mean(1).float()
-    coefficients, curves, worst = _factors(samples - offsets[:, None], tolerance / 2, most_curves)
-    basis = TimeBasis(times, offsets, coefficients, curves, worst, 0)
-    if not basis.rank and worst == 0.0:
-        return constant_basis(offsets)
-    checked = [first_s + (i * GOLDEN) % 1.0 * (last_s - first_s) for i in range(1, CHECKS + 1)]
-    for _, start, end in heapq.nsmallest(ROUGHEST // 2, queue):
-        checked += [0.75 * start + 0.25 * end, 0.25 * start + 0.75 * end]
-    for moment in checked:
-        worst = max(worst, error_of(basis.at(moment), values_at(moment).detach().float().cpu()))
-    return TimeBasis(times, offsets, coefficients, curves, worst, len(checked))
+            if not (halve(start, middle) and halve(middle, end)):
+                left.append((start, end))
+        return left
+
+    def table(self) -> tuple[Tensor, Tensor]:
+        """Moments [T], float64 and increasing, and the values [n, T] at each."""
+        times = sorted(self.seen)
+        return torch.tensor(times, dtype=torch.float64), torch.stack([self.seen[moment] for moment in times], dim=1)
 
 
-def _factors(residual: Tensor, tolerance: float, most: int) -> tuple[Tensor, Tensor, float]:
-    """Coefficients [N, r], curves [r, T] and the largest error of their products for values [N, T], r at most ``most``."""
-    worst = residual.abs().max().item() if residual.numel() else 0.0
-    if worst <= tolerance:
-        return residual.new_zeros(len(residual), 0), residual.new_zeros(0, residual.shape[1]), worst
-    directions = _directions(residual, most)
-    coefficients = torch.stack([rounded(column) for column in (residual @ directions).unbind(1)], dim=1)
+def _between(times: Tensor, numbers: Iterable[int]) -> list[float]:
+    """Moments by number: odd ones evenly in time, even ones evenly among samples [T], which lie closer where values bend."""
+    found = []
+    for number in numbers:
+        share = (number * GOLDEN) % 1.0
+        if number % 2:
+            found.append((times[0] + share * (times[-1] - times[0])).item())
+        else:
+            place = share * (len(times) - 1)
+            found.append(torch.lerp(times[int(place)], times[int(place) + 1], place % 1.0).item())
+    return found
 
-    def error_of(rank: int) -> float:
-        found = (
-            (some - own[:, :rank] @ directions[:, :rank].T).abs().max().item()
-            for some, own in zip(residual.split(ROWS), coefficients.split(ROWS), strict=True)
-        )
-        return max(found)
 
-    few, enough = 0, directions.shape[1]
-    worst = error_of(enough)
-    while worst <= tolerance and enough - few > 1:
-        middle = (few + enough) // 2
-        error = error_of(middle)
-        few, enough, worst = (few, middle, error) if error <= tolerance else (middle, enough, worst)
-    return coefficients[:, :enough].contiguous(), directions[:, :enough].T.contiguous(), worst
+def _curves(values: Tensor, level: Tensor, tolerance: float, most: int, errors: Callable) -> Tensor:
+    """Curves [r, T] of which sums come close to values [n, T] about their level [n, 1]: as many as ``tolerance`` needs.
+
+    They are right singular vectors, which make the mean error least. Weights that grow with the error of a row make the
+    largest smaller (as in the iteration of Lawson 1961): a third of it at 192 curves of 2,126 Gaussians under weather.
+    """
+    change, weights = values - level, torch.ones_like(level)
+    tried: list[tuple[float, Tensor]] = []
+    for _ in range(1 + WEIGHED):
+        directions = _directions(change * weights, most)
+        off = errors(level + change @ directions @ directions.T, values).amax(1, keepdim=True)
+        tried.append((off.max().item(), directions))
+        if tried[0][0] <= tolerance:
+            break
+        weights = weights * (1 + off / tolerance)
+        weights = weights / weights.max()
+    directions = min(tried, key=lambda one: one[0])[1]
+    coefficients = change @ directions
+
+    def enough(rank: int) -> bool:
+        found = level + coefficients[:, :rank] @ directions[:, :rank].T
+        return errors(found, values).max().item() <= tolerance
+
+    few, many = -1, directions.shape[1]
+    while many - few > 1:
+        middle = (few + many) // 2
+        few, many = (few, middle) if enough(middle) else (middle, many)
+    return directions[:, :many].T.contiguous()
+
+
+def _telling(curves: Tensor, known: Tensor) -> list[int]:
+    """Samples that tell the level and coefficients of curves [r, T], in addition to ``known`` [r, m], the curves elsewhere."""
+    level = curves.shape[1] ** -0.5
+    every, at = (torch.cat([part.new_full((1, part.shape[1]), level), part]).double() for part in (curves, known))
+    found: list[int] = []
+    if not known.shape[1]:
+        found = qr(every.numpy(), mode="r", pivoting=True)[1][: len(every)].tolist()
+    gram = at @ at.T + every[:, found] @ every[:, found].T
+    free = torch.ones(every.shape[1], dtype=torch.bool)
+    free[found] = False
+    while len(found) < every.shape[1]:
+        sizes, vectors = torch.linalg.eigh(gram)
+        if sizes[0] * AMPLIFIED**2 >= 1.0:
+            break
+        place = int(((vectors[:, 0] @ every).abs() * free).argmax())
+        free[place] = False
+        found.append(place)
+        gram += every[:, place, None] * every[None, :, place]
+    return found
+
+
+def _fit(basis: TimeBasis, fitted: Mapping[float, Tensor]) -> TimeBasis:
+    """The basis with levels and rounded coefficients of all Gaussians by least squares, of values [N] at some moments."""
+    at = _level_and_curves(basis, fitted)
+    solving = torch.linalg.pinv(at.double())
+    values = torch.stack(list(fitted.values()), dim=1)
+    found = torch.cat([(some.double() @ solving).float() for some in values.split(ROWS)])
+    return replace(basis, offsets=found[:, 0].contiguous(), coefficients=_rounded(found[:, 1:].T, basis.step).T)
+
+
+def _errors(basis: TimeBasis, known: Mapping[float, Tensor], errors: Callable) -> Tensor:
+    """The largest error [N] of each Gaussian at moments of which values [N] are known."""
+    at, true = _level_and_curves(basis, known), torch.stack(list(known.values()), dim=1)
+    own = torch.cat([basis.offsets[:, None], basis.coefficients], dim=1)
+    parts = zip(own.split(ROWS), true.split(ROWS), strict=True)
+    return torch.cat([errors(some @ at, values).amax(1) for some, values in parts])
+
+
+def _level_and_curves(basis: TimeBasis, moments: Iterable[float]) -> Tensor:
+    """What levels and coefficients are factors of, at some moments, [1 + r, m]."""
+    return torch.stack([torch.cat([torch.ones(1), basis._curves_at(moment)]) for moment in moments], dim=1)
 
 
 def _directions(values: Tensor, most: int) -> Tensor:
@@ -167,21 +315,26 @@ def _directions(values: Tensor, most: int) -> Tensor:
     within = torch.eye(count)
     if wide < count:
         within = torch.randn(count, wide, generator=torch.Generator().manual_seed(0))
-        for _ in range(TURNS):
+        for _ in range(TURNED):
             within = torch.linalg.qr(values.T @ (values @ within)).Q
     inner = (values @ within if wide < count else values).double()
     vectors = torch.linalg.eigh(inner.T @ inner).eigenvectors.flip(1).float()
     return (within @ vectors)[:, :most]
 
 
-def rounded(column: Tensor) -> Tensor:
-    """A column [N] as 16-bit steps of its largest magnitude hold it: what ``steps_of`` stores, read back."""
-    steps, size = steps_of(column)
+def _rounded(rows: Tensor, least: float = 0.0) -> Tensor:
+    """Each of some rows [r, n] as ``rounded`` has it."""
+    return torch.stack([rounded(row, least) for row in rows]) if len(rows) else rows
+
+
+def rounded(column: Tensor, least: float = 0.0) -> Tensor:
+    """A column [N] as whole steps hold it: what ``steps_of`` stores, read back."""
+    steps, size = steps_of(column, least)
     return steps.float() * size
 
 
-def steps_of(column: Tensor) -> tuple[Tensor, float]:
-    """A column [N] in whole steps of -32767 to 32767, int16, and the size of a step."""
+def steps_of(column: Tensor, least: float = 0.0) -> tuple[Tensor, float]:
+    """A column [N] in whole steps of -32767 to 32767, int16, and the size of a step: ``least`` or as large as that asks for."""
     largest = column.abs().max().item() if column.numel() else 0.0
-    size = largest / STEPS if largest > 0 else 1.0
+    size = max(largest / STEPS, least) or 1.0
     return (column / size).round().clamp(-STEPS, STEPS).to(torch.int16), size

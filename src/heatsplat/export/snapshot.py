@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneData, SceneError, evenly_spread
-from heatsplat.export.basis import TimeBasis, constant_basis, time_basis
+from heatsplat.export.basis import EXAMINED, TimeBasis, ValuesAt, constant_basis, time_basis
 from heatsplat.physics.units import kelvin
 from heatsplat.renderers.base import ALPHA_MIN
 from heatsplat.shots import at_time, first_free_id
@@ -21,15 +21,12 @@ VIEWS = 6  # training cameras over which what depends on the view is averaged
 JUDGED = 48  # training cameras at most that are compared with that mean
 TIMES = 257  # samples of a quantity over time at most, and
 BENDS = 3073  # where a weather record bends curves at each of its samples
-VALUES = 1e8  # of all Gaussians at all samples: 0.4 GB
-CURVES = 48  # curves of a quantity at most; of few Gaussians more,
-COEFFICIENTS = 4_800_000  # up to so many numbers of 16 bits
-MOST_CURVES = 192  # but no more than these
-FEW_TIMES = 65  # the same of models for which
-WORK = 2e10  # multiply-adds do not suffice; half a minute of one thread
+CURVES = 192  # curves of a quantity at most
+FEW_TIMES, FEW_CURVES = 65, 24  # the same of models for which
+WORK = 4e10  # multiply-adds do not suffice; a minute of one thread
 RECALLED = 4  # times as many under weather, where a moment goes on from what was marched before
+MOMENTS = 2  # at which all Gaussians are asked for, for each curve
 TABLE = 257  # entries of a table of temperatures
-CHUNK = 16384  # points whose truth is asked for at once
 
 
 @dataclass(frozen=True)
@@ -117,8 +114,8 @@ def snapshot(module: Any) -> Snapshot:
     kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
     channels = module.thermal.modality_channels[0]
 
-    def emitted(frame: Frame) -> Tensor:
-        return module.emissions(module.splats, frame)[kept]
+    def emitted(frame: Frame, ids: Tensor | None = None) -> Tensor:
+        return module.emissions(module.splats, frame, kept if ids is None else kept[ids])
 
     def blended(values: Tensor) -> Tensor:
         """Blended values [N] of image values [N, C]."""
@@ -150,8 +147,8 @@ def snapshot(module: Any) -> Snapshot:
             "the middle of the record."
         )
 
-    def camera(time_s: float | None) -> Tensor:
-        return blended(torch.stack([emitted(seen_at(frame, time_s)) for frame in cameras]).mean(0))
+    def camera(time_s: float | None, ids: Tensor | None = None) -> Tensor:
+        return blended(torch.stack([emitted(seen_at(frame, time_s), ids) for frame in cameras]).mean(0))
 
     slope = _slope(blended, to_unit, channels)
     surface = _surface(module, blended, kept) if span is not None else None
@@ -159,32 +156,30 @@ def snapshot(module: Any) -> Snapshot:
     sent = surface if clipped else camera
     record = () if scene.weather is None else tuple(scene.weather.times_s.tolist())
     bends = record if "weather" in module.thermal.needs else ()
-    most = BENDS if bends else TIMES
-    most = min(most, max(TIMES, int(VALUES / max(len(kept), 1))))
-    work = WORK * (RECALLED if bends else 1)
-    most = int(min(most, max(FEW_TIMES, work / (max(module.thermal.cost, 1) * len(means) * len(cameras)))))
-    curves = max(CURVES, min(MOST_CURVES, COEFFICIENTS // max(len(kept), 1)))
+    work = WORK * (RECALLED if bends else 1) / (max(module.thermal.cost, 1) * len(cameras))
+    most = int(min(BENDS if bends else TIMES, max(FEW_TIMES, work / min(len(kept), EXAMINED))))
+    curves = int(min(CURVES, max(FEW_CURVES, work / (MOMENTS * max(len(kept), 1)))))
 
-    def layer(name: str, label: str, values_at: Callable, clipped: bool = False) -> Layer:
-        return _layer(name, label, values_at, span, tolerance / slope, slope, most, curves, bends, clipped)
+    def layer(name: str, label: str, values_at: ValuesAt, clipped: bool = False) -> Layer:
+        return _layer(name, label, values_at, len(kept), span, tolerance / slope, slope, most, curves, bends, clipped)
 
     layers = [layer("camera", "as seen", sent, clipped)]
     if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
         layers.append(layer("surface", "of the surface", surface))
     for part in module.thermal.removable:
 
-        def without(time_s: float | None, part: str = part) -> Tensor:
+        def without(time_s: float | None, ids: Tensor | None = None, part: str = part) -> Tensor:
             with module.thermal.without(part):
-                return camera(time_s)
+                return camera(time_s, ids)
 
         if not _alike(without, camera, span, tolerance / slope):
             label = f"without {part.replace('_', ' ')}"
             layers.append(layer(f"without {part}", label, without))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
-        truth = _truth(scene, means[kept].cpu(), blended, span)
+        truth = _truth(scene, means[kept].cpu(), blended)
         most = BENDS if record else TIMES
         layers.append(
-            _layer("truth", "truth", truth, span, tolerance / slope, slope, most, curves, record, clipped=False)
+            _layer("truth", "truth", truth, len(kept), span, tolerance / slope, slope, most, CURVES, record, False)
         )
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
@@ -232,12 +227,12 @@ def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -
     return to_unit / (TABLE - 1) / steps.min().item()
 
 
-def _inside(values_at: Callable) -> Callable:
+def _inside(values_at: ValuesAt) -> ValuesAt:
     """A quantity where the image can show it."""
-    return lambda time: values_at(time).clamp(0, 1)
+    return lambda time, ids=None: values_at(time, ids).clamp(0, 1)
 
 
-def _alike(one: Callable, other: Callable, span: tuple[float, float] | None, tolerance: float) -> bool:
+def _alike(one: ValuesAt, other: ValuesAt, span: tuple[float, float] | None, tolerance: float) -> bool:
     """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
     if span is None:
         return bool((one(None) - other(None)).abs().max() <= 0.1 * tolerance)
@@ -248,7 +243,8 @@ def _alike(one: Callable, other: Callable, span: tuple[float, float] | None, tol
 def _layer(
     name: str,
     label: str,
-    values_at: Callable,
+    values_at: ValuesAt,
+    count: int,
     span: tuple[float, float] | None,
     tolerance: float,
     slope: float,
@@ -258,13 +254,13 @@ def _layer(
     clipped: bool,
 ) -> Layer:
     if span is None:
-        basis = constant_basis(values_at(None).cpu())
+        basis = constant_basis(values_at(None, None).cpu())
     else:
-        basis = time_basis(values_at, *span, tolerance, most_times, most_curves, bends, clipped)
+        basis = time_basis(values_at, count, *span, tolerance, most_times, most_curves, bends, clipped)
     return Layer(name, label, basis, basis.worst * slope, clipped)
 
 
-def _surface(module: Any, blended: Callable, kept: Tensor) -> Callable[[float], Tensor] | None:
+def _surface(module: Any, blended: Callable, kept: Tensor) -> ValuesAt | None:
     """Blended values of the temperature of the surface, where the model tells one."""
     scene = module.scene
     if scene.thermal_range is None or module.modality != "thermal" or "time" not in scene.metadata:
@@ -273,28 +269,20 @@ def _surface(module: Any, blended: Callable, kept: Tensor) -> Callable[[float], 
         return None
     lowest, span = kelvin(scene.thermal_range.min_c), scene.thermal_range.span_k
 
-    def surface(time_s: float) -> Tensor:
-        units = (module.thermal.temperature(module.splats, time_s)[kept] - lowest) / span
+    def surface(time_s: float, ids: Tensor | None = None) -> Tensor:
+        wanted = kept if ids is None else kept[ids]
+        units = (module.thermal.temperature(module.splats, time_s, wanted) - lowest) / span
         return blended(units[:, None])
 
     return surface
 
 
-def _truth(scene: SceneData, points: Tensor, blended: Callable, span: tuple[float, float]) -> Callable[[float], Tensor]:
-    """Blended values of the true temperatures at points [N, 3].
+def _truth(scene: SceneData, points: Tensor, blended: Callable) -> ValuesAt:
+    """Blended values of the true temperatures at points [N, 3]."""
 
-    Most of what a moment costs is to find what lights and surrounds the points, which many moments share: values at TIMES
-    moments evenly over the span are asked for at once.
-    """
-    even = torch.linspace(*span, TIMES, dtype=torch.float64)
-    known = torch.cat([scene.truth(some, even).float() for some in points.split(CHUNK)])
-
-    def truth(time_s: float) -> Tensor:
-        place = (time_s - span[0]) / (span[1] - span[0]) * (TIMES - 1)
-        if abs(place - round(place)) < 1e-6:
-            celsius = known[:, round(place), None]
-        else:
-            celsius = scene.truth(points, torch.tensor([time_s], dtype=torch.float64))[:, :1]
+    def truth(time_s: float, ids: Tensor | None = None) -> Tensor:
+        wanted = points if ids is None else points[ids]
+        celsius = scene.truth(wanted, torch.tensor([time_s], dtype=torch.float64))[:, :1]
         return blended(scene.thermal_range.to_unit(celsius).float())
 
     return truth

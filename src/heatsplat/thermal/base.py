@@ -283,6 +283,6 @@ class ThermalModel(Heat):
         """Geometry at ``query.time_s`` for deforming models; None means that splats stay as they are."""
         return None
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        """Temperature of every Gaussian in kelvin at a time, [N]; None where the model has no temperature."""
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        """Temperature at a time in kelvin of the Gaussians ``ids``, or of all, [n]; None where the model has no temperature."""
         return None

@@ -82,9 +82,9 @@ class Conducting(Wrapper):
     def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         return self.conducted(values, splats, query.time_s)
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         alone = super().temperature(splats, time_s)
-        return None if alone is None else self.conducted(alone[:, None], splats, time_s)[:, 0]
+        return None if alone is None else Query(ids).rows(self.conducted(alone[:, None], splats, time_s)[:, 0])
 
     def conducted(self, values: Tensor, splats: Splats, time_s: float | None) -> Tensor:
         """Values [N, C] of all Gaussians after they exchanged heat until ``time_s``."""

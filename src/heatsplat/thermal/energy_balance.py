@@ -276,8 +276,8 @@ class EnergyBalance(ThermalModel):
         unit = self.range.bounds.to_unit(celsius_above)
         return clipped(unit, self.clip)[:, None]
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        return self._temperature(splats, Query(time_s=time_s)) + self.reference_k.item()
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        return self._temperature(splats, Query(ids, time_s=time_s)) + self.reference_k.item()
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of

@@ -362,8 +362,8 @@ class EnergyNetwork(ThermalModel):
                 terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.interval_s[1])
         return {name: weights[name] * term for name, term in terms.items()}
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        return self.range.kelvin(self.features(splats, Query(time_s=time_s))[:, 0])
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        return self.range.kelvin(self.features(splats, Query(ids, time_s=time_s))[:, 0])
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Emissivity, absorptivity, convection and capacity at the time of the query; nothing in the first stage."""

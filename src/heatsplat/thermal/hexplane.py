@@ -192,12 +192,12 @@ class HexPlane(Wrapper):
             f"planes/{name}": self.weights[name] * term() for name, term in found.items() if self.weights[name] > 0
         }
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        level = super().temperature(splats, time_s)
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        level = super().temperature(splats, time_s, ids)
         if level is None or not self.changes or "radiance" not in self.heads:
             return level
         with torch.no_grad():
-            change = self._change("radiance", self.hidden(splats.means, time_s))[:, 0]
+            change = self._change("radiance", self.hidden(Query(ids).rows(splats.means), time_s))[:, 0]
             return level + self.range.bounds.span_k * change
 
     def rate_of(self, name: str) -> tuple[float, float]:

@@ -230,8 +230,8 @@ class NewtonHarmonic(ThermalModel):
         state = self._state(splats, query.time_s, query.ids)
         return clipped(state, self.clip)[:, None]
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        return None if self.range.bounds is None else self.range.kelvin(self._state(splats, time_s, None))
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        return None if self.range.bounds is None else self.range.kelvin(self._state(splats, time_s, ids))
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
         """Temperature in image units of the Gaussians ``ids``, [n], not clipped.

@@ -145,11 +145,11 @@ class NtrGaussian(ThermalModel):
         terms, self._terms = self._terms, {}
         return {f"ntr/{name}": self.weights[name] * term for name, term in terms.items() if self.weights[name] > 0}
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor:
         with torch.no_grad():
             if not self.emits:
-                return self.range.kelvin(splats["first_value"])
-            return self.range.kelvin(self._units(splats, None, time_s))
+                return self.range.kelvin(Query(ids).rows(splats["first_value"]))
+            return self.range.kelvin(self._units(splats, ids, time_s))
 
     def rate_of(self, name: str) -> tuple[float, float]:
         return (self.lr_attributes, self.lr_end) if name.startswith(ATTRIBUTE_NETWORKS) else super().rate_of(name)

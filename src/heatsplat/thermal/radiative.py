@@ -207,11 +207,11 @@ class Radiative(Wrapper):
             return told
         return told | {name: values[:, 0] for name, values in self._body(splats, query).items()}
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         """Of bodies that send by Planck's law; the mean over directions of what it is before the sigmoid counts."""
         if self.band is None:
-            return super().temperature(splats, time_s)
-        return self.range.kelvin((spherical_harmonics.C0 * splats["temperature"][:, 0, 0]).sigmoid())
+            return super().temperature(splats, time_s, ids)
+        return self.range.kelvin((spherical_harmonics.C0 * Query(ids).rows(splats["temperature"])[:, 0, 0]).sigmoid())
 
     def effects(self) -> dict[str, dict]:
         effects = super().effects()

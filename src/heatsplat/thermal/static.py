@@ -89,10 +89,10 @@ class Static(ThermalModel):
         values = harmonics(splats[self.sh0], rest, splats.means, query, self.active_degree)
         return (values + 0.5).clamp(min=0.0) if self.floor else values + 0.5
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         if self.modality != "thermal" or self.modality_channels[0] != 1:
             return None
-        return self.range.kelvin(spherical_harmonics.C0 * splats[self.sh0][:, 0, 0] + 0.5)
+        return self.range.kelvin(spherical_harmonics.C0 * Query(ids).rows(splats[self.sh0])[:, 0, 0] + 0.5)
 
     def effects(self) -> dict[str, dict]:
         return {"view_dependence": {"degree": self.sh_degree}} if self.sh_degree > 0 else {}

@@ -43,9 +43,9 @@ class ThroughAir(Wrapper):
         near = self.air.level + (values - self.air.level) * self._gain(query.time_s)
         return clipped(self.air(near, splats, query), self.clip)
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         """Of the surfaces themselves, without the air."""
-        seen = super().temperature(splats, time_s)
+        seen = super().temperature(splats, time_s, ids)
         if seen is None:
             return None
         air = self.range.kelvin(self.air.level)

@@ -95,12 +95,12 @@ class TimeMlp(Wrapper):
             return values
         return values + self.change(query.rows(splats["feature"]), query.time_s)[:, None].to(values)
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
-        level = super().temperature(splats, time_s)
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
+        level = super().temperature(splats, time_s, ids)
         if level is None or not self.changes:
             return level
         with torch.no_grad():
-            return level + self.range.bounds.span_k * self.change(splats["feature"], time_s)
+            return level + self.range.bounds.span_k * self.change(Query(ids).rows(splats["feature"]), time_s)
 
     def rate_of(self, name: str) -> tuple[float, float]:
         return (self.lr_time, self.lr_end) if name.startswith(ENCODER) else super().rate_of(name)

@@ -121,9 +121,9 @@ class Wrapper(ThermalModel):
     def geometry(self, splats: Splats, query: Query) -> Geometry | None:
         return self._models[0].geometry(splats, query)
 
-    def temperature(self, splats: Splats, time_s: float) -> Tensor | None:
+    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         """That of what is wrapped: what a camera would see without anything in between."""
-        return self._models[0].temperature(splats, time_s)
+        return self._models[0].temperature(splats, time_s, ids)
 
     @property
     def removable(self) -> tuple[str, ...]:

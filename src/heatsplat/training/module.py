@@ -470,9 +470,9 @@ class SplatTraining(pl.LightningModule):
         return self._shapes(self.thermal.geometry(self.splats, _query(frame)))
 
     @torch.no_grad()
-    def emissions(self, splats: Splats, frame: Frame) -> Tensor:
-        """What the thermal model makes of all Gaussians of some splats in a frame, [N, C] in image units."""
-        return self.thermal.features(splats, _query(frame))
+    def emissions(self, splats: Splats, frame: Frame, ids: Tensor | None = None) -> Tensor:
+        """What the thermal model makes of all Gaussians of some splats in a frame, or of ``ids``, [n, C] in image units."""
+        return self.thermal.features(splats, _query(frame, ids))
 
     @property
     def constants(self) -> frozenset[str]:

@@ -19,8 +19,10 @@ from heatsplat.io.quantities import words_and_unit
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
 CAMERAS = 36  # training cameras that are in the page, with their images
 THUMBNAIL = 144  # pixels of the longer side of an image
-UNKNOWN = 65535  # of a thumbnail's pixel that is masked, and of a Gaussian that has no value of an attribute
-LEVELS = 65534  # steps between the ends of a range in 16 bits
+MOST = 65535  # largest number of 16 bits
+UNKNOWN = MOST  # of a thumbnail's pixel that is masked, and of a Gaussian that has no value of an attribute
+LEVELS = MOST - 1  # steps between the ends of a range where some are unknown
+LEAST_SCALE = 1e-12  # of a Gaussian, in world units: none is drawn
 ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
 LOG_RATIO = 100.0  # an attribute above 0 whose ends are further apart than this is stored as its logarithm
 
@@ -33,7 +35,7 @@ class Block:
         self._size = 0
 
     def add(self, values: Any, kind: str) -> dict[str, Any]:
-        """Where an array lies: its type ("f4", "f8", "i2", "u2", "u1"), shape and first byte. Little-endian."""
+        """Where an array lies: its type ("f4", "f8", "i2", "i1", "u2", "u1"), shape and first byte. Little-endian."""
         array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
         content = np.ascontiguousarray(array, dtype=f"<{kind}").tobytes()
         place = {"type": kind, "shape": list(array.shape), "offset": self._size}
@@ -60,7 +62,7 @@ def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
     centre, size = scene.bulk
     renderer = module.renderer
     header = {
-        "format": 1,
+        "format": 2,
         "scene": scene.name,
         "method": module.config.get("name") or type(module.thermal).__name__,
         "unit": seen.unit,
@@ -68,8 +70,8 @@ def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
         "count": len(seen.means),
         "means": block.add(seen.means, "f4"),
         "quats": block.add((seen.quats * 32767).round(), "i2"),
-        "scales": block.add(seen.scales, "f4"),
-        "opacities": block.add(seen.opacities, "f4"),
+        "logScales": _between(seen.scales.clamp_min(LEAST_SCALE).log(), block),
+        "opacities": block.add((seen.opacities * MOST).round(), "u2"),
         "background": seen.background,
         "table": block.add(seen.table, "f4"),
         "tableEnds": list(seen.table_ends),
@@ -104,8 +106,7 @@ def _colours(name: str) -> np.ndarray:
 
 
 def _layer(layer: Layer, block: Block) -> dict[str, Any]:
-    """Coefficients lie curve by curve, in 16-bit steps."""
-    stored = [steps_of(column) for column in layer.basis.coefficients.unbind(1)]
+    """Coefficients lie curve by curve; levels, coefficients and curves in steps."""
     basis = layer.basis
     return {
         "name": layer.name,
@@ -113,11 +114,26 @@ def _layer(layer: Layer, block: Block) -> dict[str, Any]:
         "worst": layer.worst,
         "clipped": layer.clipped,
         "checks": basis.checks,
-        "offsets": block.add(basis.offsets, "f4"),
-        "coefficients": [block.add(steps, "i2") | {"step": size} for steps, size in stored],
-        "curves": block.add(basis.curves, "f4"),
+        "offsets": _steps(basis.offsets, block),
+        "coefficients": [_steps(column, block, basis.step) for column in basis.coefficients.unbind(1)],
+        "curves": [_steps(curve, block) for curve in basis.curves],
         "times": block.add(basis.times_s, "f8"),
     }
+
+
+def _steps(values: Tensor, block: Block, least: float = 0.0) -> dict[str, Any]:
+    """Where values lie in steps: whole multiples of 256 of them and the rest apart, because alike bytes pack better."""
+    steps, size = steps_of(values, least)
+    many = (steps.int() + 128) >> 8
+    told: dict[str, Any] = {"step": size, "rest": block.add(steps.int() - 256 * many, "i1")}
+    return told | {"many": block.add(many, "i2" if many.max() > 127 else "i1")} if many.any() else told
+
+
+def _between(values: Tensor, block: Block) -> dict[str, Any]:
+    """Where values lie as shares of the way from the least to the largest, in 16 bits."""
+    low, high = values.aminmax() if values.numel() else (values.new_zeros(()), values.new_ones(()))
+    span = (high - low).clamp_min(1e-12)
+    return block.add(((values - low) / span * MOST).round(), "u2") | {"low": low.item(), "span": span.item()}
 
 
 def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:

@@ -8,20 +8,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, evenly_spread
 from heatsplat.export.formats.base import Format, colours_of, extra_columns, optional
+from heatsplat.export.formats.mesh import look
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, place_of
 
 log = logging.getLogger("heatsplat")
 
 LONGEST_NAME = 32  # bytes of an extra dimension's name (LAS 1.4)
+VIEWS = 48  # training views at most that tell where surfaces are
 STEPS = 2**30  # of a coordinate, stored as a whole number of 32 bits
 
 
 class Las(Format):
-    """LAS 1.4, point format 7.
+    """LAS 1.4, point format 7. What lies where no training view shows a surface, such as under the ground, is left out.
 
     Args:
         compressed: LAZ.
@@ -47,10 +51,16 @@ class Las(Format):
         if path.suffix == ".laz":
             optional("lazrs", "las")
         place = place_of(moment.module.scene, self.gps)
-        kept = (moment.seen.opacities >= self.least_opacity).numpy()
+        opaque = moment.seen.opacities >= self.least_opacity
+        kept = (opaque & _shown(moment)).numpy()
         if not kept.any():
-            raise SceneError(f"what.least_opacity={self.least_opacity}: no Gaussian is as opaque")
-        log.info("%d of %d Gaussians have an opacity of %g or more", kept.sum(), len(kept), self.least_opacity)
+            raise SceneError(
+                f"what.least_opacity={self.least_opacity}: no Gaussian that a training view shows is as opaque"
+            )
+        log.info(
+            "%d of %d Gaussians have an opacity of %g or more and lie where a training view shows a surface; %d lie elsewhere",
+            kept.sum(), len(kept), self.least_opacity, opaque.sum() - kept.sum(),
+        )  # fmt: skip
         points = place(moment.seen.means.double()).numpy()[kept]
         header = laspy.LasHeader(point_format=7, version="1.4")
         header.offsets = np.floor(points.min(0))
@@ -76,3 +86,13 @@ class Las(Format):
         for name, values in zip(names, columns.values(), strict=True):
             data[name] = values.numpy()[kept]
         data.write(str(path))
+
+
+def _shown(moment: Moment) -> Tensor:
+    """Which Gaussians [N] lie where some training view shows a surface."""
+    frames = moment.module.scene.train.frames
+    shown = torch.zeros(len(moment.seen.means), dtype=torch.bool)
+    with torch.no_grad():
+        for i in evenly_spread(len(frames), VIEWS):
+            shown |= look(moment, frames[i]).sees(moment.seen.means)[0]
+    return shown

@@ -55,6 +55,11 @@ class Mesh(Format):
             given = trimesh.load(str(self.mesh), force="mesh", process=False)
         except Exception as error:  # every reader of trimesh raises its own
             raise SceneError(f"what.mesh={self.mesh} cannot be read as a mesh: {error}") from error
+        if not len(given.faces):
+            raise SceneError(
+                f"what.mesh={self.mesh} has no faces: a mesh is made of triangles. For points with temperatures of their own see "
+                "what=las"
+            )
         points, normals = (torch.from_numpy(np.array(part)) for part in (given.vertices, given.vertex_normals))
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)

@@ -1,6 +1,6 @@
 // Reads what heatsplat.viewer.payload wrote: a header, and arrays that it says the place of.
 
-const ARRAYS = { f4: Float32Array, f8: Float64Array, i2: Int16Array, u2: Uint16Array, u1: Uint8Array };
+const ARRAYS = { f4: Float32Array, f8: Float64Array, i2: Int16Array, i1: Int8Array, u2: Uint16Array, u1: Uint8Array };
 
 async function inflated(base64) {
   const text = atob(base64.trim());
@@ -16,7 +16,7 @@ async function readPayload(page) {
   const block = page.getElementById("block");
   if (!header || !block) throw new Error("this is no viewer.html of heatsplat");
   const told = JSON.parse(header.textContent);
-  if (told.format !== 1) throw new Error("this viewer.html was written by another version of heatsplat");
+  if (told.format !== 2) throw new Error("this viewer.html was written by another version of heatsplat");
   const bytes = await inflated(block.textContent);
   const array = (place) => {
     const count = place.shape.reduce((a, b) => a * b, 1);

@@ -111,7 +111,7 @@ class Viewer {
     const notes = [];
     if (this.told.span) {
       notes.push(`Time: each Gaussian's curve is a sum of shared ones. How many, and worst error of any Gaussian found: ${ranks} `
-        + `(aim: ${this.told.tolerance}), at every sample and ${this.splats.layers[0].checks} moments between.`);
+        + `(aim: ${this.told.tolerance}), of all Gaussians at ${this.splats.layers[0].checks} moments at which nothing was fitted.`);
       notes.push(`Beyond the record: ${this.told.beyondRecord}.`);
     }
     notes.push(...this.told.leftOut);
