@@ -110,7 +110,7 @@ class Built:
 
     def recorded(self, image, frame, depth):
         image = self.sensor(image, frame, depth)
-        return resampled(image, HEIGHT, WIDTH, self.grid["kernel"]) if self.grid else image
+        return resampled(image, HEIGHT, WIDTH, self.grid["kernel"] or "area") if self.grid else image
 
     def regularisers(self, splats):
         return [*self.thermal.regularisers(splats).values(), *self.sensor.regularisers().values()]
