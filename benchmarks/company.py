@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import setting
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 
@@ -69,7 +70,7 @@ def run(
 def seconds_of(command: Sequence[str], folders: Sequence[Path]) -> float:
     """Seconds from the start of runs, one in each folder, until the last one ends."""
     start = time.perf_counter()
-    with_folders = [[*command, f"hydra.run.dir={folder}"] for folder in folders]
+    with_folders = [[*command, setting("hydra.run.dir", folder)] for folder in folders]
     processes = [
         subprocess.Popen(each, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) for each in with_folders
     ]

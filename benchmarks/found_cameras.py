@@ -29,6 +29,7 @@ from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.alignment import PoseErrors, pose_errors
+from heatsplat.io.command_lines import setting
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import trained
@@ -95,7 +96,7 @@ def run(
                 trained(
                     place / f"trained_{kind}_{seed}",
                     train,
-                    [*lines, f"seed={seed}", f"data.root={place / kind}"],
+                    [*lines, f"seed={seed}", setting("data.root", place / kind)],
                     output_dir,
                 )
                 for seed in seeds

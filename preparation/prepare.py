@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,6 +12,7 @@ from typing import Any
 from rich.progress import track
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import setting, typed
 from heatsplat.preparation import report
 from heatsplat.preparation.conditions import Given, Uncertainty
 from heatsplat.preparation.devices import devices_of, listed
@@ -130,8 +130,5 @@ def _cameras(
             f"{error}. The temperatures are in {target / 'images'} all the same (poses=none leaves out the search)"
         ) from error
     log.info("%s", found.lines[0])
-    root = f"data.root={target}"
-    if not re.fullmatch(r"[\w./=-]+", root, re.ASCII):  # Hydra takes other texts in quotes of their own
-        root = f"\"data.root='{target}'\""
-    log.info("it trains: python src/train.py data=colmap %s", root)
+    log.info("it trains: python src/train.py data=colmap %s", typed(setting("data.root", target)))
     return [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]

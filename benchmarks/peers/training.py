@@ -19,6 +19,7 @@ import torch
 from benchmarks.peers.scenes import HELD_OUT, IMAGES, SharedScene
 from heatsplat.contracts import SceneError
 from heatsplat.geometry import spherical_harmonics
+from heatsplat.io.command_lines import setting
 from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.metrics.psnr import psnr
 from heatsplat.renderers import rasterization
@@ -59,7 +60,8 @@ def train_heatsplat(
         SceneError: it failed.
     """
     sees = SEES["rgb" if "thermal.modality=rgb" in overrides else scene.modality]
-    place = (f"data.root={scene.folder}", f"data.split_file={scene.folder / HELD_OUT}", f"hydra.run.dir={folder}")
+    places = {"data.root": scene.folder, "data.split_file": scene.folder / HELD_OUT, "hydra.run.dir": folder}
+    place = [setting(key, value) for key, value in places.items()]
     command = [sys.executable, train, *ALONE, *sees, *place, f"max_steps={steps}", f"threads={threads}", *overrides]
     process_s = _run(command, threads, {}, lambda line: None)
     checkpoint = folder / "checkpoints" / "last.ckpt"

@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from heatsplat.composition import CONF, build, composed, plain, run_of
+from heatsplat.io.command_lines import setting, typed
 from heatsplat.training.machine import prepare_machine
 
 log = logging.getLogger("heatsplat")
@@ -171,7 +172,7 @@ def _quoted(override: str) -> str:
         return f"A number has a decimal point: {key}={value.replace(',', '.')}"
     if not value or value[0] in "[{'\"":
         return ""
-    return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: \"{key}='{value}'\""
+    return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: {typed(setting(key, value))}"
 
 
 def _nulled() -> str | None:

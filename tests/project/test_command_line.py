@@ -123,24 +123,14 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
         ("optim.meens=1", "Did you mean optim.means"),
         ("schedule.factor=2", "schedule has nothing to set"),
         ("logger.colour=red", "logger has "),
-    ],
-)
-def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
-    output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
-    assert meant in output and "Traceback" not in output
-
-
-@pytest.mark.parametrize(
-    ("wrong", "right"),
-    [
         ("data.root=/data/Flug über Köln, 2. Tag", "\"data.root='/data/Flug über Köln, 2. Tag'\""),
         ("data.root=/data/flight,2", "\"data.root='/data/flight,2'\""),
         ("data.ambient_c=20,5", "data.ambient_c=20.5"),
     ],
 )
-def test_a_value_that_hydra_cannot_read_is_shown_as_it_can(wrong, right, tmp_path):
-    output = command("train", "method=3dgs", wrong, cwd=tmp_path, code=1)
-    assert right in output and "Traceback" not in output
+def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
+    output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
+    assert meant in output and "Traceback" not in output
 
 
 def test_a_group_set_to_null_is_told_its_options(tmp_path):

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import setting
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 
@@ -36,8 +37,7 @@ def trained(place: Path, train: str | None, overrides: Sequence[str], study: Pat
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
     program = [train] if train else ["-c", INSTALLED]
-    quoted = str(place).replace("'", "\\'")  # Hydra takes no bare "=" or "," in a path
-    command = [sys.executable, *program, *overrides, f"hydra.run.dir='{quoted}'"]
+    command = [sys.executable, *program, *overrides, setting("hydra.run.dir", place)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         failed = place / FAILED

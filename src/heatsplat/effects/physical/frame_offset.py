@@ -18,9 +18,8 @@ from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
 
 NOT_COMMON = "what images have in common is not common to all points; more frames would tell heat from the camera"
-IN_COMMON = (
-    0.5  # share of what numbers of all points explain of one half of them that those of the other half have to explain
-)
+# Share of what numbers of all points explain of one half of them that those of the other half have to explain.
+IN_COMMON = 0.5
 
 
 def evidence(inspected: Inspection) -> Evidence:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import setting
 from heatsplat.studies.score import META, SCENES, scenes_in
 
 
@@ -62,7 +63,7 @@ class Board:
             [
                 f"method={method}",
                 "data=benchmark",
-                f"data.root={self.root}",
+                setting("data.root", self.root),
                 f"data.scene={scene}",
                 f"seed={seed}",
                 *self.protocol["tracks"][track],
