@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.density.ops import Cloud
+from heatsplat.density.ops import Cloud, LongAxisSplit
 from heatsplat.splats import Splats
 
 
@@ -58,6 +58,23 @@ def test_overwrite_forgets_moments_of_that_tensor_only():
     assert (cloud.splats["opacity_logits"] == -2).all()
     assert (moments(cloud, "opacity_logits") == 0).all()
     assert (moments(cloud, "means") != 0).all()
+
+
+def test_a_gradient_that_waits_for_more_views_follows_its_gaussians():
+    cloud = make_cloud()
+    before = {name: cloud.splats[name].grad.clone() for name in cloud.splats.names}
+    mask = torch.tensor([True, False, True, True, False, True])
+    cloud.keep(mask)
+    cloud.append(cloud.rows(torch.tensor([1])))
+    for name in cloud.splats.names:
+        found = cloud.splats[name].grad
+        assert torch.equal(found[:4], before[name][mask]) and (found[4] == 0).all()
+    cloud.split(torch.tensor([2]), LongAxisSplit())
+    found = cloud.splats["heat"].grad
+    assert torch.equal(found[:2], before["heat"][[0, 2]]) and (found[[2, 4, 5]] == 0).all()
+    assert torch.equal(found[3], before["heat"][5])
+    cloud.overwrite("opacity_logits", torch.full((6, 2), -2.0))
+    assert (cloud.splats["opacity_logits"].grad == 0).all()
 
 
 def test_training_goes_on_after_surgery():

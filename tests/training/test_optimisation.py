@@ -6,6 +6,7 @@ It is torch's Adam with a step of its own on a CPU (tests/kernels/test_adam.py).
 import pytest
 import torch
 
+from heatsplat import composition
 from heatsplat.splats import Splats
 from heatsplat.training.optimisation import Optimisation
 from heatsplat.training.schedule import Schedule
@@ -135,6 +136,13 @@ def test_gradients_of_several_views_wait_for_one_update():
     assert all(Optimisation().updates(step, 0.99) for step in range(5))
     with pytest.raises(ValueError, match="at least 1"):
         Optimisation(accumulate=0)
+
+
+@pytest.mark.parametrize(("steps", "views"), [(20, 1), (300, 1), (650, 2), (1500, 4), (2000, 5), (5000, 8), (30000, 8)])
+def test_longer_runs_sum_the_gradients_of_more_views(steps, views):
+    ours, papers = (composition.compose([f"max_steps={steps}", *recipe]) for recipe in ([], ["recipe=published"]))
+    assert composition.build(ours["optim"]).accumulate == views
+    assert composition.build(papers["optim"]).accumulate == 1
 
 
 def test_shorter_runs_learn_faster_as_a_power_of_their_length():

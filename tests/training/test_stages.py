@@ -99,6 +99,18 @@ def test_what_is_frozen_keeps_value_and_moments_and_pays_no_penalty():
     assert all(group["params"][0].requires_grad for group in optimizer.param_groups)
 
 
+def test_what_waited_for_more_views_is_forgotten_when_it_is_frozen():
+    optimizer = optimizer_of()
+    parameters = {group["name"]: group["params"][0] for group in optimizer.param_groups}
+    for parameter in parameters.values():
+        parameter.grad = torch.ones_like(parameter)
+    before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
+    with Stages({"a": Freeze(["sh*"])}).on_step(0, optimizer):
+        optimizer.step()
+    unmoved = {name for name, parameter in parameters.items() if torch.equal(parameter, before[name])}
+    assert unmoved == {"sh0", "sh_rest"}
+
+
 @pytest.mark.parametrize("warm", [0, 3])
 def test_a_column_is_frozen_alone(warm):
     optimizer = optimizer_of(weight_decay=0.1)

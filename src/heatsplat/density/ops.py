@@ -161,9 +161,10 @@ class Cloud:
             statistic[ids] = 0
 
     def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
-        """What the optimiser keeps of a parameter, element by element."""
+        """What the optimiser keeps of a parameter, element by element, and a gradient that waits for those of more views."""
         moments = {} if self.optimizer is None else self.optimizer.state.get(parameter, {})
-        return {key: value for key, value in moments.items() if value.shape == parameter.shape}
+        waiting = {} if parameter.grad is None else {"gradient": parameter.grad}
+        return {key: value for key, value in {**moments, **waiting}.items() if value.shape == parameter.shape}
 
     def overwrite(self, name: str, values: Tensor) -> None:
         """Gives one tensor new values [N, ...] and forgets its moments; a sparse one takes the rows that it has."""
@@ -181,9 +182,11 @@ class Cloud:
     def _replace(
         self, name: str, change: Callable[[Tensor], Tensor], change_moment: Callable[[Tensor], Tensor]
     ) -> None:
-        """Puts ``change(parameter)`` in the parameter's place, everywhere it is known; its moments likewise."""
+        """Puts ``change(parameter)`` in the parameter's place, everywhere it is known; its moments and gradient likewise."""
         old = self.splats.raw[name]
         new = nn.Parameter(change(old.detach()).contiguous(), requires_grad=old.requires_grad)
+        if old.grad is not None:
+            new.grad = change_moment(old.grad).contiguous()
         self.splats.raw[name] = new
         if self.optimizer is None:
             return

@@ -236,8 +236,6 @@ class SplatTraining(pl.LightningModule):
         for name, gradient in self._waiting.items():
             self.get_parameter(name).grad = gradient.to(self.device)
         self._waiting = {}
-        if self.trainer.gradient_clip_val:  # Lightning clips what is in grad
-            self.trainer.optimizers[0].takes_unwritten = False
         self._stop_at_the_end()
 
     def on_train_batch_end(self, *_: Any) -> None:
@@ -388,10 +386,15 @@ class SplatTraining(pl.LightningModule):
 
     def _updates(self, step: int) -> bool:
         """Whether parameters change after ``step``: always, but where gradients of several views are summed."""
-        return self.optim.updates(step, self.schedule.progress(step)) or step + 1 >= self.schedule.end
+        last = step + 1 >= self.schedule.end or step + 1 in self.schedule.restarts
+        return last or self.optim.updates(step, self.schedule.round_progress(step))
 
     def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
-        if self.global_step == 0 or self._updates(self.global_step - 1):
+        step = self.global_step
+        if step == 0 or self._updates(step - 1):
+            # Gradients that are added up, or that Lightning clips, have to be in grad.
+            inner = getattr(optimizer, "optimizer", optimizer)
+            inner.takes_unwritten = self._updates(step) and not self.trainer.gradient_clip_val
             optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:

@@ -103,6 +103,8 @@ class OnePassAdam(torch.optim.Adam):
         self._sums = np.zeros(tasks, np.float32)
         if tasks > 0:
             kernel.step(np.array(tensors), np.array(rates, np.float32), np.concatenate(decays), self._sums)
+            if self._squares is not None and any(parameter is self._squares[0] for _, parameter in stepped):
+                self._squares = None
         for group, parameter, unwritten in by_rows:
             decay = np.full(parameter.shape[-1], group["weight_decay"], np.float32)
             if group.get("group_penalty"):
@@ -113,7 +115,7 @@ class OnePassAdam(torch.optim.Adam):
             self._squares = parameter, parameter._version, squares
             self._sums = np.concatenate([self._sums, sums])
 
-    _squares: tuple[torch.Tensor, int, np.ndarray] | None = None  # of the last tensor stepped by rows, and when
+    _squares: tuple[torch.Tensor, int, np.ndarray] | None = None  # of the last tensor stepped by rows, until it changes
 
     def _group_decay(self, group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
         """Decay of each column of a parameter with a penalty of groups."""
@@ -175,8 +177,8 @@ class Optimisation:
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to
             its "lr_end" to this power. 1 is what the methods' papers do in 30 000 steps; 0 leaves rates as they are.
         betas, eps: of Adam.
-        accumulate: views whose gradients are summed for one update; 1: every view has an update of its own.
-        accumulate_from: share of the run after which that begins.
+        accumulate: views whose gradients are summed for one update, rounded; 1: every view has an update of its own.
+        accumulate_from: share of the run, or of each of its rounds, after which that begins.
         decoupled: decay of opacities and sizes beside Adam, or None.
 
     Raises:
@@ -195,7 +197,7 @@ class Optimisation:
         decay: float = 1.0,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
-        accumulate: int = 1,
+        accumulate: float = 1,
         accumulate_from: float = 0.5,
         decoupled: DecoupledDecay | None = None,
     ) -> None:
@@ -207,7 +209,7 @@ class Optimisation:
         self.means, self.means_end, self.decay = means, means_end, decay
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps
-        self.accumulate, self.accumulate_from, self.decoupled = accumulate, accumulate_from, decoupled
+        self.accumulate, self.accumulate_from, self.decoupled = round(accumulate), accumulate_from, decoupled
 
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
         """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""
@@ -224,7 +226,7 @@ class Optimisation:
         ]
 
     def updates(self, step: int, progress: float) -> bool:
-        """Whether parameters change after ``step``, at which ``progress`` of the run is done; else its gradients wait."""
+        """Whether parameters change after ``step``, at which ``progress`` of its round is done; else its gradients wait."""
         return self.accumulate == 1 or progress < self.accumulate_from or (step + 1) % self.accumulate == 0
 
     def build(self, groups: list[dict[str, Any]], progress: Callable[[float], float]):
@@ -236,7 +238,6 @@ class Optimisation:
             progress: function of a step to the share of the decay that is done (``Schedule.round_progress``).
         """
         optimizer = OnePassAdam(groups, betas=self.betas, eps=self.eps, fused=True)
-        optimizer.takes_unwritten = self.accumulate == 1
         ends = [group.get("lr_end", 1.0) ** self.decay for group in optimizer.param_groups]
         progress = lru_cache(maxsize=1)(progress)  # all groups ask for the same step
         factors = [lambda step, end=end: end ** progress(step) for end in ends]

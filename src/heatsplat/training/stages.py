@@ -96,8 +96,8 @@ class Stages:
     def on_step(self, step: int, optimizer: torch.optim.Optimizer) -> Iterator[None]:
         """Runs a training step, from the render to the optimiser's update, with its parameters frozen.
 
-        Whole tensors get no gradient, so that nothing is computed for them and the optimiser passes them by. Columns of
-        a tensor are put back, with their moments, after the update.
+        Whole tensors get no gradient, so that nothing is computed for them and the optimiser passes them by; one that
+        waited for those of more views is forgotten. Columns of a tensor are put back, with their moments, after the update.
         """
         names = [name for freeze in self.freezes.values() if freeze.at(step) for name in freeze.groups]
         frozen = list(_found(names, optimizer))
@@ -109,6 +109,7 @@ class Stages:
         ]
         for parameter in whole:
             parameter.requires_grad_(False)
+            parameter.grad = None
         try:
             yield
         finally:
