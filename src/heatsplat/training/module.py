@@ -122,7 +122,6 @@ class SplatTraining(pl.LightningModule):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
-        self._penalised_views = 1  # views that the optimiser's penalties were last made for
         self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -199,7 +198,6 @@ class SplatTraining(pl.LightningModule):
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
     def configure_optimizers(self):
-        self._penalised_views = self.optim.views(0.0)
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
         groups += [
             {
@@ -208,7 +206,7 @@ class SplatTraining(pl.LightningModule):
                 "lr": item.lr * (self.optim.pace if item.paced else 1.0),
                 "lr_end": item.lr_end,
             }
-            | penalties(item, len(self.splats), self._penalised_views)
+            | penalties(item, len(self.splats))
             for name, item in self._declared.items()
         ]
         for name, parameter in self.thermal.named_parameters():
@@ -421,12 +419,10 @@ class SplatTraining(pl.LightningModule):
         self.density_change = change
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
-        views = self.optim.views(self.schedule.round_progress(step + 1))
-        if change is not None or views != self._penalised_views:
-            self._penalised_views = views
+        if change is not None:
             for group in inner.param_groups:
                 if group["name"] in self._declared:
-                    group |= penalties(self._declared[group["name"]], len(self.splats), views)
+                    group |= penalties(self._declared[group["name"]], len(self.splats))
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""

@@ -157,14 +157,11 @@ def _reciprocals(norms: torch.Tensor) -> torch.Tensor:
     return torch.where(norms > 0, 1 / norms, 0.0)
 
 
-def penalties(item: PerGaussian, count: int, views: int = 1) -> dict[str, float]:
-    """Options of a group of ``OnePassAdam`` that make the penalties of a tensor of ``count`` Gaussians.
-
-    They count once for each of the ``views`` whose gradients an update sums, as the loss does.
-    """
+def penalties(item: PerGaussian, count: int) -> dict[str, float]:
+    """Options of a group of ``OnePassAdam`` that make the penalties of a tensor of ``count`` Gaussians."""
     count = count if item.l2_mean else 1
-    group = {"group_penalty": views * item.group / math.sqrt(count)} if item.group > 0 else {}
-    return {"weight_decay": 2 * views * item.l2 / count} | group
+    group = {"group_penalty": item.group / math.sqrt(count)} if item.group > 0 else {}
+    return {"weight_decay": 2 * item.l2 / count} | group
 
 
 class Optimisation:
@@ -228,13 +225,9 @@ class Optimisation:
             for name, lr in rates.items()
         ]
 
-    def views(self, progress: float) -> int:
-        """Views whose gradients an update sums when ``progress`` of a round is done."""
-        return 1 if progress < self.accumulate_from else self.accumulate
-
     def updates(self, step: int, progress: float) -> bool:
         """Whether parameters change after ``step``, at which ``progress`` of its round is done; else its gradients wait."""
-        return (step + 1) % self.views(progress) == 0
+        return self.accumulate == 1 or progress < self.accumulate_from or (step + 1) % self.accumulate == 0
 
     def build(self, groups: list[dict[str, Any]], progress: Callable[[float], float]):
         """The optimiser over all groups, and the scheduler to call after every step.
