@@ -195,6 +195,7 @@ def pretender(garden, tmp_path):
 SETTINGS = {"train": str(ROOT / "src/train.py"), "cases": [[50, 24, 16]], "rounds": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="what cores a process has")
 def test_the_study_runs_both_and_writes_their_tables(garden, pretender, tmp_path):
     program, notes = pretender

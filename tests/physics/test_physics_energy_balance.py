@@ -201,7 +201,9 @@ def among(climate: Climate, name: str) -> Climate:
     return Climate(replace(climate.drivers, room=ROOM_K)) if "room" in name else climate
 
 
-@pytest.mark.parametrize("name", BEHIND)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if " and " in name else pytest.mark.slow) for name in BEHIND]
+)
 def test_what_lies_behind_surfaces_is_that_of_a_stiff_solver(climate, name):
     climate, surface = among(climate, name), bodies(wind=True)._replace(**BEHIND[name])
     full = course(climate.stepped_temperature, surface)
