@@ -31,7 +31,7 @@ def kind(settings: dict) -> str:
 def test_a_method_keeps_what_is_its_own_with_every_preset(method):
     """Its schedule is shares of the preset's steps, and none ends beyond them."""
     plain, own = compose([f"method={method}"]), (Path(CONF) / "method" / f"{method}.yaml").read_text()
-    for preset in ("draft", "balanced"):
+    for preset in PRESETS:
         config = compose([f"method={method}", f"preset={preset}"])
         if "stop" not in config["density"]:  # nothing grows: a field has no Gaussians
             continue
