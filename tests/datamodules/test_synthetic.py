@@ -79,7 +79,12 @@ def seen_points(preset: str) -> tuple[torch.Tensor, torch.Tensor]:
     return scene.nearest(tiny(preset).scene.points.double())
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+SLOW = {"moving_camera"}  # films each image as many
+
+
+@pytest.mark.parametrize(
+    "preset", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in PRESETS]
+)
 def test_the_same_arguments_give_the_same_bits(preset):
     first, again = recorded(preset), film(Scene(PRESETS[preset]), SMALL)
     torch.set_num_threads(2)
