@@ -98,12 +98,13 @@ class Work:
         }
 
 
-def step_floors(work: Work, machine: Machine, frequencies: int, parameters: int) -> dict[str, Any]:
+def step_floors(work: Work, machine: Machine, frequencies: int, parameters: int, together: int = 1) -> dict[str, Any]:
     """Floor of each part of a training step in milliseconds; torch and Lightning have none.
 
     Args:
         frequencies: of a Gaussian's heat source; 0 where there is none.
         parameters: numbers that the optimiser moves.
+        together: steps that it moves them after.
     """
     vectors = -(-frequencies // LANES)
     return work.floors(machine) | {
@@ -111,5 +112,5 @@ def step_floors(work: Work, machine: Machine, frequencies: int, parameters: int)
         "thermal": machine.milliseconds(
             (RESPONSES + RESPONSES_BACKWARD) * vectors * work.visible, 3 * 2 * frequencies * work.visible
         ),
-        "optimiser": machine.milliseconds(ADAM * parameters / LANES, 7 * parameters),
+        "optimiser": machine.milliseconds(ADAM * parameters / LANES, 7 * parameters) / together,
     }

@@ -35,6 +35,7 @@ def run(
     rounds: int,
     threads: Sequence[int],
     methods: dict[str, Sequence[str]],
+    views: Sequence[int] = (1,),
 ) -> dict[str, list[Row]]:
     """Rows by table, which are also written as CSV and as steps.md.
 
@@ -42,13 +43,18 @@ def run(
         output_dir: folder of the results.
         cases, steps, rounds, methods: see ``steps.training_rows``; ``rounds`` times ten for the pairs.
         threads: counts of threads; pairs take the first.
+        views: counts of views that one update follows.
     """
     output_dir = Path(output_dir)
     output_dir.mkdir(parents=True, exist_ok=True)
     tables: dict[str, list[Row]] = {"training": [], "fused": []}
     for count in threads:
         machine = Machine(vector_rate(count), memory_rate(count))
-        tables["training"] += training_rows(machine, count, cases, steps, rounds, methods, output_dir)
+        for each in views:
+            runs = {
+                name: [*says, f"optim.accumulate={each}", "optim.accumulate_from=0"] for name, says in methods.items()
+            }
+            tables["training"] += training_rows(machine, count, cases, steps, rounds, runs, output_dir)
     set_threads(threads[0])
     for n, w, h in cases:
         for what, pair in PAIRS.items():

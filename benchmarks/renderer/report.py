@@ -66,7 +66,9 @@ def _markdown(tables: dict[str, list[Row]], machines: dict[int, Machine]) -> str
 def training_table(rows: list[Row]) -> list[str]:
     """Parts down, runs across; floors in brackets."""
     parts = [key.removesuffix("_ms") for key in rows[0] if key.endswith("_ms") and not key.startswith("floor_")]
-    columns = ["part", *(f"{row['case']}, {row['method']}, {row['threads']} thr." for row in rows)]
+    heads = (f"{row['case']}, {row['method']}, {row['threads']} thr." for row in rows)
+    each = ("" if row["views"] == 1 else f", {row['views']} views an update" for row in rows)
+    columns = ["part", *map("".join, zip(heads, each, strict=True))]
     body = []
     for part in parts:
         floors = [row[f"floor_{part}_ms"] for row in rows]

@@ -7,6 +7,7 @@ timed by standing a clock before the kernels that they call.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import time
@@ -84,11 +85,12 @@ def still_scene(scene: dict[str, Any]) -> SceneData:
 class StepClock:
     """Seconds of the parts of each step: of the functions it stands before, while it is entered.
 
-    A step lasts from one call of ``training_step`` to the next.
+    A step lasts from one call of ``training_step`` to the next. Where an update follows several steps (``optim.accumulate``),
+    those of one update are taken together.
     """
 
     def __init__(self, module: Any) -> None:
-        self.module = module
+        self.module, self.together = module, module.optim.accumulate
         self.steps: list[dict[str, float]] = []
         self._patches = ExitStack()
 
@@ -120,7 +122,7 @@ class StepClock:
         self._patches.enter_context(patch.object(owner, name, timed))
 
     def milliseconds(self) -> dict[str, float]:
-        """Of the whole step and its parts, which add up to it: means over the quickest quarter of the steps.
+        """Of the whole step and its parts, which add up to it: means over the quickest quarter of the updates.
 
         "torch" is what the module does besides its kernels: activations, autograd, statistics. "Lightning" is what is
         left: the loop, its hooks and guards, the data loader, the schedule of learning rates.
@@ -132,16 +134,22 @@ class StepClock:
             parts["torch"] = sum(step.get(f"module.{name}", 0.0) for name in MODULE) - kernels
             whole = after["start"] - step["start"]
             steps.append({"step": whole} | parts | {"Lightning": whole - sum(parts.values())})
-        steps.sort(key=lambda parts: parts["step"])
-        quick = steps[: max(1, len(steps) // 4)]
-        return {name: 1e3 * sum(parts[name] for parts in quick) / len(quick) for name in quick[0]}
+        return {name: 1e3 * value for name, value in self._quick(steps).items()}
 
     def processor(self) -> float:
         """Milliseconds that all threads together took of the processor for a step, mean over the quickest quarter."""
         starts = [step["processor"] for step in self.steps[WARM_UP:]]
-        took = sorted(after - before for before, after in zip(starts, starts[1:], strict=False))
-        quick = took[: max(1, len(took) // 4)]
-        return 1e3 * sum(quick) / len(quick)
+        took = [{"step": after - before} for before, after in itertools.pairwise(starts)]
+        return 1e3 * self._quick(took)["step"]
+
+    def _quick(self, steps: Sequence[dict[str, float]]) -> dict[str, float]:
+        """Means over the steps of the quickest quarter of the updates; steps that wait for one at the end are left out."""
+        each = self.together
+        updates = [steps[k : k + each] for k in range(0, len(steps) - each + 1, each)] or [steps]
+        means = [{name: sum(step[name] for step in these) / len(these) for name in these[0]} for these in updates]
+        means.sort(key=lambda parts: parts["step"])
+        quick = means[: max(1, len(means) // 4)]
+        return {name: sum(parts[name] for parts in quick) / len(quick) for name in quick[0]}
 
 
 @dataclass(frozen=True)
@@ -152,6 +160,7 @@ class Steps:
     processor: float
     frequencies: int
     parameters: int
+    together: int
 
 
 def time_steps(overrides: Sequence[str], scene: dict[str, Any], steps: int, output_dir: Path) -> Steps:
@@ -180,6 +189,7 @@ def time_steps(overrides: Sequence[str], scene: dict[str, Any], steps: int, outp
         clock.processor(),
         frequencies,
         sum(parameter.numel() for parameter in module.parameters()),
+        clock.together,
     )
 
 
@@ -225,8 +235,8 @@ def training_rows(
             best = min(results, key=lambda result: result.milliseconds["step"])
             found = {"wall": best.milliseconds["step"], "processor": min(result.processor for result in results)}
             baseline = baseline or found
-            floors = step_floors(work, machine, best.frequencies, best.parameters)
-            row = {"case": case.name, "method": name, "threads": threads}
+            floors = step_floors(work, machine, best.frequencies, best.parameters, best.together)
+            row = {"case": case.name, "method": name, "threads": threads, "views": best.together}
             row |= {"ratio": found["wall"] / baseline["wall"], "processor": found["processor"]}
             row |= {"processor_ratio": found["processor"] / baseline["processor"]}
             row |= {f"{part}_ms": value for part, value in best.milliseconds.items()}

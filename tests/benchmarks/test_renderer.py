@@ -69,7 +69,9 @@ def test_the_study_of_steps_tells_ratios(tmp_path):
     overrides = ["study=steps", "study.cases=[[500,64,48]]", "study.steps=8", "study.rounds=1", "study.threads=[1]"]
     config = compose_run(tmp_path, *overrides, config_name="study")
     tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
-    assert [row["method"] for row in tables["training"]] == ["3dgs", "etgs"] and tables["training"][0]["ratio"] == 1
+    found = [(row["method"], row["views"]) for row in tables["training"]]
+    assert found == [("3dgs", 1), ("etgs", 1), ("3dgs", 8), ("etgs", 8)]
+    assert tables["training"][0]["ratio"] == tables["training"][2]["ratio"] == 1
     assert [row["ratio"] > 0 for row in tables["fused"]] == [True] * 3
     assert "etgs" in (tmp_path / "steps.md").read_text()
 
