@@ -138,6 +138,7 @@ CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
 }
 # Strengths of effects, in standard deviations of the noise of a pixel, between which verdicts are counted together.
 STRENGTHS = (0.0, 1.0, 3.0, 10.0, 30.0, math.inf)
+LEAST_RIGHT, MOST_WRONG = 95.0, 1.0  # hundredths of the verdicts on scenes that are drawn at random
 MISSED, TAKEN, UNTOLD = (attrgetter(name) for name in ("missed", "taken", "untold"))
 COLUMNS = ("effect", "stage", "what it is", "source", "needs", "null hypothesis", "threshold", "adds")
 
@@ -336,7 +337,11 @@ def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
         if these:
             rows.append((condition, len(these), *_shares(these)))
     head = ("recording", "scenes", "right %", "cannot be told %", "wrong %")
-    return [*_by_effect(title, outcomes), *markdown_table(head, rows), *_by_strength(outcomes)]
+    right, _, wrong = map(float, _shares(outcomes))
+    reached = "is reached" if right >= LEAST_RIGHT and wrong <= MOST_WRONG else "is not reached"
+    goal = f"The goal of {LEAST_RIGHT:g} % right and at most {MOST_WRONG:g} % wrong {reached}. "
+    goal += "Verdicts on effects whose metadata are missing count as right.\n"
+    return [*_by_effect(title, outcomes, goal), *markdown_table(head, rows), *_by_strength(outcomes)]
 
 
 def groups_by_strength(outcomes: Sequence[Outcome]) -> list[tuple[float, float, int, int, int, int]]:
@@ -395,8 +400,8 @@ def _shares(outcomes: Sequence[Outcome]) -> tuple[str, str, str]:
     return tuple(f"{100 * count / cases:.1f}" for count in (cases - untold - wrong, untold, wrong))
 
 
-def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """How verdicts and truth agree in words, and a table by effect."""
+def _by_effect(title: str, outcomes: Sequence[Outcome], goal: str = "") -> list[str]:
+    """How verdicts and truth agree in words, of which the last are the ``goal``, and a table by effect."""
     right, untold, wrong = _shares(outcomes)
     clean = sum(outcome.wrong == 0 for outcome in outcomes)
     seconds = sorted(outcome.seconds for outcome in outcomes)[len(outcomes) // 2]
@@ -421,6 +426,7 @@ def _by_effect(title: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"Of {len(outcomes) * len(CATALOGUE)} verdicts {right} % are right, {untold} % cannot be told, {wrong} % are "
         f"wrong ({len(sought)} verdicts concern effects whose metadata are present). {clean} of {len(outcomes)} scenes have no "
         f"wrong verdict. A scene's verdicts took {seconds:.1f} s of processor time (median).\n",
+        *([goal] if goal else []),
         *markdown_table(head, rows),
         "",
     ]

@@ -92,6 +92,9 @@ def test_verdicts_are_counted_by_the_strength_of_effects():
         (0.0, 1.0, 0, 1, 0, 0), (1.0, 3.0, 0, 0, 1, 1), (30.0, math.inf, 1, 0, 0, 0),
     ]  # fmt: skip
     text = written([outcome], drawn={"all": range(1)})
+    assert (
+        "The goal of 95 % right and at most 1 % wrong is not reached." in text
+    )  # two of 24 are undecided, one is missed
     assert "| 1 to 3 | 2 | 0 | 0 | 50 | 50 |" in text and "| 30 and more | 1 | 100 | 0 | 0 | 0 |" in text
     assert picture([outcome]) is not None and picture([]) is None
 

@@ -111,6 +111,17 @@ def test_what_waited_for_more_views_is_forgotten_when_it_is_frozen():
     assert unmoved == {"sh0", "sh_rest"}
 
 
+def test_a_frozen_column_gathers_nothing_for_the_next_update():
+    optimizer = optimizer_of()
+    (opacities,) = next(group["params"] for group in optimizer.param_groups if group["name"] == "opacity_logits")
+    stages = Stages({"opacity": Freeze(["opacity_logits[1]"], stop=2)})
+    opacities.grad = torch.ones_like(opacities)  # waits for more views
+    for step in range(2):
+        with stages.on_step(step, optimizer):
+            opacities.grad += 1.0
+    assert opacities.grad[:, 0].eq(3.0).all() and opacities.grad[:, 1].eq(0.0).all()
+
+
 @pytest.mark.parametrize("warm", [0, 3])
 def test_a_column_is_frozen_alone(warm):
     optimizer = optimizer_of(weight_decay=0.1)

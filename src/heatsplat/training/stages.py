@@ -97,7 +97,8 @@ class Stages:
         """Runs a training step, from the render to the optimiser's update, with its parameters frozen.
 
         Whole tensors get no gradient, so that nothing is computed for them and the optimiser passes them by; one that
-        waited for those of more views is forgotten. Columns of a tensor are put back, with their moments, after the update.
+        waited for those of more views is forgotten. Columns of a tensor are put back, with their moments, after the update, and
+        what they gathered is forgotten, too.
         """
         names = [name for freeze in self.freezes.values() if freeze.at(step) for name in freeze.groups]
         frozen = list(_found(names, optimizer))
@@ -139,9 +140,11 @@ def _columns(parameter: Tensor, column: int, optimizer: torch.optim.Optimizer) -
 
 
 def _put_back(parameter: Tensor, column: int, before: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> None:
-    """Writes a column of a parameter and of its moments; moments that were missing become zero."""
+    """Writes a column of a parameter and of its moments; moments that were missing, and its gradient, become zero."""
     with torch.no_grad():
         parameter[:, column] = before[""]
+        if parameter.grad is not None:
+            parameter.grad[:, column] = 0.0
         for key, value in optimizer.state.get(parameter, {}).items():
             if value.shape == parameter.shape:
                 value[:, column] = before.get(key, 0.0)
