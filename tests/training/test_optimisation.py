@@ -145,6 +145,18 @@ def test_longer_runs_sum_the_gradients_of_more_views(steps, views):
     assert composition.build(papers["optim"]).accumulate == 1
 
 
+@pytest.mark.parametrize("length", [1500, 30000])
+def test_centres_keep_a_tenth_of_their_rate_and_with_the_papers_settings_a_hundredth(length):
+    for recipe, end in (([], 0.1), (["recipe=published"], 0.01)):
+        settings = composition.build(composition.compose([f"max_steps={length}", *recipe])["optim"])
+        cloud = splats(4)
+        optimizer, scheduler = build(cloud, settings)
+        means = optimizer.param_groups[0]
+        first = means["lr"]
+        steps(cloud, optimizer, scheduler, 0, 100)
+        assert means["lr"] == pytest.approx(end * first)
+
+
 def test_shorter_runs_learn_faster_as_a_power_of_their_length():
     cloud = splats(4)
     papers = {group["name"]: group["lr"] for group in Optimisation().geometry_groups(cloud, 2.0)}
