@@ -122,7 +122,7 @@ class Cloud:
             self._replace(
                 name,
                 lambda tensor, new=new: torch.cat([tensor, new.to(tensor)]),
-                lambda moment, new=new: torch.cat([moment, moment.new_zeros(new.shape)]),
+                lambda moment, new=new: torch.cat([moment, moment.new_zeros(len(new), *moment.shape[1:])]),
             )
         for name, tensor in self.state.items():
             self.state[name] = torch.cat([tensor, tensor.new_zeros(count, *tensor.shape[1:])])
@@ -157,6 +157,8 @@ class Cloud:
             rows = ids if places is None else places[ids][places[ids] >= 0]
             for moment in self._moments(parameter).values():
                 moment[rows] = 0
+            if hasattr(parameter, "unwritten"):
+                parameter.unwritten.change_rows(lambda numbers, rows=rows: numbers.index_fill(0, rows, 0))
         for statistic in self.state.values():
             statistic[ids] = 0
 
@@ -187,6 +189,9 @@ class Cloud:
         new = nn.Parameter(change(old.detach()).contiguous(), requires_grad=old.requires_grad)
         if old.grad is not None:
             new.grad = change_moment(old.grad).contiguous()
+        if hasattr(old, "unwritten"):
+            old.unwritten.change_rows(change_moment)
+            new.unwritten = old.unwritten
         self.splats.raw[name] = new
         if self.optimizer is None:
             return

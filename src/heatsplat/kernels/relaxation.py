@@ -3,9 +3,9 @@
 The plain-torch twin, which also says what the symbols mean, is heatsplat.physics.relaxation (``temperature`` and
 ``response_slope``); heatsplat.physics.fused drives these kernels. Lanes are frequencies. ``forward`` reads a Gaussian's row
 of gains and finds values and slopes in one go, so that ``backward`` needs no gains. The gradient of a row of gains is one
-number times the responses of its Gaussian: ``write_gains`` writes it out, ``step_gains`` is Adam's step with it, which reads
-and writes gains and moments once and the gradient never. Every row is computed and written by one thread and sums are
-ordered, so results do not depend on the number of threads.
+number times the responses of its Gaussian: ``write_gains`` writes it out, summed over views, ``step_gains`` is Adam's step
+with it, which reads and writes gains and moments once and the gradient never. Every row is computed and written by one
+thread and sums are ordered, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -55,6 +55,9 @@ SCRATCH_ROWS = 14
 # Rows of what ``forward`` leaves for ``backward``: slopes of the value, and the rate that was used.
 BY_RATE, BY_INITIAL, BY_AMBIENT, BY_SCALE, USED_RATE = range(5)
 SLOPES = 5
+
+# Rows of what ``backward`` leaves of the gradient of gains.
+RATES, PULLS = 0, 1
 
 _f = np.float32
 _LARGEST_RATE = _f(1e18)  # its square still fits
@@ -304,7 +307,7 @@ def forward(rate, bounds, initial, ambient, gains, places, scale, ids, time, lim
 
 @inline
 def _backward_block(
-    block, ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls
+    block, ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, rows
 ):  # fmt: skip
     """``backward`` of BLOCK Gaussians."""
     ambient_sum = _f(0.0)  # becomes a double among doubles
@@ -317,16 +320,16 @@ def _backward_block(
         if scale.shape[0] > 0:
             v_scale[row] = v * slopes[BY_SCALE, j]
             pull = pull * scale[row]
-        if row_pulls.shape[0] > 0:
+        if rows.shape[1] > 0:
             place = places[row] if places.shape[0] > 0 else row
             if place >= 0:
-                row_rates[place] = slopes[USED_RATE, j]
-                row_pulls[place] = pull
+                rows[RATES, place] = slopes[USED_RATE, j]
+                rows[PULLS, place] = pull
     v_ambient[block] = ambient_sum
 
 
 @kernel
-def backward(ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls):
+def backward(ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, rows):
     """Writes the rows ``ids`` of the gradients; ids must not repeat.
 
     Args:
@@ -334,26 +337,26 @@ def backward(ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_am
         v_values: [n] gradient of the values.
         v_rate, v_initial, v_scale: outputs, shaped as what they are gradients of.
         v_ambient: [blocks] output, a sum for each block of Gaussians.
-        row_rates, row_pulls: [M] outputs, of each row of gains that is seen the rate of its Gaussian and what its responses
-            are multiplied by for the gradient; or empty where there are no gains.
+        rows: [2, M] output, of each row of gains that is seen the rate of its Gaussian (RATES) and what its responses
+            are multiplied by for the gradient (PULLS); or [2, 0] where there are no gains.
     """
     parallel_for(
         _backward_block, v_ambient.shape[0],
-        (ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, row_rates, row_pulls),
+        (ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_ambient, v_scale, rows),
     )  # fmt: skip
 
 
 @inline
-def _fill_rows(block, row_rates, row_pulls, time, scratch):
-    """Rates, and functions of y = at, of a block of rows of gains; how many rows it has, and whether any is seen."""
+def _fill_rows(block, view, rows, time, scratch):
+    """Rates, and functions of y = at, of a block of rows of gains; how many rows it has, and whether the view sees any."""
     start = block * BLOCK
-    count, seen = min(BLOCK, row_rates.shape[0] - start), False
+    count, seen = min(BLOCK, rows.shape[2] - start), False
     for j in range(count):
-        scratch[RATE, j] = row_rates[start + j]
-        seen = seen or row_pulls[start + j] != 0
+        scratch[RATE, j] = rows[view, RATES, start + j]
+        seen = seen or rows[view, PULLS, start + j] != 0
     if seen:
         _fill_functions(count, time, scratch)
-    return count
+    return count, seen
 
 
 @inline
@@ -367,47 +370,53 @@ def _row_gradient(pull, j, k, time, table, scratch):
 
 
 @inline
-def _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, out, place):
-    """Writes the gradient of a block's rows from ``place`` of ``out`` on, which has room for a vector after them."""
-    count = _fill_rows(block, row_rates, row_pulls, time, scratch)
-    for j in range(count):
-        pull = row_pulls[block * BLOCK + j]
-        for k in range(0, frequencies, LANES):  # whole vectors, of which the next one overwrites what is too much
-            by_sine, by_cosine = filled(scratch, 0.0), filled(scratch, 0.0)
-            if pull != 0:
-                by_sine, by_cosine = _row_gradient(pull, j, k, time, table, scratch)
-            store_columns(out, place + k, (by_sine,), frequencies - k)
-            store_columns(out, place + frequencies + k, (by_cosine,), frequencies - k)
-        place += 2 * frequencies
+def _sum_rows(block, rows, times, tables, frequencies, scratch, out, place):
+    """Writes the gradient of a block's rows, summed over views, from ``place`` of ``out`` on; how many rows it has."""
+    count, begin = min(BLOCK, rows.shape[2] - block * BLOCK), place
+    for k in range(0, count * 2 * frequencies, LANES):
+        store_columns(out, begin + k, (filled(scratch, 0.0),), count * 2 * frequencies - k)
+    for view in range(rows.shape[0]):
+        if not _fill_rows(block, view, rows, times[view], scratch)[1]:
+            continue
+        for j in range(count):
+            pull, place = rows[view, PULLS, block * BLOCK + j], begin + j * 2 * frequencies
+            for k in range(0, frequencies if pull != 0 else 0, LANES):
+                by_sine, by_cosine = _row_gradient(pull, j, k, times[view], tables[view], scratch)
+                rest = frequencies - k
+                (sine,), (cosine,) = (
+                    load_columns(out, place + k, 1, rest),
+                    load_columns(out, place + frequencies + k, 1, rest),
+                )
+                store_columns(out, place + k, (sine + by_sine,), rest)
+                store_columns(out, place + frequencies + k, (cosine + by_cosine,), rest)
     return count
 
 
 @inline
-def _write_block(block, row_rates, row_pulls, time, table, v_gains):
+def _write_block(block, rows, times, tables, v_gains):
     """``write_gains`` of BLOCK rows."""
     scratch, frequencies = np.empty((SCRATCH_ROWS, BLOCK), v_gains.dtype), v_gains.shape[2]
-    place = block * BLOCK * 2 * frequencies
-    _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, v_gains, place)
+    _sum_rows(block, rows, times, tables, frequencies, scratch, v_gains, block * BLOCK * 2 * frequencies)
 
 
 @kernel
-def write_gains(row_rates, row_pulls, time, table, v_gains):
-    """Writes the gradient of gains [M, 2, K]: all rows, zeros where a row pulls nowhere.
+def write_gains(rows, times, tables, v_gains):
+    """Writes the gradient of gains [M, 2, K], summed over views: all rows, zeros where no view pulls.
 
     Args:
-        row_rates, row_pulls: [M] of ``backward``.
-        time, table: of ``forward``.
+        rows: [views, 2, M], RATES and PULLS of ``backward``.
+        times, tables: [views], [views, TABLE_ROWS, padded K], of ``forward``.
         v_gains: output.
     """
-    parallel_for(_write_block, (row_rates.shape[0] + BLOCK - 1) // BLOCK, (row_rates, row_pulls, time, table, v_gains))
+    parallel_for(_write_block, (rows.shape[2] + BLOCK - 1) // BLOCK, (rows, times, tables, v_gains))
 
 
 @inline
-def _step_block(block, row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares):
+def _step_block(block, rows, times, tables, gains, first, second, decay, rates, sums, squares):
     """``step_gains`` of BLOCK rows."""
     scratch, frequencies = np.empty((SCRATCH_ROWS, BLOCK), gains.dtype), gains.shape[2]
-    gradient = np.empty(BLOCK * 2 * frequencies + LANES, gains.dtype)  # stays in the first cache
-    count = _write_rows(block, row_rates, row_pulls, time, table, frequencies, scratch, gradient, 0)
+    gradient = np.empty(BLOCK * 2 * frequencies, gains.dtype)  # stays in the first cache
+    count = _sum_rows(block, rows, times, tables, frequencies, scratch, gradient, 0)
     begin, numbers, period = block * BLOCK * 2 * frequencies, count * 2 * frequencies, decay.shape[0]
     added, phase = filled(scratch, 0.0), 0
     for k in range(0, numbers, LANES):
@@ -425,11 +434,11 @@ def _step_block(block, row_rates, row_pulls, time, table, gains, first, second, 
 
 
 @kernel
-def step_gains(row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares):
+def step_gains(rows, times, tables, gains, first, second, decay, rates, sums, squares):
     """Adam's step of gains [M, 2, K] with the gradient that ``write_gains`` would write; float32.
 
     Args:
-        row_rates, row_pulls, time, table: of ``write_gains``.
+        rows, times, tables: of ``write_gains``.
         gains, first, second: the gains and their moments.
         decay: weight decay of each frequency, as often as it takes to be whole vectors.
         rates: [5], a row of what ``adam.step`` takes.
@@ -438,5 +447,5 @@ def step_gains(row_rates, row_pulls, time, table, gains, first, second, decay, r
     """
     parallel_for(
         _step_block, sums.shape[0],
-        (row_rates, row_pulls, time, table, gains, first, second, decay, rates, sums, squares),
+        (rows, times, tables, gains, first, second, decay, rates, sums, squares),
     )  # fmt: skip

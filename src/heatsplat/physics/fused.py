@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -133,37 +134,68 @@ _gain_gradients = {dtype: _SpareMemory(plain) for dtype, plain in NUMPY_TYPES.it
 
 
 class Unwritten:
-    """A gradient of gains [M, 2, K] that nobody has written out: of each row, one number times the responses to its rate.
+    """A gradient of gains [M, 2, K] that nobody has written out: of each view and row, one number times its responses.
 
-    A leaf with the attribute ``unwritten`` (a list) gets its gradient in there in place of ``grad``; so an optimiser asks
-    for it that steps the gains with it (``step``). Everybody else finds in ``grad`` what ``written`` gives.
+    A leaf that has one as its attribute ``unwritten`` gets its gradients there in place of ``grad``, those of several views
+    one beside the other; so an optimiser asks for them that steps the gains with them (``step``). Everybody else finds in
+    ``grad`` what ``written`` gives.
     """
 
-    def __init__(self, rates: Tensor, pulls: Tensor, time: np.floating, table: np.ndarray, frequencies: int) -> None:
-        self._rows = rates.numpy(), pulls.numpy(), time, table
-        self._shape = torch.Size((len(rates), 2, frequencies))
-        self._count = len(rates)
+    def __init__(self) -> None:
+        self._views: list[tuple[Tensor, np.floating, np.ndarray]] = []
 
-    def written(self) -> Tensor:
-        """The gradient, [M, 2, K]; zeros in rows out of view."""
-        rates = self._rows[0]
-        v_gains = _gain_gradients[torch.from_numpy(rates).dtype].take(self._shape)
-        with kernels.threads_for(self._count):
-            kernels.write_gains(*self._rows, v_gains.numpy())
+    def __len__(self) -> int:
+        """Number of views."""
+        return len(self._views)
+
+    def add(self, rows: Tensor, time: np.floating, table: np.ndarray) -> None:
+        """Adds a view: what ``kernels.backward`` left, at a time with its table of frequencies."""
+        self._views.append((rows, time, table))
+
+    def clear(self) -> None:
+        """Forgets all views."""
+        self._views = []
+
+    def change_rows(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Follows gains whose rows come, go or are forgotten: ``change`` is given tensors [M, 2] of numbers of the rows."""
+        self._views = [(change(rows.T).T.contiguous(), time, table) for rows, time, table in self._views]
+
+    def written(self, shape: torch.Size) -> Tensor:
+        """The gradient of all views, of the gains' ``shape``; zeros in rows out of view."""
+        v_gains = _gain_gradients[self._views[0][0].dtype].take(shape)
+        with kernels.threads_for(len(v_gains)):
+            kernels.write_gains(*self._arrays(), v_gains.numpy())
         return v_gains
 
     def step(
         self, gains: Tensor, first: Tensor, second: Tensor, decay: np.ndarray, rates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Adam's step of the gains in place; sums of what was written, and of its squares by column [.., K] (step_gains)."""
-        blocks = -(-self._count // kernels.BLOCK)
-        sums, squares = np.empty(blocks, np.float32), np.empty((blocks, self._shape[2]), np.float32)
+        blocks = -(-len(gains) // kernels.BLOCK)
+        sums, squares = np.empty(blocks, np.float32), np.empty((blocks, gains.shape[2]), np.float32)
         tensors = [tensor.detach().numpy() for tensor in (gains, first, second)]
-        with kernels.threads_for(self._count):
-            kernels.step_gains(*self._rows, *tensors, np.tile(decay, LANES), rates, sums, squares)
+        with kernels.threads_for(len(gains)):
+            kernels.step_gains(*self._arrays(), *tensors, np.tile(decay, LANES), rates, sums, squares)
         return sums, squares
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """The views as tensors, for a checkpoint; ``load_state_dict`` takes them back."""
+        return {name: torch.from_numpy(array) for name, array in zip(_STATE, self._arrays(), strict=True)}
 
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Puts the views of a checkpoint in place of its own."""
+        rows, times, tables = (state[name] for name in _STATE)
+        self._views = list(zip(rows, times.numpy(), tables.numpy(), strict=True))
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, times and tables of all views, as ``write_gains`` takes them."""
+        rows, times, tables = zip(*self._views, strict=True)
+        if len(rows) == 1:
+            return rows[0].numpy()[None], np.array(times), tables[0][None]
+        return torch.stack(rows).numpy(), np.array(times), np.stack(tables)
+
+
+_STATE = ("rows", "times", "tables")
 _NO_SLOPES = {kind: np.empty((0, 0), kind) for kind in NUMPY_TYPES.values()}
 
 
@@ -205,22 +237,21 @@ class _VisibleTemperature(torch.autograd.Function):
         wanted = ctx.needs_input_grad
         v_initial, v_rate, v_scale = (torch.zeros_like(x) for x in (initial, rate, scale))
         v_ambient = rate.new_empty(-(-ids.shape[0] // kernels.BLOCK))
-        rates, pulls = rate.new_zeros(2, gains.shape[0] if wanted[5] and gains.numel() > 0 else 0)
+        rows = rate.new_zeros(2, gains.shape[0] if wanted[5] and gains.numel() > 0 else 0)
         arrays = [x.detach().contiguous().numpy() for x in (ids, places, scale, v_values)]
         ids, places, scale, v_values = arrays
-        outputs = [x.numpy() for x in (v_rate, v_initial, v_ambient, v_scale, rates, pulls)]
+        outputs = [x.numpy() for x in (v_rate, v_initial, v_ambient, v_scale, rows)]
         with kernels.threads_for(len(ids)):
             kernels.backward(ids, places, scale, ctx.time, ctx.slopes, v_values, *outputs)
         v_gains = None
         if wanted[5]:
             v_gains = torch.zeros_like(gains) if gains.numel() == 0 else None
-        if len(rates) > 0:
-            unwritten = Unwritten(rates, pulls, ctx.time, ctx.table, gains.shape[2])
-            box = getattr(gains, "unwritten", None)
-            if box is None:
-                v_gains = unwritten.written()
-            else:
-                box.append(unwritten)
+        if rows.numel() > 0:
+            waiting = getattr(gains, "unwritten", None)
+            unwritten = Unwritten() if waiting is None else waiting
+            unwritten.add(rows, ctx.time, ctx.table)
+            if waiting is None:
+                v_gains = unwritten.written(gains.shape)
         v_ambient = v_ambient.sum() if wanted[1] else None
         v_scale = v_scale if wanted[6] else None
         return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None, None

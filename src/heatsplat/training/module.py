@@ -28,7 +28,7 @@ from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation, penalties
+from heatsplat.training.optimisation import Optimisation, load_waiting, penalties, waiting
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -122,7 +122,7 @@ class SplatTraining(pl.LightningModule):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
-        self._waiting: dict[str, Tensor] = {}  # gradients of a checkpoint that was written between two updates
+        self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
@@ -233,8 +233,7 @@ class SplatTraining(pl.LightningModule):
     # One step ----------------------------------------------------------------------------------------
 
     def on_train_start(self) -> None:
-        for name, gradient in self._waiting.items():
-            self.get_parameter(name).grad = gradient.to(self.device)
+        load_waiting(self, self._waiting)
         self._waiting = {}
         self._stop_at_the_end()
 
@@ -392,9 +391,8 @@ class SplatTraining(pl.LightningModule):
     def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
         step = self.global_step
         if step == 0 or self._updates(step - 1):
-            # Gradients that are added up, or that Lightning clips, have to be in grad.
             inner = getattr(optimizer, "optimizer", optimizer)
-            inner.takes_unwritten = self._updates(step) and not self.trainer.gradient_clip_val
+            inner.takes_unwritten = not self.trainer.gradient_clip_val  # what Lightning clips has to be in grad
             optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
@@ -539,8 +537,7 @@ class SplatTraining(pl.LightningModule):
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
         if self.global_step > 0 and not self._updates(self.global_step - 1):
-            gradients = ((name, parameter.grad) for name, parameter in self.named_parameters())
-            checkpoint[CHECKPOINT_KEY]["gradients"] = {name: grad.cpu() for name, grad in gradients if grad is not None}
+            checkpoint[CHECKPOINT_KEY] |= waiting(self)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -553,7 +550,7 @@ class SplatTraining(pl.LightningModule):
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
-        self._waiting = checkpoint[CHECKPOINT_KEY].get("gradients", {})
+        self._waiting = checkpoint[CHECKPOINT_KEY]
         state = checkpoint[CHECKPOINT_KEY]["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from heatsplat.kernels import adam as kernel
 from heatsplat.kernels.simd import LANES
+from heatsplat.physics.fused import Unwritten
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian
 from heatsplat.training.decoupled import DecoupledDecay
@@ -28,8 +30,8 @@ class OnePassAdam(torch.optim.Adam):
     A group may have one more option, "group_penalty": the weight of a penalty Σ_k √(Σ_i x_ik²) over the columns k of the
     last dimension of its tensors. Its gradient is that of a weight decay of weight / √(Σ_i x_ik²), and is added like that.
 
-    From ``zero_grad`` to ``step`` parameters take gradients that are not written out (``physics.fused.Unwritten``), unless
-    ``takes_unwritten`` is False: then all gradients are in ``grad``, where those of several views add up.
+    From ``zero_grad`` to ``step`` parameters take gradients that are not written out, those of several views, too, as their
+    attribute ``unwritten`` (``physics.fused.Unwritten``), unless ``takes_unwritten`` is False: then all are in ``grad``.
     """
 
     takes_unwritten = True
@@ -45,7 +47,7 @@ class OnePassAdam(torch.optim.Adam):
             for parameter in group["params"]:
                 parameter.grad = None
                 if self.takes_unwritten and _fits_kernel(parameter):
-                    parameter.unwritten = []
+                    parameter.unwritten = Unwritten()
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -57,19 +59,19 @@ class OnePassAdam(torch.optim.Adam):
         stepped, by_rows = [], []
         for group in self.param_groups:
             for x in group["params"]:
-                box = x.__dict__.pop("unwritten", None)
-                if box and x.grad is None and len(box) == 1:
-                    by_rows.append((group, x, box[0]))
+                unwritten = x.__dict__.pop("unwritten", None)
+                if unwritten and x.grad is None:
+                    by_rows.append((group, x, unwritten))
                     continue
-                for unwritten in box or ():
-                    x.grad = unwritten.written() if x.grad is None else x.grad + unwritten.written()
+                if unwritten:
+                    x.grad += unwritten.written(x.shape)
                 if x.grad is not None:
                     stepped.append((group, x))
         if all(_fits_kernel(x) and x.grad.dtype == x.dtype for _, x in stepped):
             self._step_in_kernel(stepped, by_rows)
         else:
             for group, x, unwritten in by_rows:
-                x.grad = unwritten.written()
+                x.grad = unwritten.written(x.shape)
                 stepped.append((group, x))
             for group, x in stepped:
                 if group.get("group_penalty"):
@@ -83,7 +85,7 @@ class OnePassAdam(torch.optim.Adam):
     def _step_in_kernel(
         self,
         stepped: list[tuple[dict[str, Any], torch.Tensor]],
-        by_rows: list[tuple[dict[str, Any], torch.Tensor, Any]],
+        by_rows: list[tuple[dict[str, Any], torch.Tensor, Unwritten]],
     ) -> None:
         tensors, rates, kept, tasks = [], [], [], 0
         decays = [np.array([group["weight_decay"] for group, _ in stepped], np.float32).repeat(LANES)]
@@ -137,6 +139,37 @@ class OnePassAdam(torch.optim.Adam):
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         return state
+
+
+def forget_gradients(parameter: torch.Tensor) -> None:
+    """Forgets the gradients of a parameter, those that wait for more views, too."""
+    parameter.grad = None
+    if hasattr(parameter, "unwritten"):
+        parameter.unwritten.clear()
+
+
+def waiting(module: nn.Module) -> dict[str, dict[str, Any]]:
+    """Gradients of a module that wait for those of more views, for a checkpoint: "gradients" and "unwritten", by name."""
+    named = dict(module.named_parameters())
+    unwritten = {name: x.unwritten for name, x in named.items() if hasattr(x, "unwritten")}
+    return {
+        "gradients": {name: x.grad.cpu() for name, x in named.items() if x.grad is not None},
+        "unwritten": {name: found.state_dict() for name, found in unwritten.items() if found},
+    }
+
+
+def load_waiting(module: nn.Module, state: Mapping[str, Any]) -> None:
+    """Gives the parameters of a module the gradients of ``waiting``, where a checkpoint has any."""
+    for name, gradient in state.get("gradients", {}).items():
+        parameter = module.get_parameter(name)
+        parameter.grad = gradient.to(parameter.device)
+    for name, views in state.get("unwritten", {}).items():
+        parameter, found = module.get_parameter(name), Unwritten()
+        found.load_state_dict(views)
+        if _fits_kernel(parameter):
+            parameter.unwritten = found
+        else:
+            parameter.grad = found.written(parameter.shape).to(parameter)
 
 
 def _fits_kernel(parameter: torch.Tensor) -> bool:

@@ -14,6 +14,8 @@ from fnmatch import fnmatchcase
 import torch
 from torch import Tensor
 
+from heatsplat.training.optimisation import forget_gradients
+
 log = logging.getLogger(__name__)
 
 COLUMN = re.compile(r"(.+)\[(\d+)\]")
@@ -110,7 +112,7 @@ class Stages:
         ]
         for parameter in whole:
             parameter.requires_grad_(False)
-            parameter.grad = None
+            forget_gradients(parameter)
         try:
             yield
         finally:
