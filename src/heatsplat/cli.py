@@ -360,7 +360,7 @@ def view(config: dict[str, Any], output_dir: Path) -> None:
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
     )
-    path = write_viewer(trained.module, output_dir / FILE)
+    path = write_viewer(trained.module, output_dir / FILE, config["cameras"])
     log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
 
 

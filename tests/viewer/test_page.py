@@ -1,21 +1,29 @@
 """viewer.html in a real browser: it loads, what it says agrees with the renderer, and the keyboard alone suffices."""
 
+import base64
+import json
 import re
+import zlib
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from running import run
 from viewer.browser import open_browser, opened, wait_until
+from viewer.test_payload import in_units
 
-from heatsplat.contracts import evenly_spread
+from heatsplat.contracts import ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
-from heatsplat.viewer.page import FILE
+from heatsplat.viewer.page import FILE, write_viewer
 
 ActionChains = pytest.importorskip(
     "selenium.webdriver", reason="selenium is not installed (pip install -e '.[dev]')"
 ).ActionChains
 
+ROOT = Path(__file__).parents[2]
 TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "threads=1", "optim.length_power=0")
 SETTINGS = ("method=etgs", "max_steps=120", "thermal.frequencies=6")
 
@@ -52,6 +60,13 @@ def pixels(page) -> np.ndarray:
     gl.readPixels(0, 0, c.width, c.height, gl.RGBA, gl.UNSIGNED_BYTE, found);
     return Array.from({length: Math.floor(found.length / 268)}, (_, i) => [0, 1, 2].map((k) => found[268 * i + k]));"""
     return np.array(page.execute_script(script), dtype=float)
+
+
+def parts_of(path: Path) -> tuple[dict, bytes]:
+    """The header of a page and its block."""
+    text = path.read_text(encoding="utf-8")
+    header, packed = (re.search(rf'id="{name}">(.*?)</script>', text, re.S)[1] for name in ("header", "block"))
+    return json.loads(header), zlib.decompress(base64.b64decode(packed))
 
 
 def keys(page, *pressed):
@@ -98,6 +113,39 @@ def test_the_report_is_one_page_with_all_its_pictures(browser, folder):
     assert all(row["low"] <= row["median"] <= row["high"] for row in learned.values())
     hot, *_, cold = read_csv(folder / "surfaces.csv")
     assert hot["kind"] == "hottest" and cold["kind"] == "coldest" and hot["mean_c"] > cold["mean_c"] and hot["area"] > 0
+
+
+def test_the_small_page_of_the_readme_opens(browser):
+    page = opened(browser, ROOT / "docs" / "pictures" / "heated_viewer.html")
+    assert "5,652 Gaussians" in page.execute_script("return document.body.innerText")
+
+
+def test_images_of_cameras_are_kept_to_half_a_step_and_masked_pixels_are_told(trained, tmp_path):
+    scene = trained.module.scene
+    mask = torch.ones(scene.train[0].thermal.shape[:2])
+    mask[:9, :13] = 0
+    masked = replace(scene, train=ViewSet(scene.train.frames, lambda i: replace(scene.train[i], mask=mask)))
+    trained.module.scene = masked
+    try:
+        header, block = parts_of(write_viewer(trained.module, tmp_path / FILE, cameras=2))
+    finally:
+        trained.module.scene = scene
+    told = header["cameras"][0]["recorded"]
+    found = in_units(block, told).reshape(told["size"])
+    expected = scene.train[0].thermal[..., 0] * (header["limits"][1] - header["limits"][0])
+    assert told["step"] == 0.05 and (found[:9, :13] < 0).all()
+    seen = mask.numpy() > 0
+    np.testing.assert_allclose(found[seen], expected.numpy()[seen], atol=0.0251)
+
+
+def test_a_page_with_fewer_cameras_is_smaller_and_none_is_refused(trained, folder, tmp_path):
+    path = write_viewer(trained.module, tmp_path / FILE, cameras=3)
+    header, _ = parts_of(path)
+    names = [frame.name for frame in trained.module.scene.train.frames]
+    assert [camera["name"] for camera in header["cameras"]] == [names[i] for i in evenly_spread(len(names), 3)]
+    assert path.stat().st_size < (folder / FILE).stat().st_size
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        write_viewer(trained.module, tmp_path / FILE, cameras=0)
 
 
 def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trained):

@@ -23,6 +23,11 @@ def back(block: bytes, place: dict) -> np.ndarray:
     return np.frombuffer(block, kind, int(np.prod(place["shape"])), place["offset"]).reshape(place["shape"])
 
 
+def in_units(block: bytes, one: dict) -> np.ndarray:
+    many = back(block, one["many"]).astype(int) if "many" in one else 0
+    return one["step"] * (back(block, one["rest"]).astype(int) + 256 * many)
+
+
 def test_arrays_come_back_and_lie_where_any_type_may_start():
     block = Block()
     stored = [
@@ -84,9 +89,9 @@ def test_what_a_part_adds_that_needs_to_know_how_far_away_things_are():
     }
     module = SimpleNamespace(render=render, sensor=SensorChain(parts), thermal=SimpleNamespace(modality_channels=(1,)))
     block = Block()
-    told = _added(module, frame, tuple(image.shape), 30.0, block)
+    told = _added(module, frame, tuple(image.shape), 30.0, 0.005, block)
     assert asked == [True] and [one["name"] for one in told] == ["thermal lag", "rolling readout"]
     after = module.sensor(image[..., None], frame, depth)
-    added = sum(one["step"] * back(block.content, one) for one in told)
+    added = sum(in_units(block.content, one) for one in told).reshape(image.shape)
     np.testing.assert_allclose(added, 30.0 * (after.detach()[..., 0] - image), atol=told[0]["step"] + told[1]["step"])
     assert np.abs(added).max() > 1.0

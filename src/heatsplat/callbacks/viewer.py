@@ -6,7 +6,7 @@ import logging
 
 import pytorch_lightning as pl
 
-from heatsplat.viewer.page import FILE, write_viewer
+from heatsplat.viewer.page import CAMERAS, FILE, write_viewer
 
 log = logging.getLogger("heatsplat")
 
@@ -15,11 +15,17 @@ class ViewerPage(pl.Callback):
     """Writes viewer.html at the end of the test: the trained scene in one file, to look at in a browser, offline.
 
     Of methods without Gaussians that stay as they are (``ThermalModel.stays_here``) it says that there is none.
+
+    Args:
+        cameras: how many training cameras are in it at most, with small images.
     """
+
+    def __init__(self, cameras: int = CAMERAS) -> None:
+        self.cameras = cameras
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if module.thermal.stays_here:
             log.info("no %s: %s", FILE, module.thermal.stays_here)
             return
-        path = write_viewer(module, module.output_dir / FILE)
+        path = write_viewer(module, module.output_dir / FILE, self.cameras)
         log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)

@@ -164,7 +164,7 @@ class Unwritten:
         """The gradient of all views, of the gains' ``shape``; zeros in rows out of view."""
         v_gains = _gain_gradients[self._views[0][0].dtype].take(shape)
         with kernels.threads_for(len(v_gains)):
-            kernels.write_gains(*self._arrays(), v_gains.numpy())
+            kernels.write_gains(*self._arrays(len(v_gains)), v_gains.numpy())
         return v_gains
 
     def step(
@@ -175,7 +175,7 @@ class Unwritten:
         sums, squares = np.empty(blocks, np.float32), np.empty((blocks, gains.shape[2]), np.float32)
         tensors = [tensor.detach().numpy() for tensor in (gains, first, second)]
         with kernels.threads_for(len(gains)):
-            kernels.step_gains(*self._arrays(), *tensors, np.tile(decay, LANES), rates, sums, squares)
+            kernels.step_gains(*self._arrays(len(gains)), *tensors, np.tile(decay, LANES), rates, sums, squares)
         return sums, squares
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -187,9 +187,11 @@ class Unwritten:
         rows, times, tables = (state[name] for name in _STATE)
         self._views = list(zip(rows, times.numpy(), tables.numpy(), strict=True))
 
-    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows, times and tables of all views, as ``write_gains`` takes them."""
+    def _arrays(self, count: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, times and tables of all views, as ``write_gains`` takes them; of ``count`` gains, or they are read beside."""
         rows, times, tables = zip(*self._views, strict=True)
+        if count is not None and any(one.shape[1] != count for one in rows):
+            raise RuntimeError(f"gradients that wait have {[one.shape[1] for one in rows]} rows, the gains {count}")
         if len(rows) == 1:
             return rows[0].numpy()[None], np.array(times), tables[0][None]
         return torch.stack(rows).numpy(), np.array(times), np.stack(tables)

@@ -15,18 +15,25 @@ from heatsplat.io.results import write_atomically
 from heatsplat.viewer.payload import payload
 
 FILE = "viewer.html"
+CAMERAS = 36  # in a page: their images take 1 to 2 MB
 SOURCES = Path(__file__).resolve().parent / "page"
 SCRIPTS = ("payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "viewer.js")
 
 
-def write_viewer(module: Any, path: Path) -> Path:
+def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
     """The path of the page that was written: a trained scene that a browser opens from a file, offline.
 
     Args:
         module: a training module with its scene (``training.module.SplatTraining``).
         path: of the file.
+        cameras: how many training cameras are in it at most, with small images.
+
+    Raises:
+        ValueError: fewer than one camera; the page stands at the first when it opens.
     """
-    header, block = payload(module, snapshot(module))
+    if cameras < 1:
+        raise ValueError(f"cameras: the page opens at a training camera, so at least 1, got {cameras}")
+    header, block = payload(module, snapshot(module), cameras)
     write_atomically(path, page(header, block))
     return path
 

@@ -17,10 +17,9 @@ from heatsplat.export.snapshot import TOLERANCE_C, TOLERANCE_UNIT, Layer, Snapsh
 from heatsplat.io.quantities import words_and_unit
 
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
-CAMERAS = 36  # training cameras that are in the page, with their images
 THUMBNAIL = 144  # pixels of the longer side of an image
 MOST = 65535  # largest number of 16 bits
-UNKNOWN = MOST  # of a thumbnail's pixel that is masked, and of a Gaussian that has no value of an attribute
+UNKNOWN = MOST  # of a Gaussian that has no value of an attribute
 LEVELS = MOST - 1  # steps between the ends of a range where some are unknown
 LEAST_SCALE = 1e-12  # of a Gaussian, in world units: none is drawn
 ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
@@ -49,12 +48,13 @@ class Block:
         return b"".join(self._parts)
 
 
-def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
+def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], bytes]:
     """The header and the block of a scene.
 
     Args:
         module: the training module; of it come cameras, images, the settings of the renderer and names.
         seen: its Gaussians (``export.snapshot``).
+        cameras: how many training cameras are in it at most, with their images, spread evenly.
     """
     scene: SceneData = module.scene
     block = Block()
@@ -62,7 +62,7 @@ def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
     centre, size = scene.bulk
     renderer = module.renderer
     header = {
-        "format": 2,
+        "format": 3,
         "scene": scene.name,
         "method": module.config.get("name") or type(module.thermal).__name__,
         "unit": seen.unit,
@@ -93,7 +93,7 @@ def payload(module: Any, seen: Snapshot) -> tuple[dict[str, Any], bytes]:
         "centre": centre.tolist(),
         "size": size,
         "up": (-down / down.norm().clamp_min(1e-12)).tolist(),
-        "cameras": _cameras(module, seen, block),
+        "cameras": _cameras(module, seen, cameras, block),
         "probes": [] if scene.probes is None else scene.probes.tolist(),
         "effects": sorted(module.thermal.effects() | module.sensor.effects()),
         "maps": {name: block.add(_colours(name), "u1") for name in COLORMAPS},
@@ -157,11 +157,11 @@ def _attribute(name: str, values: Tensor, block: Block) -> dict[str, Any]:
     }
 
 
-def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
+def _cameras(module: Any, seen: Snapshot, count: int, block: Block) -> list[dict[str, Any]]:
     """Training cameras with small images: what was recorded, what the sensor of the model adds, what the eye saw."""
     scene = module.scene
-    told = []
-    for i in evenly_spread(len(scene.train), CAMERAS):
+    told, tolerance = [], TOLERANCE_C if seen.unit else TOLERANCE_UNIT
+    for i in evenly_spread(len(scene.train), count):
         view = scene.train[i]
         camera, frame = view.camera, view.frame
         low, high = seen.limits
@@ -175,13 +175,12 @@ def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
             "intrinsics": [camera.K[0, 0].item(), camera.K[1, 1].item(), camera.K[0, 2].item(), camera.K[1, 2].item()],
             "viewmat": camera.viewmat[:3].flatten().tolist(),
         }
-        share = _small(view.image(module.modality).float().mean(-1), size).clamp(0, 1)
-        levels = (share * LEVELS).round().to(torch.int32)
+        above = _small(view.image(module.modality).float().mean(-1), size).clamp(0, 1) * (high - low)
         if view.mask is not None:
-            levels[_small(view.mask.float(), size) < 0.999] = UNKNOWN
-        entry["recorded"] = block.add(levels, "u2")
+            above[_small(view.mask.float(), size) < 0.999] = low - high  # the page knows masked pixels by their sign
+        entry["recorded"] = _steps(above.flatten(), block, tolerance) | {"size": size}
         if module.sensor.parts:
-            entry["added"] = _added(module, frame, size, high - low, block)
+            entry["added"] = _added(module, frame, size, high - low, tolerance / 10, block)
         if view.rgb is not None:
             entry["rgb"] = block.add((_small(view.rgb.float(), size).clamp(0, 1) * 255).round(), "u1")
         told.append(entry)
@@ -189,16 +188,17 @@ def _cameras(module: Any, seen: Snapshot, block: Block) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def _added(module: Any, frame: Frame, size: tuple[int, int], span: float, block: Block) -> list[Mapping[str, Any]]:
-    """What each part of the sensor adds to the image of a frame, in their order, in the scene's unit."""
+def _added(
+    module: Any, frame: Frame, size: tuple[int, int], span: float, least: float, block: Block
+) -> list[Mapping[str, Any]]:
+    """What each part of the sensor adds to the image of a frame, in their order, in steps of ``least`` of the scene's unit."""
     output = module.render(frame, depth=module.sensor.needs_depth)
     image, depth = output.features[..., : module.thermal.modality_channels[0]], output.seen_depth
     told = []
     for name, part in module.sensor.parts.items():
         after = part(image, frame, depth) if part.needs_depth else part(image, frame)
         difference = (after - image).mean(-1).cpu() * span
-        steps, step = steps_of(_small(difference, size).flatten())
-        told.append(block.add(steps.view(size), "i2") | {"step": step, "name": name.replace("_", " ")})
+        told.append(_steps(_small(difference, size).flatten(), block, least) | {"name": name.replace("_", " ")})
         image = after
     return told
 

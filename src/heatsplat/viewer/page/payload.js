@@ -16,7 +16,7 @@ async function readPayload(page) {
   const block = page.getElementById("block");
   if (!header || !block) throw new Error("this is no viewer.html of heatsplat");
   const told = JSON.parse(header.textContent);
-  if (told.format !== 2) throw new Error("this viewer.html was written by another version of heatsplat");
+  if (told.format !== 3) throw new Error("this viewer.html was written by another version of heatsplat");
   const bytes = await inflated(block.textContent);
   const array = (place) => {
     const count = place.shape.reduce((a, b) => a * b, 1);

@@ -20,9 +20,10 @@ class Viewer {
       const gl = this.drawing.gl, colours = payload.array(place);
       return [name, { colours, texture: this.drawing.texture(gl.RGB8, 256, 1, gl.RGB, gl.UNSIGNED_BYTE, colours, true) }];
     }));
-    this.cameras = this.told.cameras.map((entry) => ({ ...entry, camera: Camera.of(entry), recorded: payload.array(entry.recorded),
-      size: entry.recorded.shape, rgb: entry.rgb ? payload.array(entry.rgb) : null,
-      added: entry.added ? entry.added.map((part) => ({ ...part, values: payload.array(part) })) : null }));
+    const { array } = payload, [low] = this.told.limits;
+    this.cameras = this.told.cameras.map((entry) => ({ ...entry, camera: Camera.of(entry), size: entry.recorded.size,
+      recorded: inUnits(entry.recorded, array).map((above) => above < 0 ? NaN : low + above), rgb: entry.rgb ? array(entry.rgb) : null,
+      added: entry.added ? entry.added.map((part) => ({ name: part.name, values: inUnits(part, array) })) : null }));
     this.off = new Set();  // parts of the camera's model that are switched off
     this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, spots: false, at: 0,
       time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
@@ -137,7 +138,7 @@ class Viewer {
 
   // What the parts of the camera's model that are on add at a pixel of a training camera.
   addedAt(one, j) {
-    return one.added.reduce((sum, part) => sum + (this.off.has(part.name) ? 0 : part.values[j] * part.step), 0);
+    return one.added.reduce((sum, part) => sum + (this.off.has(part.name) ? 0 : part.values[j]), 0);
   }
 
   thumbnail(one, i) {
@@ -146,14 +147,15 @@ class Viewer {
     Object.assign(canvas, { width, height });
     const context = canvas.getContext("2d"), image = context.createImageData(width, height), { colours } = this.maps.inferno;
     let low = Infinity, high = -Infinity;
-    for (const level of one.recorded) if (level !== 65535) [low, high] = [Math.min(low, level), Math.max(high, level)];
-    one.recorded.forEach((level, j) => {
-      const k = 3 * Math.round((Math.min(level, high) - low) / Math.max(high - low, 1) * 255);
+    for (const value of one.recorded) if (!Number.isNaN(value)) [low, high] = [Math.min(low, value), Math.max(high, value)];
+    const place = (value) => 3 * Math.round((Number.isNaN(value) ? 1 : (value - low) / Math.max(high - low, 1e-9)) * 255);
+    one.recorded.forEach((value, j) => {
+      const k = place(value);
       image.data.set(one.rgb ? [...one.rgb.subarray(3 * j, 3 * j + 3), 255] : [...colours.subarray(k, k + 3), 255], 4 * j);
     });
     if (one.rgb) for (let j = 0; j < one.recorded.length; j++) {  // heat on the left, light on the right
       if (j % width >= width / 2) continue;
-      const k = 3 * Math.round((Math.min(one.recorded[j], high) - low) / Math.max(high - low, 1) * 255);
+      const k = place(one.recorded[j]);
       image.data.set([...colours.subarray(k, k + 3), 255], 4 * j);
     }
     context.putImageData(image, 0, 0);
@@ -375,11 +377,11 @@ class Viewer {
     this.pictureKey = key;
     this.picture = this.pictured = null;
     if (!one || (other === "sensor" && !one.added)) return null;
-    const [low, high] = this.told.limits, [rows, columns] = one.size;
+    const [rows, columns] = one.size;
     const content = new Float32Array(2 * rows * columns);
     for (let j = 0; j < rows * columns; j++) {
-      const value = other === "sensor" ? this.addedAt(one, j) : low + one.recorded[j] / 65534 * (high - low);
-      content.set([value, other === "sensor" || one.recorded[j] !== 65535 ? 1 : 0], 2 * j);
+      const value = other === "sensor" ? this.addedAt(one, j) : one.recorded[j];
+      content.set(Number.isNaN(value) ? [0, 0] : [value, 1], 2 * j);
     }
     this.pictured = { content, rows, columns };
     this.picture = this.drawing.texture(gl.RG32F, columns, rows, gl.RG, gl.FLOAT, content);
@@ -690,9 +692,8 @@ class Viewer {
     if (seen && one.time !== null && seen[0] >= 0 && seen[1] >= 0 && seen[0] < one.width && seen[1] < one.height) {
       const { depth } = this.splats.weightsAt(one.camera, seen[0], seen[1]);
       const [rows, columns] = one.size;
-      const level = one.recorded[Math.floor(seen[1] / one.height * rows) * columns + Math.floor(seen[0] / one.width * columns)];
-      const [low, high] = this.told.limits;
-      if (Math.abs(depth - seen[2]) < 0.05 * seen[2] && level !== 65535) probe.dots.push([one.time, low + level / 65534 * (high - low)]);
+      const value = one.recorded[Math.floor(seen[1] / one.height * rows) * columns + Math.floor(seen[0] / one.width * columns)];
+      if (Math.abs(depth - seen[2]) < 0.05 * seen[2] && !Number.isNaN(value)) probe.dots.push([one.time, value]);
     }
     setTimeout(() => this.gatherDots(probe, i + 1));
     return undefined;
