@@ -36,7 +36,7 @@ demo: $(READY)  ## train ETGS on the embedded synthetic scene, about a minute; e
 	@$(RUN) src/train.py method=etgs preset=balanced $(ARGS)
 
 test: $(READY)  ## run the tests, side by side on up to four cores (a file's tests stay together)
-	@$(RUN) -m pytest -m "not slow" -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+	@$(RUN) -m pytest -m "not slow" -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(READY)  ## run the tests that take minutes
 	@$(RUN) -m pytest -m slow $(ARGS)

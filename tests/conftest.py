@@ -28,7 +28,41 @@ RUNS = {
     "studies",
     "training",
 }  # folders with tests that train
+# Files that take longest, begun first: side by side, no process is left with one of them while the others have none.
+LONGEST = (
+    "physics/test_physics_energy_balance.py",
+    "viewer/test_page.py",
+    "training/test_presets.py",
+    "project/test_command_line.py",
+    "density/test_rules_in_runs.py",
+    "project/test_readme.py",
+    "benchmarks/test_evidence.py",
+    "project/test_notebooks.py",
+    "thermal/test_energy_balance.py",
+    "density/test_inheritance.py",
+    "export/test_snapshot.py",
+    "physics/test_marching.py",
+    "project/test_extending.py",
+    "studies/test_sweeps.py",
+    "effects/test_swept_points.py",
+    "faults/test_killed_runs.py",
+    "benchmarks/test_work_precision.py",
+    "studies/test_reproduction.py",
+    "kernels/test_platforms.py",
+    "renderers/test_contract.py",
+    "datamodules/test_glass.py",
+    "effects/test_real_scenes.py",
+    "benchmarks/test_stability.py",
+    "datamodules/test_damage.py",
+    "preparation/test_devices.py",
+    "training/test_auto_runs.py",
+)
 FILMED = {}  # settings of a recording -> the scene, which nobody changes
+
+
+def pytest_collection_modifyitems(items):
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get("/".join(item.path.parts[-2:]), len(LONGEST)))
 
 
 @pytest.fixture(autouse=True)

@@ -88,7 +88,7 @@ def test_visible_light_comes_with_its_own_opacity(tmp_path):
     assert seen.attributes.keys() >= {"emissivity"}
 
 
-@pytest.mark.parametrize("method", ["energy_balance", "thermogs", "auto"])
+@pytest.mark.parametrize("method", [pytest.param("energy_balance", marks=pytest.mark.slow), "thermogs", "auto"])
 def test_of_many_gaussians_under_weather_few_are_examined(tmp_path, monkeypatch, method):
     """Against the model itself, of all Gaussians at moments of no special kind."""
     monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 100)

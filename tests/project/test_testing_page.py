@@ -34,6 +34,11 @@ def test_what_may_be_left_out_is_listed_with_its_reason(path):
     assert "needs" not in reasons or "needs" in stated or "gpu" in stated or stated == "slow", name
 
 
+def test_files_that_begin_first_are_there():
+    names = re.findall(r'^    "(\w+/test_\w+\.py)",$', (ROOT / "tests" / "conftest.py").read_text(), re.M)
+    assert len(names) > 20 and [name for name in names if not (ROOT / "tests" / name).exists()] == []
+
+
 def test_the_page_names_every_folder_and_no_file_that_is_gone():
     assert [name for name in TABLE if not (ROOT / name).exists()] == []
     named = set(re.findall(r"`(?:tests/)?(\w+)`", TEXT.split("Three habits")[0]))
