@@ -7,8 +7,8 @@ import os
 import warnings
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
-# folder, SLURM where a run was started by hand, and loaders that cannot resume (ours takes the step from the trainer, so
-# a resumed run sees the right views).
+# folder, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step from the trainer, so
+# a resumed run sees the right views), runs without validation, and schedules that go on while gradients wait.
 NOISE = (
     r".*does not have many workers.*",
     r".*LeafSpec.*",
@@ -19,6 +19,8 @@ NOISE = (
     r".*dirpath has changed.*",
     r".*dataloader is not resumable.*",
     r".*`srun` command is available.*",
+    r".*but have no `val_dataloader`.*",
+    r".*`lr_scheduler.step\(\)` before.*",
 )
 
 
@@ -39,4 +41,5 @@ def prepare_machine(threads: int | None) -> None:
     torch.set_num_threads(threads)
     for pattern in NOISE:
         warnings.filterwarnings("ignore", message=pattern)
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
+    for name in ("pytorch_lightning", "pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.WARNING)  # of the first, Lightning's import makes INFO again
