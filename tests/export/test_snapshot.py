@@ -112,6 +112,16 @@ def test_of_many_gaussians_under_weather_few_are_examined(tmp_path, monkeypatch,
     assert worst <= 1.2 * TOLERANCE
 
 
+def test_of_very_many_gaussians_the_truth_may_err_by_more(tmp_path, monkeypatch):
+    module = started(tmp_path, "method=etgs", "data.scene=cooling")
+    few = {layer.name: layer for layer in snapshot(module).layers}
+    monkeypatch.setattr("heatsplat.export.snapshot.MANY", len(module.splats) - 1)
+    many = {layer.name: layer for layer in snapshot(module).layers}
+    assert few["truth"].tolerance == pytest.approx(TOLERANCE) == many["camera"].tolerance
+    assert many["truth"].tolerance == pytest.approx(4 * TOLERANCE) and many["truth"].worst <= 4 * TOLERANCE
+    assert many["truth"].basis.rank < few["truth"].basis.rank
+
+
 METHODS = (
     "3dgs",
     "etgs",

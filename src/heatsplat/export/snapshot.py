@@ -17,6 +17,8 @@ from heatsplat.shots import at_time, first_free_id
 
 TOLERANCE_C = 0.05  # °C that the basis of time may cost any Gaussian
 TOLERANCE_UNIT = 0.001  # the same where image values are no temperatures
+MANY = 50_000  # Gaussians; of more the truth, which is there to compare with, may err by
+COARSER = 4  # times as much: else half of a page would be its
 VIEWS = 6  # training cameras over which what depends on the view is averaged
 JUDGED = 48  # training cameras at most that are compared with that mean
 TIMES = 257  # samples of a quantity over time at most, and
@@ -39,6 +41,7 @@ class Layer:
         label: for people.
         basis: its values.
         worst: largest error of the basis in the scene's unit.
+        tolerance: what was aimed at.
         clipped: values count as 0 below 0 and as 1 above 1. The basis holds them as they were before: clipping bends
             curves, and bent ones need more of them.
     """
@@ -47,6 +50,7 @@ class Layer:
     label: str
     basis: TimeBasis
     worst: float
+    tolerance: float
     clipped: bool = False
 
 
@@ -177,10 +181,8 @@ def snapshot(module: Any) -> Snapshot:
             layers.append(layer(f"without {part}", label, without))
     if scene.truth is not None and span is not None and scene.thermal_range is not None:
         truth = _truth(scene, means[kept].cpu(), blended)
-        most = BENDS if record else TIMES
-        layers.append(
-            _layer("truth", "truth", truth, len(kept), span, tolerance / slope, slope, most, CURVES, record, False)
-        )
+        most, aim = BENDS if record else TIMES, tolerance / slope * (COARSER if len(kept) > MANY else 1)
+        layers.append(_layer("truth", "truth", truth, len(kept), span, aim, slope, most, CURVES, record, False))
     ends = _ends(layers, module.background[0].item())
     table = _table(module, scene, ends, channels)
     colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
@@ -257,7 +259,7 @@ def _layer(
         basis = constant_basis(values_at(None, None).cpu())
     else:
         basis = time_basis(values_at, count, *span, tolerance, most_times, most_curves, bends, clipped)
-    return Layer(name, label, basis, basis.worst * slope, clipped)
+    return Layer(name, label, basis, basis.worst * slope, tolerance * slope, clipped)
 
 
 def _surface(module: Any, blended: Callable, kept: Tensor) -> ValuesAt | None:

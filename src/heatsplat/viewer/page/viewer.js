@@ -108,11 +108,11 @@ class Viewer {
     if (this.told.span) for (const id of ["time", "otherTime"]) Object.assign($(id), { min: this.told.span[0], max: this.told.span[1] });
     this.cameras.forEach((one, i) => $("cameras").append(this.thumbnail(one, i)));
     const unit = this.told.unit || "image values", small = (value) => Number(value.toPrecision(2));
-    const ranks = this.splats.layers.map((layer) => `${layer.coefficients.length} for ${layer.name}, ${small(layer.worst)} ${unit}`).join("; ");
+    const ranks = this.splats.layers.map((layer) => `${layer.coefficients.length} for ${layer.name}, ${small(layer.worst)} ${unit} (aim: ${small(layer.aim)})`).join("; ");
     const notes = [];
     if (this.told.span) {
-      notes.push(`Time: each Gaussian's curve is a sum of shared ones. How many, and worst error of any Gaussian found: ${ranks} `
-        + `(aim: ${this.told.tolerance}), of all Gaussians at ${this.splats.layers[0].checks} moments at which nothing was fitted.`);
+      notes.push(`Time: each Gaussian's curve is a sum of shared ones. How many, and worst error of any Gaussian found: ${ranks}, `
+        + `of all Gaussians at ${this.splats.layers[0].checks} moments at which nothing was fitted.`);
       notes.push(`Beyond the record: ${this.told.beyondRecord}.`);
     }
     notes.push(...this.told.leftOut);
