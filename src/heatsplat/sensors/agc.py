@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.sensors.per_frame import PerFrame
+from heatsplat.sensors.sums import everywhere
 
 EPSILON = 1e-4  # images are kept this far from 0 and 1 under the logit, which bounds its slope by 1e4
 
@@ -59,7 +60,8 @@ class GainControl(PerFrame):
             return image
         log_stretch, shift = self.at(self.settings(), frame)
         logits = torch.logit(image.clamp(EPSILON, 1 - EPSILON))
-        return image + (torch.sigmoid(log_stretch.exp() * logits + shift) - torch.sigmoid(logits))
+        stretch, shift = everywhere(log_stretch.exp(), image), everywhere(shift, image)
+        return image + (torch.sigmoid(stretch * logits + shift) - torch.sigmoid(logits))
 
     def settings(self) -> Tensor:
         """log s and t of the training images in order of time, [F, 2], each with mean zero."""

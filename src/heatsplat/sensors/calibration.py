@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.geometry.resampling import resampled
 from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.sums import everywhere
 
 
 class Calibration(SensorPart):
@@ -91,7 +92,7 @@ class Calibration(SensorPart):
         if self.raw_falloff is None:
             return torch.ones_like(r2)
         r2 = r2.to(self.raw_falloff)
-        a2, a4 = self.coefficients()
+        a2, a4 = (everywhere(a, r2) for a in self.coefficients())
         return torch.exp((a2 + a4 * r2) * r2)
 
     def coefficients(self) -> Tensor:

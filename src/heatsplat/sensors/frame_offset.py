@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.sensors.per_frame import PerFrame
+from heatsplat.sensors.sums import everywhere
 
 
 class FrameOffset(PerFrame):
@@ -51,10 +52,10 @@ class FrameOffset(PerFrame):
             self.raw_gain = nn.Parameter(torch.zeros(len(self.moments)))
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        offset = self.at(self.offsets(), frame)
+        offset = everywhere(self.at(self.offsets(), frame), image)
         if self.raw_gain is None:
             return image + offset
-        return image + (image * self.at(self.gains(), frame) + offset)
+        return image + (image * everywhere(self.at(self.gains(), frame), image) + offset)
 
     def offsets(self) -> Tensor:
         """o of the training images in order of time, [F] in image units, with mean zero."""

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.sums import total
 
 REACH = 3.5  # standard deviations that the kernel reaches at its widest; beyond lie 5e-4 of its weight
 
@@ -87,7 +88,7 @@ class _Blur(torch.autograd.Function):
             slopes = 0.5 * (weights.roll(1) + weights.roll(-1)) - weights
             down = _convolved(_convolved(image, slopes, 0), weights, 1)
             across = _convolved(_convolved(image, weights, 0), slopes, 1)
-            grad_variance = (grad * (down + across)).sum().to(ctx.variance_type)
+            grad_variance = total(grad * (down + across)).to(ctx.variance_type)
         return grad_image, grad_variance, None
 
 
