@@ -128,7 +128,7 @@ def test_levels_of_the_tone_curve():
     def error(levels: int) -> float:
         at = torch.linspace(0, 1, levels, dtype=DOUBLE)
         found = tone._interpolated(torch.stack([torch.sin(3 * at), torch.cos(5 * at)], 1), brightness)
-        exact = torch.stack([torch.sin(3 * brightness), torch.cos(5 * brightness)], 2)
+        exact = torch.stack([torch.sin(3 * brightness), torch.cos(5 * brightness)])
         return (found - exact).abs().max().item()
 
     assert order([17, 33, 65, 129, 257], lambda n: error(n)) == pytest.approx(2.0, abs=0.15)

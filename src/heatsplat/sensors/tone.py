@@ -72,13 +72,13 @@ class Tone(SensorPart):
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         brightness = image.mean(2)
         curve = self.bounds * self.network(self.levels).tanh()
+        line = 0.0 if self.straight else self._line(curve)
         if self.exact:
-            change = self.bounds * self.network(brightness.clamp(0, 1)[..., None]).tanh()
+            change = self.bounds * self.network(brightness.clamp(0, 1)[..., None]).tanh() - line
+            gain, offset = change.unbind(2)
         else:
-            change = _interpolated(curve, brightness)
-        if not self.straight:
-            change = change - self._line(curve)
-        return image * (1.0 + change[..., :1]) + change[..., 1:]
+            gain, offset = _interpolated(curve - line, brightness)
+        return image * (1.0 + gain[..., None]) + offset[..., None]
 
     def _line(self, curve: Tensor) -> Tensor:
         """Slope and level of the line that fits the correction of a curve [L, 2] best over [0, 1], [2]."""
@@ -95,9 +95,9 @@ class Tone(SensorPart):
 
 
 def _interpolated(curve: Tensor, brightness: Tensor) -> Tensor:
-    """The curve [L, 2] over [0, 1] at brightness [H, W], [H, W, 2], linear between levels."""
+    """The two columns of a curve [L, 2] over [0, 1] at brightness [H, W], [2, H, W], linear between levels."""
     where = torch.stack((2.0 * brightness - 1.0, torch.zeros_like(brightness)), 2)
     found = functional.grid_sample(
         curve.T[None, :, None], where[None], mode="bilinear", padding_mode="border", align_corners=True
     )
-    return found[0].permute(1, 2, 0)
+    return found[0]
