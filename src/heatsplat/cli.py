@@ -354,13 +354,14 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
 def view(config: dict[str, Any], output_dir: Path) -> None:
     """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
     from heatsplat.runs.run import load
-    from heatsplat.viewer.page import FILE, write_viewer
+    from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
 
     prepare_machine(config["threads"])
+    cameras = checked_cameras(config["cameras"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
     )
-    path = write_viewer(trained.module, output_dir / FILE, config["cameras"])
+    path = write_viewer(trained.module, output_dir / FILE, cameras)
     log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
 
 

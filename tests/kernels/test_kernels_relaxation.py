@@ -10,7 +10,7 @@ from heatsplat.kernels.relaxation import BLOCK, WORTH_A_SECOND_THREAD
 from heatsplat.kernels.scheduling import thread_count, use_threads
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.splats import Splats
-from heatsplat.training.optimisation import OnePassAdam, forget_gradients, load_waiting, waiting
+from heatsplat.training.optimisation import OnePassAdam, forget_gradients, load_waiting_gradients, waiting_gradients
 
 DOUBLE = torch.float64
 
@@ -101,10 +101,10 @@ def test_gradients_that_wait_in_a_checkpoint_give_the_same_bits():
     times = (0.3, 2.0, 5.0)
     gains, optimizer = waiting_gains(times)
     holder = torch.nn.ParameterDict({"gains": gains})
-    state = waiting(holder)
+    state = waiting_gradients(holder)
     assert not state["gradients"] and state["unwritten"]["gains"]["times"].tolist() == pytest.approx(times)
     other = torch.nn.ParameterDict({"gains": gains.detach().clone()})
-    load_waiting(other, state)
+    load_waiting_gradients(other, state)
     optimizer.step()
     OnePassAdam([{"params": list(other.values()), "lr": 0.01}], eps=1e-3).step()
     assert torch.equal(gains, other["gains"])
@@ -113,7 +113,7 @@ def test_gradients_that_wait_in_a_checkpoint_give_the_same_bits():
 def test_gradients_that_wait_come_back_written_where_the_kernel_does_not_step():
     gains, _ = waiting_gains((0.3, 2.0))
     other = torch.nn.ParameterDict({"gains": gains.detach().double()})
-    load_waiting(other, waiting(torch.nn.ParameterDict({"gains": gains})))
+    load_waiting_gradients(other, waiting_gradients(torch.nn.ParameterDict({"gains": gains})))
     torch.testing.assert_close(other["gains"].grad, gains.unwritten.written(gains.shape).double())
 
 

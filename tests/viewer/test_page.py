@@ -14,7 +14,8 @@ from running import run
 from viewer.browser import open_browser, opened, wait_until
 from viewer.test_payload import in_units
 
-from heatsplat.contracts import ViewSet, evenly_spread
+from heatsplat.callbacks.viewer import ViewerPage
+from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
 from heatsplat.viewer.page import FILE, write_viewer
@@ -144,8 +145,9 @@ def test_a_page_with_fewer_cameras_is_smaller_and_none_is_refused(trained, folde
     names = [frame.name for frame in trained.module.scene.train.frames]
     assert [camera["name"] for camera in header["cameras"]] == [names[i] for i in evenly_spread(len(names), 3)]
     assert path.stat().st_size < (folder / FILE).stat().st_size
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        write_viewer(trained.module, tmp_path / FILE, cameras=0)
+    for refused in (lambda: write_viewer(trained.module, tmp_path / FILE, cameras=0), lambda: ViewerPage(cameras=0)):
+        with pytest.raises(SceneError, match="at least 1, got 0"):
+            refused()
 
 
 def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trained):

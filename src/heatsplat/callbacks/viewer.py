@@ -6,7 +6,7 @@ import logging
 
 import pytorch_lightning as pl
 
-from heatsplat.viewer.page import CAMERAS, FILE, write_viewer
+from heatsplat.viewer.page import CAMERAS, FILE, checked_cameras, write_viewer
 
 log = logging.getLogger("heatsplat")
 
@@ -18,10 +18,13 @@ class ViewerPage(pl.Callback):
 
     Args:
         cameras: how many training cameras are in it at most, with small images.
+
+    Raises:
+        SceneError: fewer than one camera: said before a run trains.
     """
 
     def __init__(self, cameras: int = CAMERAS) -> None:
-        self.cameras = cameras
+        self.cameras = checked_cameras(cameras)
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if module.thermal.stays_here:

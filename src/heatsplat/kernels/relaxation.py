@@ -348,7 +348,7 @@ def backward(ids, places, scale, time, slopes, v_values, v_rate, v_initial, v_am
 
 @inline
 def _fill_rows(block, view, rows, time, scratch):
-    """Rates, and functions of y = at, of a block of rows of gains; how many rows it has, and whether the view sees any."""
+    """Rates, and functions of y = at, of the rows of a block, if the view sees any; whether it does."""
     start = block * BLOCK
     count, seen = min(BLOCK, rows.shape[2] - start), False
     for j in range(count):
@@ -356,7 +356,7 @@ def _fill_rows(block, view, rows, time, scratch):
         seen = seen or rows[view, PULLS, start + j] != 0
     if seen:
         _fill_functions(count, time, scratch)
-    return count, seen
+    return seen
 
 
 @inline
@@ -376,7 +376,7 @@ def _sum_rows(block, rows, times, tables, frequencies, scratch, out, place):
     for k in range(0, count * 2 * frequencies, LANES):
         store_columns(out, begin + k, (filled(scratch, 0.0),), count * 2 * frequencies - k)
     for view in range(rows.shape[0]):
-        if not _fill_rows(block, view, rows, times[view], scratch)[1]:
+        if not _fill_rows(block, view, rows, times[view], scratch):
             continue
         for j in range(count):
             pull, place = rows[view, PULLS, block * BLOCK + j], begin + j * 2 * frequencies

@@ -28,7 +28,7 @@ from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation, load_waiting, penalties, waiting
+from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -233,7 +233,7 @@ class SplatTraining(pl.LightningModule):
     # One step ----------------------------------------------------------------------------------------
 
     def on_train_start(self) -> None:
-        load_waiting(self, self._waiting)
+        load_waiting_gradients(self, self._waiting)
         self._waiting = {}
         self._stop_at_the_end()
 
@@ -537,7 +537,7 @@ class SplatTraining(pl.LightningModule):
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
         if self.global_step > 0 and not self._updates(self.global_step - 1):
-            checkpoint[CHECKPOINT_KEY] |= waiting(self)
+            checkpoint[CHECKPOINT_KEY] |= waiting_gradients(self)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -549,10 +549,10 @@ class SplatTraining(pl.LightningModule):
             if stored is not None and stored.shape != buffer.shape:
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
-        self.schedule.load_state_dict(checkpoint[CHECKPOINT_KEY]["schedule"])
-        self._waiting = checkpoint[CHECKPOINT_KEY]
-        state = checkpoint[CHECKPOINT_KEY]["density_state"]
-        self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
+        own = checkpoint[CHECKPOINT_KEY]
+        self.schedule.load_state_dict(own["schedule"])
+        self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
+        self._density_state = {name: tensor.to(self.device) for name, tensor in own["density_state"].items()}
 
 
 def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = None) -> Query:

@@ -148,7 +148,7 @@ def forget_gradients(parameter: torch.Tensor) -> None:
         parameter.unwritten.clear()
 
 
-def waiting(module: nn.Module) -> dict[str, dict[str, Any]]:
+def waiting_gradients(module: nn.Module) -> dict[str, dict[str, Any]]:
     """Gradients of a module that wait for those of more views, for a checkpoint: "gradients" and "unwritten", by name."""
     named = dict(module.named_parameters())
     unwritten = {name: x.unwritten for name, x in named.items() if hasattr(x, "unwritten")}
@@ -158,8 +158,8 @@ def waiting(module: nn.Module) -> dict[str, dict[str, Any]]:
     }
 
 
-def load_waiting(module: nn.Module, state: Mapping[str, Any]) -> None:
-    """Gives the parameters of a module the gradients of ``waiting``, where a checkpoint has any."""
+def load_waiting_gradients(module: nn.Module, state: Mapping[str, Any]) -> None:
+    """Gives the parameters of a module the gradients of ``waiting_gradients``, where a checkpoint has any."""
     for name, gradient in state.get("gradients", {}).items():
         parameter = module.get_parameter(name)
         parameter.grad = gradient.to(parameter.device)

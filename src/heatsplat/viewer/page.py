@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+from heatsplat.contracts import SceneError
 from heatsplat.export.snapshot import snapshot
 from heatsplat.io.results import write_atomically
 from heatsplat.viewer.payload import payload
@@ -18,6 +19,17 @@ FILE = "viewer.html"
 CAMERAS = 36  # in a page: their images take 1 to 2 MB
 SOURCES = Path(__file__).resolve().parent / "page"
 SCRIPTS = ("payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "viewer.js")
+
+
+def checked_cameras(count: int) -> int:
+    """The number of training cameras of a page.
+
+    Raises:
+        SceneError: it is less than one; the page stands at the first when it opens.
+    """
+    if count < 1:
+        raise SceneError(f"cameras: the page opens at a training camera, so at least 1, got {count}")
+    return count
 
 
 def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
@@ -29,11 +41,9 @@ def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
         cameras: how many training cameras are in it at most, with small images.
 
     Raises:
-        ValueError: fewer than one camera; the page stands at the first when it opens.
+        SceneError: fewer than one camera, or Gaussians that cannot be told apart from the model (``snapshot``).
     """
-    if cameras < 1:
-        raise ValueError(f"cameras: the page opens at a training camera, so at least 1, got {cameras}")
-    header, block = payload(module, snapshot(module), cameras)
+    header, block = payload(module, snapshot(module), checked_cameras(cameras))
     write_atomically(path, page(header, block))
     return path
 
