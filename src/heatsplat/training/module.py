@@ -552,7 +552,8 @@ class SplatTraining(pl.LightningModule):
         own = checkpoint[CHECKPOINT_KEY]
         self.schedule.load_state_dict(own["schedule"])
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
-        self._density_state = {name: tensor.to(self.device) for name, tensor in own["density_state"].items()}
+        state = own["density_state"]
+        self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 
 
 def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = None) -> Query:
