@@ -16,7 +16,7 @@ ALLOWED = {
     "geometry": {"contracts", "kernels"},
     "kernels": set(),
     "splats": {"contracts"},
-    "sensors": {"contracts", "geometry", "physics"},
+    "sensors": {"contracts", "geometry", "physics", "kernels"},
     "losses": {"contracts", "geometry", "physics", "kernels", "splats"},
     "metrics": {"contracts", "geometry", "physics"},
     "renderers": {"contracts", "geometry", "splats", "kernels"},

@@ -123,12 +123,12 @@ def test_terms_of_the_series(monkeypatch):
 
 def test_levels_of_the_tone_curve():
     """Straight lines between levels of brightness: the second order."""
-    brightness = torch.linspace(0, 1, 1001, dtype=DOUBLE)[None]
+    image = torch.linspace(0, 1, 1001, dtype=DOUBLE)[None, :, None]
 
     def error(levels: int) -> float:
         at = torch.linspace(0, 1, levels, dtype=DOUBLE)
-        found = tone._interpolated(torch.stack([torch.sin(3 * at), torch.cos(5 * at)], 1), brightness)
-        exact = torch.stack([torch.sin(3 * brightness), torch.cos(5 * brightness)])
+        found = tone.corrected(image, torch.stack([torch.sin(3 * at), torch.cos(5 * at)], 1))
+        exact = image * (1 + torch.sin(3 * image)) + torch.cos(5 * image)
         return (found - exact).abs().max().item()
 
     assert order([17, 33, 65, 129, 257], lambda n: error(n)) == pytest.approx(2.0, abs=0.15)

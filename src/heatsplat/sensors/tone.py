@@ -7,9 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from heatsplat.contracts import Frame
+from heatsplat.kernels import tone as kernel
 from heatsplat.sensors.base import SensorPart
 
 LEVELS = 256  # the curve between 0 and 1 is kept at this many brightnesses
@@ -68,16 +70,17 @@ class Tone(SensorPart):
                 parameter.zero_()
         self.register_buffer("bounds", torch.tensor([gain_max, offset_max]))
         self.register_buffer("levels", torch.linspace(0.0, 1.0, LEVELS)[:, None])
+        self._answers: Tensor | None = None  # of the network at the levels, which the last image and its penalty share
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        brightness = image.mean(2)
-        curve = self.bounds * self.network(self.levels).tanh()
+        answers = self.network(self.levels)
+        self._answers = answers if self.training and torch.is_grad_enabled() else None
+        curve = self.bounds * answers.tanh()
         line = 0.0 if self.straight else self._line(curve)
-        if self.exact:
-            change = self.bounds * self.network(brightness.clamp(0, 1)[..., None]).tanh() - line
-            gain, offset = change.unbind(2)
-        else:
-            gain, offset = _interpolated(curve - line, brightness)
+        if not self.exact:
+            return corrected(image, curve - line)
+        brightness = image.mean(2).clamp(0, 1)
+        gain, offset = (self.bounds * self.network(brightness[..., None]).tanh() - line).unbind(2)
         return image * (1.0 + gain[..., None]) + offset[..., None]
 
     def _line(self, curve: Tensor) -> Tensor:
@@ -88,16 +91,50 @@ class Tone(SensorPart):
         return torch.stack((slope, correction.mean() - 0.5 * slope))
 
     def penalty(self) -> Tensor:
-        return self.network(self.levels).square().sum(1).mean()
+        answers, self._answers = self._answers, None
+        if answers is None:
+            answers = self.network(self.levels)
+        return answers.square().sum(1).mean()
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"tone": {"width": self.network[0].out_features}}
 
 
-def _interpolated(curve: Tensor, brightness: Tensor) -> Tensor:
-    """The two columns of a curve [L, 2] over [0, 1] at brightness [H, W], [2, H, W], linear between levels."""
+def corrected(image: Tensor, curve: Tensor) -> Tensor:
+    """I (1 + g(b)) + o(b), [H, W, C], at the mean b of a pixel's channels; by a kernel on a CPU in float32.
+
+    Args:
+        image: [H, W, C].
+        curve: [L, 2] g and o at evenly spaced brightnesses from 0 to 1, with straight lines between; the ends hold beyond.
+    """
+    on_cpu = image.device.type == "cpu" and image.dtype == curve.dtype == torch.float32
+    return _Corrected.apply(image, curve) if on_cpu else corrected_reference(image, curve)
+
+
+def corrected_reference(image: Tensor, curve: Tensor) -> Tensor:
+    """``corrected`` in plain torch, on any device and in any precision."""
+    brightness = image.mean(2)
     where = torch.stack((2.0 * brightness - 1.0, torch.zeros_like(brightness)), 2)
-    found = functional.grid_sample(
+    gain, offset = functional.grid_sample(
         curve.T[None, :, None], where[None], mode="bilinear", padding_mode="border", align_corners=True
-    )
-    return found[0]
+    )[0]
+    return image * (1.0 + gain[..., None]) + offset[..., None]
+
+
+class _Corrected(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, curve: Tensor) -> Tensor:
+        image, curve = image.detach().contiguous(), curve.detach().contiguous()
+        found = torch.empty_like(image)
+        kernel.correct(image.view(-1).numpy(), image.shape[2], curve.numpy(), found.view(-1).numpy())
+        ctx.save_for_backward(image, curve)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        image, curve = ctx.saved_tensors
+        v_image, v_curve = torch.empty_like(image), torch.empty_like(curve)
+        flat = [tensor.view(-1).numpy() for tensor in (image, grad.contiguous(), v_image)]
+        kernel.differentiate(flat[0], image.shape[2], curve.numpy(), *flat[1:], v_curve.numpy())
+        return v_image, v_curve

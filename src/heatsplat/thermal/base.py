@@ -108,7 +108,8 @@ class PerGaussian:
         group: weight of the penalty Σ_k √(Σ_i x_ik²) over the columns k of the last dimension; inside the optimiser, too.
         lr_end: factor on lr at the last step of the run, log-linear in between.
         paced: whether it learns faster in shorter runs (``Optimisation.length_power``). Not what many numbers make up
-            together, such as the gains of a series or the input of a network: their steps add up.
+            together, such as the gains of a series or the input of a network: their steps add up. Nor what has to be a mean
+            over images that differ.
     """
 
     initial: Tensor

@@ -285,7 +285,8 @@ class EnergyNetwork(ThermalModel):
     @torch.no_grad()
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         value = seeds.values[:, 0]
-        tensors = {"first_value": PerGaussian(value.clone(), self.lr_first)}
+        # Not paced: one value for all times has to be a mean over images that differ, and must not follow single ones.
+        tensors = {"first_value": PerGaussian(value.clone(), self.lr_first, paced=False)}
         _, nearest = cKDTree(self._points["means"].numpy()).query(seeds.means.numpy(), workers=1)
         nearest = torch.from_numpy(nearest)
         if self.labelled:

@@ -128,7 +128,8 @@ class NtrGaussian(ThermalModel):
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
         tensors = {"feature": PerGaussian(feature, self.lr_feature, paced=False)}
         if self.first_steps > 0:
-            tensors["first_value"] = PerGaussian(seeds.values.mean(1), self.lr_first)
+            # Not paced: one value for all times has to be a mean over images that differ, and must not follow single ones.
+            tensors["first_value"] = PerGaussian(seeds.values.mean(1), self.lr_first, paced=False)
         return tensors
 
     def on_step(self, step: int) -> None:
