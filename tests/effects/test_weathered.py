@@ -11,6 +11,7 @@ from heatsplat.effects.weathered import (
     EXCHANGE_W_M2_K,
     MIN_DB,
     MIRRORED,
+    PART_SIGMAS,
     PARTS,
     SHADOWS,
     SIGMAS,
@@ -76,7 +77,7 @@ def test_what_drives_a_scene_is_told():
 @pytest.mark.parametrize("name", PARTS)
 def test_what_does_not_drive_a_scene_is_not_taken_in(name):
     evidence = judged(recorded(without=name), name, "")
-    assert not (evidence.told and evidence.statistic > 3), evidence
+    assert not (evidence.told and evidence.statistic > PART_SIGMAS), evidence
 
 
 def test_a_body_with_a_core_has_two_nodes():

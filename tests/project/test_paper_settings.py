@@ -284,6 +284,8 @@ OWN = {
         "thermal.weights.ode": (0.01, "lambda_5"),
         "thermal.weights.pinn": (1.0, "lambda_6"),
         "thermal.time_frequencies": (10, "orders of the time encoding"),
+        "thermal.frames_per_cycle": (None, "all of them"),
+        "thermal.time": ("record", "min-max time"),
         "thermal.width": (256, "our reading"),
         "thermal.blocks": (6, "our reading"),
         "thermal.projected_area": ("printed", "Eq. 8"),

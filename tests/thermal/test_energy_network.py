@@ -109,6 +109,29 @@ def test_temperature_follows_the_time_of_the_question(time):
     assert ((again - morning).abs().max() < 1e-4) == (time != "record")
 
 
+def test_hours_come_again_where_the_weather_goes_on_for_more_than_a_day():
+    scene = make_scene()
+    weather = scene.weather
+    span = float(weather.times_s[-1] - weather.times_s[0])
+    for days, time in ((0.9, "record"), (2.0, "day")):
+        start, stretch = weather.times_s[0], days * 24 * HOUR_S / span
+        longer = replace(scene, weather=replace(weather, times_s=start + stretch * (weather.times_s - start)))
+        model, _ = make(longer)
+        assert model.effects()["relaxation"]["time"] == time
+    clock = [model._moment(moment)[-2 * model.time_frequencies :] for moment in (HOUR_S, 25 * HOUR_S, 13 * HOUR_S)]
+    torch.testing.assert_close(clock[0], clock[1])
+    assert not torch.allclose(clock[0], clock[2], atol=0.1)
+
+
+def test_the_network_sees_octaves_that_images_tell():
+    """Of ten images in nine hours there are four or more to a cycle of 18, 9 and 4.5 hours, or of 24, 12 and 6."""
+    scene = make_scene(times=[hour * HOUR_S for hour in range(10)])
+    for options, seen in (({"time": "record"}, 3), ({"time": "day"}, 3), ({"frames_per_cycle": None}, 10)):
+        model, _ = make(scene, **options)
+        code = model._moment(1.3 * HOUR_S)[-2 * model.time_frequencies :].unflatten(0, (2, -1))
+        assert int(code.ne(0).any(0).sum()) == seen
+
+
 def test_beyond_the_record_the_clock_stays_and_the_weather_goes_on():
     model, _ = make()
     last, later = 9 * HOUR_S, 15 * HOUR_S
@@ -422,7 +445,7 @@ def test_the_table_needs_a_class_for_every_point():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"time": "year"}, "time must be one of record, day, none"),
+        ({"time": "year"}, "time must be one of scene, record, day, none"),
         ({"features": "rgb"}, "features must be one of"),
         ({"sky": "blue"}, "sky must be one of"),
         ({"projected_area": "shadow"}, "projected_area must be one of"),

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 # Standard errors from which a gain on held-out observations is no chance, and below which it is; decibels that are none.
 SIGMAS, CHANCE = 3.0, 0.5
+# Those of sun, sky and wind, which are there more often than not under the sky. A part that is absent loses on such observations:
+# of 25 that were in 24 scenes drawn at random the luckiest gained 1.9 standard errors, the others 0.9 at most.
+PART_SIGMAS = 2.0
 MIN_DB, NOTHING_DB, MUCH_DB = 0.2, 0.05, 0.5
 NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
 NO_SUN = "the record has no irradiance, or the sun does not shine in it"
@@ -73,8 +76,8 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         share = weathered.shares[name]
         found, large = f"{found}; bodies take a share of {share:.2f}", share > LEAST[name]
     if name == "radiation" and not weathered.dark:
-        return weighed(gain, found, large, False, "more of them in the dark")
-    return weighed(gain, found, large)
+        return weighed(gain, found, large, False, "more of them in the dark", sigmas=PART_SIGMAS)
+    return weighed(gain, found, large, sigmas=PART_SIGMAS)
 
 
 def around(inspected: Inspection, name: str) -> Evidence:
@@ -103,6 +106,7 @@ def weighed(
     needed: str = "",
     least_db: float = MIN_DB,
     nothing_db: float = NOTHING_DB,
+    sigmas: float = SIGMAS,
 ) -> Evidence:
     """The evidence of what a balance gains on observations that were left out.
 
@@ -112,12 +116,13 @@ def weighed(
         can_be_none: whether no gain says that there is none.
         needed: frames that would tell; else their number, from how the gain scatters.
         least_db, nothing_db: decibels that are a gain, and that are none.
+        sigmas: standard errors from which a gain is no chance.
     """
-    if gain.sigmas > SIGMAS and gain.db > least_db and large:
+    if gain.sigmas > sigmas and gain.db > least_db and large:
         return Evidence(gain.sigmas, found, gain_db=gain.db)
     if (gain.sigmas < CHANCE or gain.db < nothing_db) and can_be_none:
         return Evidence(min(gain.sigmas, CHANCE), found, gain_db=gain.db)
-    needed = needed or f"about {math.ceil(gain.images * (SIGMAS / max(gain.sigmas, CHANCE)) ** 2)}"
+    needed = needed or f"about {math.ceil(gain.images * (sigmas / max(gain.sigmas, CHANCE)) ** 2)}"
     why = f"cannot be told from {gain.images} frames, {needed} would tell"
     return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 

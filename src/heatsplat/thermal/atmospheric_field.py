@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData, check_option
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
-from heatsplat.thermal.coordinates import Box, Clock, octaves
+from heatsplat.thermal.coordinates import Box, Clock, octaves, slow_octaves
 from heatsplat.thermal.layers import draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
 
@@ -122,12 +122,8 @@ class AtmosphericField(Wrapper):
             self.clock.record.copy_(torch.tensor([0.0, max(*ids, 1)]))
         elif self.time != "none":
             self.clock.prepare(scene)
-        if self.frames_per_cycle is not None:
-            moments = {frame.frame_id if self.by_index else frame.time_s for frame in scene.train.frames}
-            cycles = max(
-                (len(moments) - 1) / self.frames_per_cycle, 0.5
-            )  # octave k has 2^k / 2 of them over the record
-            self.slow_octaves.fill_(min(self.time_frequencies, 1 + math.floor(math.log2(2 * cycles))))
+        moments = {frame.frame_id if self.by_index else frame.time_s for frame in scene.train.frames}
+        self.slow_octaves.fill_(slow_octaves(self.time_frequencies, len(moments), self.frames_per_cycle, 0.5))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((*self.layers, *self.moment_layers.values()), seeds.generator)

@@ -104,3 +104,16 @@ def octaves(values: Tensor, count: int) -> Tensor:
     scaled = values[:, :, None] * 2.0 ** torch.arange(count, dtype=values.dtype, device=values.device)
     phase = math.pi * (scaled - 2.0 * torch.round(scaled / 2.0))
     return torch.cat((phase.sin(), phase.cos()), 2).flatten(1)
+
+
+def slow_octaves(count: int, frames: int, frames_per_cycle: float | None, slowest: float) -> int:
+    """How many of ``count`` octaves of time have cycles long enough for images to tell, at least one.
+
+    Args:
+        frames: images of the record.
+        frames_per_cycle: images to a cycle of the fastest octave, at least; None takes all octaves.
+        slowest: cycles of the first octave over the record.
+    """
+    if frames_per_cycle is None:
+        return count
+    return min(count, 1 + math.floor(math.log2(max((frames - 1) / frames_per_cycle / slowest, 1.0))))

@@ -18,7 +18,7 @@ from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
-from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
+from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves, slow_octaves
 from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
@@ -27,7 +27,7 @@ from heatsplat.thermal.weather_drive import columns_at, remembered, value_at
 
 log = logging.getLogger(__name__)
 
-TIMES = ("record", "day", "none")
+TIMES = ("scene", "record", "day", "none")
 FEATURES = ("learned", "given", "labels", "none")
 MATERIALS = ("inferred", "constant", "table")
 COLLOCATIONS = ("view", "record")
@@ -47,6 +47,8 @@ GOLDEN, PLASTIC = 0.6180339887498949, 0.7548776662466927
 TRAVELS = (
     "bounds_k",
     "clock.record",
+    "daily",
+    "slow_octaves",
     "weather_mean",
     "weather_scale",
     "feature_mean",
@@ -89,7 +91,10 @@ class EnergyNetwork(ThermalModel):
         position_frequencies: octaves of the place; 0 leaves it out (places in one scene tell nothing of another).
         time_frequencies: octaves of the time (paper: 10).
         time: "record" encodes the share of the record that has passed (paper), "day" the share of 24 hours, "none" leaves
-            time to the weather.
+            time to the weather. "scene" takes "day" where the weather record is longer than a day, so that hours come
+            again, else "record".
+        frames_per_cycle: training images to a cycle of an octave of time, at least: the network does not see faster ones,
+            with which it would learn images one by one; None takes all octaves (paper).
         features: "learned" per Gaussian, "given" by the scene's points, "labels" (one number per class), or "none".
         feature_size: F of learned or given features.
         attributes: "inferred" by the network at every moment (paper), "constant" by it throughout, or those of the class "table"
@@ -128,7 +133,8 @@ class EnergyNetwork(ThermalModel):
         blocks: int = 2,
         position_frequencies: int = 10,
         time_frequencies: int = 10,
-        time: str = "record",
+        time: str = "scene",
+        frames_per_cycle: float | None = 4.0,
         features: str = "learned",
         feature_size: int = 8,
         attributes: str = "inferred",
@@ -174,6 +180,8 @@ class EnergyNetwork(ThermalModel):
             raise ValueError(
                 f"interval_s must be two rising positive numbers and margin not negative, got {interval_s}"
             )
+        if frames_per_cycle is not None and not frames_per_cycle > 0:
+            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
         if set(weights or {}) - set(TERMS):
             raise ValueError(f"weights are those of {', '.join(TERMS)}, got {', '.join(weights)}")
         sizes = {"learned": feature_size, "given": feature_size, "labels": len(CLASSES), "none": 0}
@@ -187,6 +195,7 @@ class EnergyNetwork(ThermalModel):
             self.weights.pop("physical", None)  # nothing is predicted that could be compared
         self.features_from, self.feature_size = features, sizes[features]
         self.position_frequencies, self.time_frequencies, self.time = position_frequencies, time_frequencies, time
+        self.frames_per_cycle = frames_per_cycle
         self.first_steps, self.ramp_steps, self.interval_s = first_steps, ramp_steps, (shortest, longest)
         self.sampled, self.margin = sampled, margin
         self.path = None if network is None else Path(network).expanduser()
@@ -209,6 +218,8 @@ class EnergyNetwork(ThermalModel):
 
         self.register_buffer("emits", torch.tensor(True))  # the network, not the value of the first stage
         self.box, self.clock, self.range = Box(), Clock(), ImageRange()
+        self.register_buffer("daily", torch.tensor(time == "day"))  # the network sees the hour of the day
+        self.register_buffer("slow_octaves", torch.tensor(time_frequencies))  # those of time that it sees
         self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # T_min, and T_max - T_min
         self.register_buffer("weather_mean", torch.zeros(columns, dtype=torch.float64))
         self.register_buffer("weather_scale", torch.zeros(columns, dtype=torch.float64))
@@ -258,6 +269,11 @@ class EnergyNetwork(ThermalModel):
         self._past = remembered(scene.weather, self.past_h)
         for constants in (self.box, self.clock, self.range):
             constants.prepare(scene)
+        moments = scene.weather.times_s
+        self.daily.fill_(self.time == "day" or self.time == "scene" and float(moments[-1] - moments[0]) > DAY_S)
+        slowest = self.clock.span_s / DAY_S if self.daily else 0.5
+        frames = len(set(scene.train.times_s))
+        self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
         for frame in (*scene.test.frames, *scene.val.frames):
             scene.weather.at(frame.time_s)  # refuses now what would fail after training
         columns = torch.stack([self._weather_at(time) for time in scene.train.times_s])
@@ -383,7 +399,7 @@ class EnergyNetwork(ThermalModel):
     def effects(self) -> dict[str, dict]:
         missing = self._missing_columns
         used = [name for name in WEATHER_COLUMNS if name not in missing]
-        effects = {"relaxation": {"network_sees": used, "left_out": missing, "time": self.time}}
+        effects = {"relaxation": {"network_sees": used, "left_out": missing, "time": self._time}}
         if self._balanced:
             effects |= self.balance.effects(self.weather)
             effects["radiation"]["materials"] = "inferred" if self.inferred else "table"
@@ -400,6 +416,10 @@ class EnergyNetwork(ThermalModel):
     def _network_emits(self) -> bool:
         taken_over = self.path is not None and not self.training
         return taken_over or bool(self.emits)
+
+    @property
+    def _time(self) -> str:
+        return self.time if self.time == "none" else "day" if self.daily else "record"
 
     @property
     def _balanced(self) -> bool:
@@ -445,8 +465,9 @@ class EnergyNetwork(ThermalModel):
         if self.time != "none":
             # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
             clock = self.clock.spans if self.training else self.clock.within
-            share = clock(time_s) if self.time == "record" else 2.0 * math.fmod(time_s / DAY_S, 1.0)
-            parts.append(octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0])
+            share = 2.0 * math.fmod(time_s / DAY_S, 1.0) if self.daily else clock(time_s)
+            code = octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0]
+            parts.append(code * (torch.arange(self.time_frequencies) < self.slow_octaves.cpu()).repeat(2))
         return torch.cat(parts).to(self.network.own.weight)
 
     def _units(self, hidden: Tensor) -> Tensor:

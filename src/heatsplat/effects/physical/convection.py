@@ -5,7 +5,7 @@ from __future__ import annotations
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -24,7 +24,7 @@ EFFECT = Effect(
     source="ThermoGS, Eq. 6, 7",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="convection does not depend on wind",
-    threshold=SIGMAS,
+    threshold=PART_SIGMAS,
     adds="a wind-dependent exchange with the air, one driver",
     evidence=evidence,
     part=Part("state", "energy_balance", off={"wind": False}),

@@ -7,7 +7,7 @@ from dataclasses import replace
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -34,7 +34,7 @@ EFFECT = Effect(
     source="ThermoGS, Eq. 5",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="temperatures follow air and sun, not the sky",
-    threshold=SIGMAS,
+    threshold=PART_SIGMAS,
     adds="an emissivity for each Gaussian, one driver",
     evidence=evidence,
     part=Part("state", "energy_balance", off={"sky": None}),

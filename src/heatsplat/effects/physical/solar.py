@@ -5,7 +5,7 @@ from __future__ import annotations
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, PART_SIGMAS, judged
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -24,7 +24,7 @@ EFFECT = Effect(
     source="ThermoGS, Eq. 4",
     needs=frozenset({"time", "thermal_range", "weather"}),
     null="temperatures follow the air, not the irradiance",
-    threshold=SIGMAS,
+    threshold=PART_SIGMAS,
     adds="an absorptivity for each Gaussian, one driver",
     evidence=evidence,
     part=Part("state", "energy_balance", off={"sun": False}),
