@@ -144,6 +144,12 @@ class Certainty:
         slopes = (fit.data.tracks.slopes * used).sum(1) / used.sum(1).clamp_min(1.0)
         return bool(left[slopes <= slopes.quantile(EVEN)].quantile(OF_POINTS) < EXPLAINED)
 
+    @cached_property
+    def changes(self) -> bool:
+        """Whether courses over time explain what was left out beside the model, or cannot be asked for."""
+        changing = self._changing(self.model)
+        return not changing or any(self._shows(one, self.model) for one in changing)
+
     def few(self, name: str) -> str:
         """That the record has too few frames to tell an effect that was left out, and how many are needed; empty where it has
         enough, and where nothing is left that it could explain."""
@@ -155,14 +161,14 @@ class Certainty:
         if self.explained:
             return ""
         if in_time:
-            return lacking if self._changes else ""
+            return lacking if self.changes else ""
         tried = [more for other, more in candidates(self.fit, self.model) if other == name]
         return lacking if not tried or any(self._shows(more, self.model) for more in tried) else ""
 
     @cached_property
     def unseen_changes(self) -> str:
         """That the scene may change in ways that the record has too few frames to follow; empty where it cannot."""
-        return self._unfollowed if not self.explained and self._changes else ""
+        return self._unfollowed if not self.explained and self.changes else ""
 
     @cached_property
     def _unfollowed(self) -> str:
@@ -185,12 +191,6 @@ class Certainty:
         if data.usual_length >= needed:
             return ""
         return f"of {data.frames} frames {data.usual_length:.0f} see a point, and {needed} are needed"
-
-    @cached_property
-    def _changes(self) -> bool:
-        """Whether courses over time explain what was left out beside the model, or cannot be asked for."""
-        changing = self._changing(self.model)
-        return not changing or any(self._shows(one, self.model) for one in changing)
 
     def beside_weather(self, model: Model) -> Model:
         """The model in a scene that changes in any way, where a weather record says roughly in which."""

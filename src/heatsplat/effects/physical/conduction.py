@@ -23,7 +23,8 @@ LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 def evidence(inspected: Inspection) -> Evidence:
     """Whether contrasts between neighbours fade faster than the levels that they share.
 
-    Where every point relaxes by itself, an excess and a difference of two excesses fade alike.
+    Where every point relaxes by itself, an excess and a difference of two excesses fade alike. So they do where a camera's gain
+    drifts, which may pass for relaxation of all points, but not for a flow: that has courses of its own.
     """
     obs = inspected.obs
     if inspected.joint is None or obs.times_s is None:
@@ -35,7 +36,7 @@ def evidence(inspected: Inspection) -> Evidence:
         if "harmonic_source" in model.names:
             return Evidence(None, "cannot be told: a source hides how contrasts fade", told=False)
         doubt = inspected.certainty.doubts.get("relaxation") or inspected.certainty.few("relaxation")
-        if doubt and "relaxation" not in model.names:
+        if doubt and "relaxation" not in model.names and inspected.certainty.changes:
             return Evidence(None, f"cannot be told, as whether anything changes over time: {doubt}", told=False)
         return Evidence(0.0, "nothing changes over time, so that no flow between neighbours shows")
     early, late, used = early_and_late(fit, model)
