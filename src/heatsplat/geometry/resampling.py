@@ -68,7 +68,10 @@ def resampled(image: Tensor, height: int, width: int, kernel: str = "bicubic") -
         return image
     rows = weights(image.shape[0], height, kernel).to(image)
     columns = weights(image.shape[1], width, kernel).to(image)
-    return torch.einsum("bw,awc->abc", columns, torch.einsum("ah,hwc->awc", rows, image))
+    planes = image.permute(2, 0, 1)
+    # What shrinks goes first.
+    planes = (rows @ planes) @ columns.T if height < image.shape[0] else rows @ (planes @ columns.T)
+    return planes.permute(1, 2, 0)
 
 
 def valid_after(mask: Tensor, height: int, width: int, kernel: str = "bicubic") -> Tensor:
