@@ -67,6 +67,8 @@ them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere 
 **Weather.** Sun, sky and wind are judged by heat balances fitted with and without them (`effects/weathered.py`); massive
 walls by balances of bodies with one rate, with a core, and of infinite depth.
 
+- Sun, sky and wind count from a gain of two standard errors on: a part that is absent loses on held-out observations. On the 200
+  scenes below that were not inspected, three standard errors found 61 of 91, two find 70, and one more is wrongly found.
 - Shadows are cast by the sparse points and add no parameter to a balance. They gain 0.13 dB (3.2 standard errors) on
   `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, which has none.
 - Hidden sky, light from the ground and reflected sky are tested in the same way, but they also absorb other errors of a

@@ -47,6 +47,7 @@ def by_hand(model, means, time_s):
     """The factor in double precision, layer by layer: a plain perceptron on the code of place and of time, side by side."""
     place = octaves(((means.double() - model.box.center) / model.box.edge).clamp(-0.9, 0.9), model.position_frequencies)
     moment = octaves(torch.tensor([[(time_s - 5.0) / 40.0]], dtype=torch.float64), model.time_frequencies)
+    moment[:, [k % model.time_frequencies >= model.slow_octaves for k in range(moment.shape[1])]] = 0.0
     code = torch.cat((place, moment.expand(len(place), -1)), 1)
     hidden = code
     for i, layer in enumerate(model.layers):

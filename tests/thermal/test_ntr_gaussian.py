@@ -1,6 +1,7 @@
 """NTR-Gaussian: the integral against closed forms and a fine rule, its stages, its penalties, its gradients."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -59,7 +60,7 @@ def test_a_steady_balance_integrates_exactly():
 
 def test_more_nodes_converge_at_second_order():
     errors = []
-    model, splats, _ = make()
+    model, splats, _ = make(frames_per_cycle=None)
     exact = None
     with torch.no_grad():
         for parameter in model.parameters():
@@ -103,6 +104,20 @@ def test_the_ends_of_the_record_are_held_beyond_it():
     assert torch.equal(model.features(splats, at(last + 3600.0)), model.features(splats, at(last)))
     assert torch.equal(model.features(splats, at(first - 3600.0)), model.features(splats, at(first)))
     assert not torch.equal(model.features(splats, at(first)), model.features(splats, at(last)))
+
+
+def test_hours_come_again_where_the_weather_goes_on_for_more_than_a_day():
+    model, splats, scene = make(time="day")
+    with torch.no_grad():
+        model.temperature_head.weight.normal_(generator=torch.Generator().manual_seed(2))
+    noon, next_noon, evening = (model.features(splats, at(hours * HOUR_S)) for hours in (6, 30, 12))
+    torch.testing.assert_close(noon, next_noon)
+    assert not torch.allclose(noon, evening, atol=1e-3)
+    for days in (0.9, 2.0):
+        model.time, times = "scene", scene.weather.times_s
+        stretch = days * 24 * HOUR_S / float(times[-1] - times[0])
+        model.prepare(replace(scene, weather=replace(scene.weather, times_s=times[0] + stretch * (times - times[0]))))
+        assert bool(model.daily) == (days > 1)
 
 
 def test_penalties_are_there_with_gradients_and_absent_at_weight_zero():

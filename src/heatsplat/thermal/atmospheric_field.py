@@ -63,7 +63,7 @@ class AtmosphericField(Wrapper):
         skip: int | None = None,
         position_frequencies: int = 10,
         time_frequencies: int = 10,
-        frames_per_cycle: float | None = None,
+        frames_per_cycle: float | None = 4.0,
         positions: str = "box",
         time: str = "auto",
         exponent: str = "printed",

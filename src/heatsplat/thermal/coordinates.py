@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData, ThermalRange
-from heatsplat.physics.units import kelvin
+from heatsplat.physics.units import DAY_S, kelvin
 
 BOX_EDGE = 0.9  # places end here: the code of ``octaves`` has period 2 and would repeat from 1 on
 
@@ -89,6 +89,11 @@ class ImageRange(nn.Module):
     def kelvin(self, units: Tensor) -> Tensor | None:
         """Temperatures in kelvin of image values, any shape; None where they are unknown."""
         return None if self.bounds is None else self.lowest_k + self.bounds.span_k * units
+
+
+def hours_come_again(scene: SceneData) -> bool:
+    """Whether the weather record is longer than a day, so that the hour says more of a moment than how much has passed."""
+    return scene.weather is not None and float(scene.weather.times_s[-1] - scene.weather.times_s[0]) > DAY_S
 
 
 def octaves(values: Tensor, count: int) -> Tensor:

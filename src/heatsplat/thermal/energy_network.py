@@ -18,7 +18,7 @@ from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
-from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves, slow_octaves
+from heatsplat.thermal.coordinates import Box, Clock, ImageRange, hours_come_again, octaves, slow_octaves
 from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
@@ -269,8 +269,7 @@ class EnergyNetwork(ThermalModel):
         self._past = remembered(scene.weather, self.past_h)
         for constants in (self.box, self.clock, self.range):
             constants.prepare(scene)
-        moments = scene.weather.times_s
-        self.daily.fill_(self.time == "day" or self.time == "scene" and float(moments[-1] - moments[0]) > DAY_S)
+        self.daily.fill_(self.time == "day" or self.time == "scene" and hours_come_again(scene))
         slowest = self.clock.span_s / DAY_S if self.daily else 0.5
         frames = len(set(scene.train.times_s))
         self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))

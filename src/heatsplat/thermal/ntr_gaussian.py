@@ -6,14 +6,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm, softplus
 
-from heatsplat.contracts import SceneData
-from heatsplat.physics.units import STEFAN_BOLTZMANN
+from heatsplat.contracts import SceneData, check_option
+from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
-from heatsplat.thermal.coordinates import Box, Clock, ImageRange, octaves
+from heatsplat.thermal.coordinates import Box, Clock, ImageRange, hours_come_again, octaves, slow_octaves
 from heatsplat.thermal.layers import draw_uniform
 
+TIMES = ("scene", "record", "day")
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
 STORAGE = 1.0e5  # J/m²/K, unit of the heat capacity: 5 cm of ground
 ATTRIBUTE_NETWORKS = ("of_feature", "of_place", "of_state", "attribute_")  # what their parameters' names begin with
@@ -38,6 +39,10 @@ class NtrGaussian(ThermalModel):
         nodes: of the trapezoid rule (paper: 6).
         window_s: longest window of the integral in seconds (paper: 3600).
         position_frequencies, time_frequencies: octaves of the encodings (paper: 10).
+        time: "record" encodes the share of the record that has passed (paper), "day" the share of 24 hours; "scene" takes "day"
+            where the scene has a weather record of more than a day, else "record".
+        frames_per_cycle: training images to a cycle of an octave of time, at least: the networks do not see faster ones; None
+            takes all octaves (paper).
         feature_size: numbers per Gaussian that are learned (paper: 32 from Feature-3DGS).
         first_steps: steps of the first stage.
         consistency: weight of the mean (T - T_net)², image units.
@@ -52,7 +57,7 @@ class NtrGaussian(ThermalModel):
 
     needs = frozenset({"time", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
-    beyond_record = "temperatures stay as at the nearest moment of the record"
+    beyond_record = "the networks see the hour, or the nearest moment of a record without weather of more than a day"
 
     def __init__(
         self,
@@ -61,6 +66,8 @@ class NtrGaussian(ThermalModel):
         window_s: float = 3600.0,
         position_frequencies: int = 10,
         time_frequencies: int = 10,
+        time: str = "scene",
+        frames_per_cycle: float | None = 4.0,
         feature_size: int = 8,
         first_steps: int = 0,
         consistency: float = 1.0,
@@ -80,7 +87,10 @@ class NtrGaussian(ThermalModel):
                 "width and nodes must be at least 2, the encodings and feature_size at least 1 and window_s positive, got "
                 f"{width}, {nodes}, {position_frequencies}, {time_frequencies}, {feature_size}, {window_s}"
             )
-        self.nodes, self.window_s = nodes, window_s
+        check_option("time", time, TIMES)
+        if frames_per_cycle is not None and not frames_per_cycle > 0:
+            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
+        self.nodes, self.window_s, self.time, self.frames_per_cycle = nodes, window_s, time, frames_per_cycle
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         self.feature_size, self.first_steps = feature_size, first_steps
         self.weights = {
@@ -107,6 +117,8 @@ class NtrGaussian(ThermalModel):
             )
         self.normalised, self.lr_attributes = normalised, lr_attributes
         self.clock, self.box, self.range = Clock(), Box(), ImageRange()
+        self.register_buffer("daily", torch.tensor(time == "day"))  # the networks see the hour of the day
+        self.register_buffer("slow_octaves", torch.tensor(time_frequencies))  # those of time that the networks see
         self.register_buffer("ambient", torch.full((), 0.5))
         self.register_buffer("emits", torch.tensor(first_steps == 0))
         self._storage = STORAGE
@@ -117,6 +129,10 @@ class NtrGaussian(ThermalModel):
     def prepare(self, scene: SceneData) -> None:
         for constants in (self.clock, self.box, self.range):
             constants.prepare(scene)
+        frames = len(set(scene.train.times_s))
+        self.daily.fill_(self.time == "day" or self.time == "scene" and hours_come_again(scene))
+        slowest = self.clock.span_s / DAY_S if self.daily else 0.5
+        self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
         bounds = scene.thermal_range
         self.ambient.fill_(0.5 if scene.ambient_c is None else bounds.to_unit(scene.ambient_c))
         # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
@@ -167,14 +183,17 @@ class NtrGaussian(ThermalModel):
     # The integral ---------------------------------------------------------------------------------------
 
     def _units(self, splats: Splats, ids: Tensor | None, time_s: float) -> Tensor:
-        """Temperatures [n] in image units at the moment of the record that is nearest to ``time_s``."""
-        time_s = min(max(time_s, self.clock.first_s), self.clock.first_s + self.clock.span_s)
+        """Temperatures [n] in image units at ``time_s``, or at the moment of the record that is nearest if hours do not count."""
+        if not self.daily:
+            time_s = min(max(time_s, self.clock.first_s), self.clock.first_s + self.clock.span_s)
         rows = (lambda tensor: tensor) if ids is None else (lambda tensor: tensor.index_select(0, ids))
         means, feature = rows(splats.means).detach(), rows(splats["feature"])
         code = octaves(self.box.places(means), self.position_frequencies)
-        start = max(self.clock.first_s, time_s - self.window_s)
+        start = time_s - self.window_s if self.daily else max(self.clock.first_s, time_s - self.window_s)
         times = torch.linspace(start, time_s, self.nodes, dtype=torch.float64)
-        moments = octaves(((times - self.clock.first_s) / self.clock.span_s)[:, None], self.time_frequencies).to(code)
+        shares = 2.0 * (times / DAY_S) if self.daily else (times - self.clock.first_s) / self.clock.span_s
+        moments = octaves(shares[:, None], self.time_frequencies).to(code)
+        moments = moments * (torch.arange(self.time_frequencies) < self.slow_octaves.cpu()).repeat(2).to(code)
         env, wind = self.env(moments).sigmoid().unbind(1)
         units = self._network(self.place(code), moments)
         rates = self._rates(units, env, wind, moments, feature, code)
