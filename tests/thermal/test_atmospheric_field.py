@@ -113,7 +113,7 @@ def test_only_gaussians_in_view_are_evaluated():
 
 def test_the_field_of_ti3dgs_adds_a_sensitivity_and_nothing_else():
     field, splats = make(exponent="positive", disturb=0.4)
-    imaging, _ = make(kind=ImagingField, exponent="positive", frames_per_cycle=None, disturb=0.4)
+    imaging, _ = make(kind=ImagingField, exponent="positive", disturb=0.4)
     assert (field.head.out_features, imaging.head.out_features) == (3, 4)
     with torch.no_grad():
         imaging.head.weight[:3], imaging.head.weight[3] = field.head.weight, 0.0
