@@ -74,7 +74,7 @@ class Tone(SensorPart):
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
         answers = self.network(self.levels)
-        self._answers = answers if self.training and torch.is_grad_enabled() else None
+        self._answers = answers if self.weight and self.training and torch.is_grad_enabled() else None
         curve = self.bounds * answers.tanh()
         line = 0.0 if self.straight else self._line(curve)
         if not self.exact:

@@ -9,7 +9,7 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData, check_option
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
-from heatsplat.thermal.coordinates import Box, Clock, octaves, slow_octaves
+from heatsplat.thermal.coordinates import Box, Clock, check_frames_per_cycle, octaves, slow_octaves
 from heatsplat.thermal.layers import draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
 
@@ -82,8 +82,7 @@ class AtmosphericField(Wrapper):
             )
         if skip is not None and not 1 <= skip < depth:
             raise ValueError(f"skip must name a hidden layer from 1 to {depth - 1}, or be null, got {skip}")
-        if frames_per_cycle is not None and not frames_per_cycle > 0:
-            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
+        check_frames_per_cycle(frames_per_cycle)
         if exponent_max is not None and not exponent_max > 0:
             raise ValueError(f"exponent_max must be positive or null, got {exponent_max}")
         self.positive, self.exponent_max = exponent == "positive", exponent_max
@@ -198,11 +197,7 @@ class AtmosphericField(Wrapper):
         else:
             fraction = self.clock.within(moment)
         when = torch.tensor([[fraction]], dtype=torch.float64, device=self.start.device)
-        code = octaves(when, self.time_frequencies)[0].to(self.head.weight)
-        if self.frames_per_cycle is None:
-            return code
-        slow = torch.arange(self.time_frequencies, device=code.device) < self.slow_octaves
-        return code * slow.repeat(2)
+        return octaves(when, self.time_frequencies, self.slow_octaves)[0].to(self.head.weight)
 
     @property
     def _time_source(self) -> str:

@@ -91,12 +91,18 @@ class ImageRange(nn.Module):
         return None if self.bounds is None else self.lowest_k + self.bounds.span_k * units
 
 
-def hours_come_again(scene: SceneData) -> bool:
-    """Whether the weather record is longer than a day, so that the hour says more of a moment than how much has passed."""
-    return scene.weather is not None and float(scene.weather.times_s[-1] - scene.weather.times_s[0]) > DAY_S
+def sees_hours(time: str, scene: SceneData) -> bool:
+    """Whether a network sees the hour of the day, not the share of the record that has passed.
+
+    Args:
+        time: "day", "record", "none", or "scene": where the weather record is longer than a day, so that hours come again.
+    """
+    weather = scene.weather
+    longer = weather is not None and float(weather.times_s[-1] - weather.times_s[0]) > DAY_S
+    return time == "day" or (time == "scene" and longer)
 
 
-def octaves(values: Tensor, count: int) -> Tensor:
+def octaves(values: Tensor, count: int, slow: Tensor | None = None) -> Tensor:
     """sin(2^k π p) and cos(2^k π p) of every column p for k below ``count``, [n, 2 count D] (TI-3DGS, Eq. 11).
 
     Multiples of the period are taken away before π comes in, which is exact; sin(2^9 π p) taken directly has lost three
@@ -105,10 +111,20 @@ def octaves(values: Tensor, count: int) -> Tensor:
     Args:
         values: [n, D].
         count: octaves.
+        slow: [] how many of them are there (``slow_octaves``), the others are 0; None is all.
     """
     scaled = values[:, :, None] * 2.0 ** torch.arange(count, dtype=values.dtype, device=values.device)
     phase = math.pi * (scaled - 2.0 * torch.round(scaled / 2.0))
+    if slow is not None:
+        seen = torch.arange(count, device=values.device) < slow.to(values.device)
+        return torch.cat((phase.sin() * seen, phase.cos() * seen), 2).flatten(1)
     return torch.cat((phase.sin(), phase.cos()), 2).flatten(1)
+
+
+def check_frames_per_cycle(value: float | None) -> None:
+    """Raises ValueError where images to a cycle are not positive, or None."""
+    if value is not None and not value > 0:
+        raise ValueError(f"frames_per_cycle must be positive or null, got {value}")
 
 
 def slow_octaves(count: int, frames: int, frames_per_cycle: float | None, slowest: float) -> int:

@@ -18,7 +18,15 @@ from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
-from heatsplat.thermal.coordinates import Box, Clock, ImageRange, hours_come_again, octaves, slow_octaves
+from heatsplat.thermal.coordinates import (
+    Box,
+    Clock,
+    ImageRange,
+    check_frames_per_cycle,
+    octaves,
+    sees_hours,
+    slow_octaves,
+)
 from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
 from heatsplat.thermal.residual_network import ResidualNetwork
@@ -180,8 +188,7 @@ class EnergyNetwork(ThermalModel):
             raise ValueError(
                 f"interval_s must be two rising positive numbers and margin not negative, got {interval_s}"
             )
-        if frames_per_cycle is not None and not frames_per_cycle > 0:
-            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
+        check_frames_per_cycle(frames_per_cycle)
         if set(weights or {}) - set(TERMS):
             raise ValueError(f"weights are those of {', '.join(TERMS)}, got {', '.join(weights)}")
         sizes = {"learned": feature_size, "given": feature_size, "labels": len(CLASSES), "none": 0}
@@ -269,7 +276,7 @@ class EnergyNetwork(ThermalModel):
         self._past = remembered(scene.weather, self.past_h)
         for constants in (self.box, self.clock, self.range):
             constants.prepare(scene)
-        self.daily.fill_(self.time == "day" or self.time == "scene" and hours_come_again(scene))
+        self.daily.fill_(sees_hours(self.time, scene))
         slowest = self.clock.span_s / DAY_S if self.daily else 0.5
         frames = len(set(scene.train.times_s))
         self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
@@ -465,8 +472,9 @@ class EnergyNetwork(ThermalModel):
             # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
             clock = self.clock.spans if self.training else self.clock.within
             share = 2.0 * math.fmod(time_s / DAY_S, 1.0) if self.daily else clock(time_s)
-            code = octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies)[0]
-            parts.append(code * (torch.arange(self.time_frequencies) < self.slow_octaves.cpu()).repeat(2))
+            parts.append(
+                octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies, self.slow_octaves)[0]
+            )
         return torch.cat(parts).to(self.network.own.weight)
 
     def _units(self, hidden: Tensor) -> Tensor:

@@ -11,7 +11,15 @@ from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
-from heatsplat.thermal.coordinates import Box, Clock, ImageRange, hours_come_again, octaves, slow_octaves
+from heatsplat.thermal.coordinates import (
+    Box,
+    Clock,
+    ImageRange,
+    check_frames_per_cycle,
+    octaves,
+    sees_hours,
+    slow_octaves,
+)
 from heatsplat.thermal.layers import draw_uniform
 
 TIMES = ("scene", "record", "day")
@@ -88,8 +96,7 @@ class NtrGaussian(ThermalModel):
                 f"{width}, {nodes}, {position_frequencies}, {time_frequencies}, {feature_size}, {window_s}"
             )
         check_option("time", time, TIMES)
-        if frames_per_cycle is not None and not frames_per_cycle > 0:
-            raise ValueError(f"frames_per_cycle must be positive or null, got {frames_per_cycle}")
+        check_frames_per_cycle(frames_per_cycle)
         self.nodes, self.window_s, self.time, self.frames_per_cycle = nodes, window_s, time, frames_per_cycle
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         self.feature_size, self.first_steps = feature_size, first_steps
@@ -130,7 +137,7 @@ class NtrGaussian(ThermalModel):
         for constants in (self.clock, self.box, self.range):
             constants.prepare(scene)
         frames = len(set(scene.train.times_s))
-        self.daily.fill_(self.time == "day" or self.time == "scene" and hours_come_again(scene))
+        self.daily.fill_(sees_hours(self.time, scene))
         slowest = self.clock.span_s / DAY_S if self.daily else 0.5
         self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
         bounds = scene.thermal_range
@@ -192,8 +199,7 @@ class NtrGaussian(ThermalModel):
         start = time_s - self.window_s if self.daily else max(self.clock.first_s, time_s - self.window_s)
         times = torch.linspace(start, time_s, self.nodes, dtype=torch.float64)
         shares = 2.0 * (times / DAY_S) if self.daily else (times - self.clock.first_s) / self.clock.span_s
-        moments = octaves(shares[:, None], self.time_frequencies).to(code)
-        moments = moments * (torch.arange(self.time_frequencies) < self.slow_octaves.cpu()).repeat(2).to(code)
+        moments = octaves(shares[:, None], self.time_frequencies, self.slow_octaves).to(code)
         env, wind = self.env(moments).sigmoid().unbind(1)
         units = self._network(self.place(code), moments)
         rates = self._rates(units, env, wind, moments, feature, code)
