@@ -42,6 +42,26 @@ def check_numbers(name: str, value: Any, count: int | None = None, error: type[V
         raise error(f"{name} must be {wanted}, got {list(value) if listed else value}")
 
 
+SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
+
+
+@dataclass(frozen=True)
+class Course:
+    """How something that a whole scene or its camera has in common changes over the record.
+
+    Args:
+        name: what it is, in words for a title.
+        times_s: seconds since the first training frame, increasing.
+        values: at these times.
+        unit: of the values; SHARE_OF_RANGE for differences of image values.
+    """
+
+    name: str
+    times_s: Sequence[float]
+    values: Sequence[float]
+    unit: str
+
+
 @dataclass(frozen=True)
 class ThermalRange:
     """The temperatures that image values 0 and 1 stand for; linear between them, in °C."""
@@ -346,6 +366,12 @@ class SceneData:
         """Centre [3] and longest edge of the box that holds the points but for a hundredth at each end of every axis."""
         low, high = torch.quantile(self.points.float(), torch.tensor([0.01, 0.99]), dim=0)
         return (low + high) / 2, max((high - low).max().item(), 1e-12)
+
+    @property
+    def distance(self) -> float:
+        """Median distance between the training cameras and the middle of the points, in world units."""
+        centers = torch.stack([frame.camera.center for frame in self.train.frames])
+        return (self.points.double().median(0).values - centers).norm(dim=1).median().item()
 
     @property
     def record(self) -> tuple[float, float]:

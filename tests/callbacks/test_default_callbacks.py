@@ -54,6 +54,7 @@ def test_an_evaluation_has_the_measuring_part():
         "attributes",
         "attribute_errors",
         "probes",
+        "courses",
         "learned",
         "surfaces",
         "turntable",

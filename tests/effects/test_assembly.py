@@ -109,6 +109,24 @@ def test_what_evidence_found_is_where_parts_start():
         assembled("attenuation", attenuation={"colour": 1})
 
 
+def test_the_evidence_or_the_user_says_whether_points_share_the_course_of_a_source():
+    both = {"source": "common", "frequencies": 7, "course": [0.0, 1.0, 0.5]}
+    common = assembled("relaxation", "harmonic_source", harmonic_source=both)["thermal"]["state"]
+    assert common["_target_"].endswith(".CommonSource") and common["course"] == [0.0, 1.0, 0.5]
+    assert "frequencies" not in common
+    apart = assembled("relaxation", "harmonic_source", harmonic_source=both | {"source": "harmonics"})["thermal"][
+        "state"
+    ]
+    assert apart["_target_"].endswith(".NewtonHarmonic") and apart["frequencies"] == 7 and "course" not in apart
+    on = verdicts("relaxation", "harmonic_source", harmonic_source=both)
+    asked = assembly.assemble(on, config("method=auto", "effects.source=harmonics")["effects"])
+    assert asked["thermal"]["state"] == apart
+    without = assembled("relaxation", harmonic_source=both)["thermal"]["state"]
+    assert without["_target_"].endswith(".NewtonHarmonic") and without["frequencies"] == 0
+    with pytest.raises(SceneError, match="effects.source must be one of scene, harmonics, common, got 'lamp'"):
+        assembly.assemble(on, config("method=auto", "effects.source=lamp")["effects"])
+
+
 def test_what_is_set_by_hand_wins_over_the_evidence():
     by_hand = config(
         "method=auto", "effects.parts.attenuation.moments=8", "effects.states.newton_harmonic.frequencies=5"

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.physics.first_look import RELAXES, STAYS, first_rates
+from heatsplat.physics.first_look import RELAXES, STAYS, first_numbers, first_rates
 
 AMBIENT = torch.tensor(0.2)
 SPANS = torch.linspace(0, 1, 24, dtype=torch.float64)
@@ -51,3 +51,26 @@ def test_bodies_that_are_hardly_or_never_seen_stay():
 def test_looks_of_one_moment_tell_no_rate():
     found = first_rates(torch.full((2, 5), 0.7), torch.zeros(5, dtype=torch.float64), AMBIENT)
     assert found.tolist() == pytest.approx([STAYS] * 2)
+
+
+def test_numbers_of_courses_stand_what_hid_a_body_in_some_views():
+    """A fifth of the looks show something else."""
+    generator = torch.Generator().manual_seed(0)
+    courses = torch.randn(60, 4, generator=generator)
+    courses = torch.linalg.qr(courses).Q * 60**0.5
+    numbers = 0.2 * torch.randn(30, 4, generator=generator)
+    looks = numbers @ courses.T + 0.003 * torch.randn(30, 60, generator=generator)
+    looks[:, ::5] = 0.9
+    looks[:, 1::7] = torch.nan
+    found = first_numbers(looks, courses, looks.nanmedian(1).values)
+    seen = ~looks[0].isnan()
+    squares = torch.linalg.lstsq(courses[seen], looks[:, seen].T).solution.T
+    assert (found - numbers).abs().mean() < 0.5 * (squares - numbers).abs().mean()
+
+
+def test_bodies_that_are_hardly_seen_start_at_their_level():
+    courses = torch.stack([torch.ones(8), torch.linspace(-1.5, 1.5, 8)], 1)
+    looks = torch.full((2, 8), torch.nan)
+    looks[1, 3] = 0.7
+    found = first_numbers(looks, courses, torch.tensor([0.4, 0.7]))
+    torch.testing.assert_close(found, torch.tensor([[0.4, 0.0], [0.7, 0.0]]), rtol=0, atol=1e-5)

@@ -13,6 +13,7 @@ from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.common_source import CommonSource
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.conduction import Conducting, laplacian
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
@@ -25,8 +26,9 @@ STATES = {
     "static": lambda **options: Static(**options),
     "relaxation": lambda **options: NewtonHarmonic(frequencies=0, **options),
     "harmonic": lambda **options: NewtonHarmonic(frequencies=4, **options),
+    "common": lambda **options: CommonSource(moments=5, **options),
 }
-OPEN = {"static": {"floor": False}, "relaxation": {"clip": "none"}, "harmonic": {"clip": "none"}}
+OPEN = {"static": {"floor": False}} | dict.fromkeys(("relaxation", "harmonic", "common"), {"clip": "none"})
 PARTS = {
     "view_dependence": lambda: ViewDependence(sh_degree_interval=0),
     "reflection": lambda: Reflection(),
@@ -203,13 +205,19 @@ def test_air_of_an_unknown_temperature_is_learned():
     assert {name for name, _ in other.named_parameters()} == {"log_depth", "level"}
 
 
-def test_extinction_over_the_record_is_linear_in_its_logarithm_between_moments():
-    part = Attenuation(moments=3)
+def test_extinction_over_the_record_is_cubic_in_its_logarithm_between_moments():
+    part = Attenuation(depth=[math.exp(-2.0), 1.0, math.exp(-1.0)], moments=3)
     part.prepare(scene())
-    with torch.no_grad():
-        part.log_depth.copy_(torch.tensor([-2.0, 0.0, -1.0]))
     typical = part.typical.item()
-    for time_s, expected in ((-50, -2.0), (0, -2.0), (100, -1.0), (200, 0.0), (300, -0.5), (400, -1.0), (900, -1.0)):
+    for time_s, expected in (
+        (-50, -2.0),
+        (0, -2.0),
+        (100, -0.8125),
+        (200, 0.0),
+        (300, -0.3125),
+        (400, -1.0),
+        (900, -1.0),
+    ):
         assert part.extinction(time_s).item() == pytest.approx(math.exp(expected) / typical, rel=1e-5)
     with pytest.raises(ValueError, match="give time_s"):
         part.extinction(None)
@@ -217,23 +225,33 @@ def test_extinction_over_the_record_is_linear_in_its_logarithm_between_moments()
 
 def test_extinction_goes_on_through_a_gap_as_it_bends_on_both_sides():
     """Moments that no view sees: four on a parabola, whose top lies in the gap between them."""
-    part = Attenuation(moments=7)
+    part = Attenuation(moments=7, smooth=1e-6)
     part.prepare(scene())
-    parabola = 1 - (torch.arange(7) - 3.0).square() / 9
+    parabola = 1 - (torch.arange(7) - 3.0).square() / 12
     seen = torch.tensor([0, 1, 5, 6])
     optimizer = torch.optim.LBFGS(part.parameters(), max_iter=200, line_search_fn="strong_wolfe")
 
     def closure():
         optimizer.zero_grad()
-        fit = (part.log_depth[seen] - parabola[seen]).square().sum()
+        fit = (part.log_depth.exp()[seen] - parabola[seen]).square().sum()
         loss = fit + part.regularisers(splats_of(made("static")))["extinction_smooth"]
         loss.backward()
         return loss
 
     optimizer.step(closure)
-    top = part.log_depth.detach()[3].item()
-    assert top == pytest.approx(1, abs=0.15)  # a straight line through the gap would be at 0.56
+    top = part.log_depth.detach()[3].exp().item()
+    assert top == pytest.approx(1, abs=0.05)  # a straight line through the gap would be at 0.67
     assert Attenuation(moments=2).regularisers(None) == Attenuation(moments=0).regularisers(None) == {}
+
+
+def test_what_air_costs_does_not_depend_on_how_thick_it_is():
+    """Or heat that is lost at all times alike would be given to the air, whose logarithm bends less then."""
+    swing = [0.1, 0.3, 0.2, 0.5, 0.1]
+    costs = [
+        Attenuation(depth=[depth + more for depth in swing], moments=5).regularisers(None)["extinction_smooth"].item()
+        for more in (0.0, 1.0)
+    ]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-5) and costs[0] > 0
 
 
 @pytest.mark.parametrize("log_depth", [-1e4, 1e4])
@@ -345,6 +363,7 @@ def test_needs_are_those_of_all_owners():
         (lambda: Reflection(degree=3), "degree must be 0 to 2"),
         (lambda: Attenuation(depth=0), "depth must be positive and moments 0 or at least 2"),
         (lambda: Attenuation(moments=1), "depth must be positive and moments 0 or at least 2"),
+        (lambda: Attenuation(depth=[0.1, 0.2], moments=3), "one number or one for each of 3 moments, got 2"),
         (lambda: Conducting(Static(), neighbours=0), "neighbours and every must be at least 1"),
     ],
 )

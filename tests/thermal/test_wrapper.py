@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 import heatsplat.thermal
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.contracts import Camera, Course, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import AtmosphericField
 from heatsplat.thermal.attenuation import Attenuation
@@ -35,6 +35,8 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]
 QUERY = Query(None, CAMERA, 5.0, 1)
 MOVED = Geometry(torch.ones(COUNT, 3), torch.ones(COUNT, 4), torch.ones(COUNT, 3), torch.ones(1, COUNT))
 DROPPED = ("probe", torch.arange(COUNT) < 3, {})
+
+PROBED = Course("depth of the probe", [0.0, 5.0], [1.0, 2.0], "m")
 
 
 class Probe(ThermalModel):
@@ -106,6 +108,9 @@ class Probe(ThermalModel):
 
     def effects(self):
         return {"probing": {"how": "deep"}}
+
+    def courses(self):
+        return [PROBED]
 
     @property
     def cost(self):
@@ -197,6 +202,7 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
         assert model.removable == ("needle",)
         with model.without("needle"):
             assert probe.told[-1] == "without needle"
+    assert PROBED in model.courses()
     model.features(splats, QUERY)
     assert model.regularisers(splats)["probe/term"].grad_fn is not None
     assert list(model.rows_to_drop(splats, 3)) == [DROPPED]

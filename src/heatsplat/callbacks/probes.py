@@ -13,7 +13,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
-from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.pictures import figure_picture, time_unit, write_png
 from heatsplat.io.tables import write_csv
 
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
@@ -208,10 +208,7 @@ def _figure(
     title: str,
 ) -> Figure:
     """Curves of all probes: lines are the model, dashes the truth, dots what images recorded; shaded beyond the record."""
-    span = times[-1] - times[0]
-    divisor, word = next(
-        (d, w) for limit, d, w in ((300, 1, "s"), (3 * 3600, 60, "min"), (np.inf, 3600, "h")) if span < limit
-    )
+    divisor, word = time_unit(times[-1] - times[0])
     figure = Figure(figsize=(9, 4.2), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     outside = [(times[0], record[0]), (record[1], times[-1])]

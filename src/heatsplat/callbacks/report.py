@@ -16,6 +16,7 @@ from rich.table import Table
 
 from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.board import board
+from heatsplat.callbacks.courses import COURSES_PICTURE
 from heatsplat.callbacks.images import file_stem
 from heatsplat.callbacks.metrics import TEST_FILE
 from heatsplat.callbacks.page import PAGE_FILE, write_page
@@ -234,6 +235,7 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
         lines += ["", "## Quality over training time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
         lines += ["", f"Values: [{CURVE_FILE}]({CURVE_FILE})."]
     lines += _picture_section("Temperature over time", folder, "renders/probes.png", "probes")
+    lines += _picture_section("What all surfaces or images share over time", folder, COURSES_PICTURE, "learned courses")
     lines += _surfaces_section(folder)
     lines += learned_section(folder)
     lines += ["", "## The run", "", *_bullets(run)]

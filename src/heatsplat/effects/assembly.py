@@ -200,26 +200,44 @@ def _on(verdicts: Mapping[str, Verdict]) -> list[str]:
 
 def _parts(slot: str, verdicts: Mapping[str, Verdict], templates: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the parts of a slot that simulate effects that are on, by name, in the order of the catalogue."""
+    choices = templates
     for key in SLOTS[slot]:
         templates = templates[key]
     users = [effect for effect in CATALOGUE if effect.part.slot == slot]
+    chosen = {effect.name: _part_of(effect, verdicts[effect.name], choices) for effect in users}
     parts = {}
-    for name in dict.fromkeys(effect.part.name for effect in users if verdicts[effect.name].on):
-        mine = [effect for effect in users if effect.part.name == name]
-        parts[name] = _set(templates[name], [verdicts[effect.name] for effect in mine if verdicts[effect.name].on])
+    for name in dict.fromkeys(chosen[effect.name] for effect in users if verdicts[effect.name].on):
+        mine = [effect for effect in users if chosen[effect.name] == name]
+        parts[name] = _set(templates[name], [effect for effect in mine if verdicts[effect.name].on], verdicts)
         for effect in mine:
             parts[name] |= {} if verdicts[effect.name].on else effect.part.off
+        for effect in users:  # simulated by another one
+            if effect.part.name == name and chosen[effect.name] != name:
+                parts[name] |= effect.part.off
     return parts
 
 
-def _set(template: Mapping[str, Any], verdicts: Sequence[Verdict]) -> dict[str, Any]:
+def _part_of(effect: Effect, verdict: Verdict, choices: Mapping[str, Any]) -> str:
+    """Name of the part that simulates an effect."""
+    if not effect.part.kinds:
+        return effect.part.name
+    kind = choices.get(effect.part.choice, SCENE_SAYS)
+    check_option(f"effects.{effect.part.choice}", kind, (SCENE_SAYS, *effect.part.kinds), SceneError)
+    if kind == SCENE_SAYS:
+        kind = verdict.settings.get(effect.part.choice)
+    return effect.part.kinds.get(kind, effect.part.name)
+
+
+def _set(template: Mapping[str, Any], effects: Sequence[Effect], verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
     """A part's settings, with what verdicts say of it where they leave that to the scene."""
     settings = dict(template)
-    for verdict in verdicts:
-        for key, value in verdict.settings.items():
+    for effect in effects:
+        for key, value in verdicts[effect.name].settings.items():
+            if key not in settings and effect.part.kinds:  # of another kind
+                continue
             if key not in settings:
                 raise SceneError(
-                    f"the evidence on {verdict.name} sets '{key}', which {settings['_target_']} does not have"
+                    f"the evidence on {effect.name} sets '{key}', which {settings['_target_']} does not have"
                 )
             if settings[key] == SCENE_SAYS:
                 settings[key] = value

@@ -59,11 +59,16 @@ class Part:
         slot: where it stands in a configuration, one of SLOTS.
         name: of its settings in conf/effects/shared/parts.yaml. Effects may share a part.
         off: settings that leave this effect out where another one calls for the part.
+        choice: key of the group "effects", and of the evidence's settings, that says which of ``kinds`` simulates it; empty
+            where there is one.
+        kinds: value of that key -> name.
     """
 
     slot: str
     name: str
     off: Mapping[str, Any] = field(default_factory=dict)
+    choice: str = ""
+    kinds: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,13 +24,13 @@ class Inspection:
     """A scene, for the evidence of effects.
 
     Args:
-        scene: seen through its training views only; of the others count the sizes. Random points give way to those that its
-            images show (``swept_points``).
+        scene: seen through its training views only; of the others count the sizes. In ``scene``, random points give way to
+            those that its images show (``swept_points``); ``given`` is the scene as training has it.
         effects: those that the joint fit may take in.
     """
 
     def __init__(self, scene: SceneData, effects: Sequence[Effect] = ()) -> None:
-        self.scene = with_swept_points(scene)
+        self.given, self.scene = scene, with_swept_points(scene)
         self.effects = effects
 
     @property

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -259,6 +260,15 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
 def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
     """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
     draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
+
+
+def time_unit(span_s: float) -> tuple[float, str]:
+    """Seconds in the unit that suits an axis of so many seconds, and its sign: s, min or h."""
+    return next(
+        (unit_s, sign)
+        for least, unit_s, sign in ((10800, 3600, "h"), (300, 60, "min"), (-math.inf, 1, "s"))
+        if span_s >= least
+    )
 
 
 def figure_picture(figure: Figure) -> np.ndarray:

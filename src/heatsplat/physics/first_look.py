@@ -38,3 +38,29 @@ def first_rates(values: Tensor, spans: Tensor, ambient: Tensor) -> Tensor:
     stays, least = misfits[0], torch.stack(misfits).amin(0)
     relaxes = (seen.sum(1) >= LEAST_LOOKS) & (stays > ALIKE * least + floor)
     return torch.where(relaxes, RELAXES, STAYS).to(values)
+
+
+def first_numbers(values: Tensor, courses: Tensor, levels: Tensor) -> Tensor:
+    """Numbers [N, M] of bodies for courses over time that all have in common, from what was seen of each.
+
+    They start from those few that make a constant, at the median of what was seen: a look or two tell nothing of a course.
+
+    Args:
+        values: [N, F] what was seen above the surroundings; NaN where a body was not seen.
+        courses: [F, M] at these moments, uncorrelated and each with a root mean square of about 1.
+        levels: [N] median of what was seen of each.
+    """
+    usual = courses.mean(0)
+    start = levels[:, None] * (usual / usual.square().sum().clamp_min(1e-12))
+    seen = ~values.isnan()
+    left = torch.where(seen, values - start @ courses.T, 0.0)
+    floor = 1e-2 * left.abs().mean().clamp_min(1e-12)
+    eye = torch.eye(courses.shape[1], dtype=values.dtype)
+    numbers, weights = torch.zeros_like(start), seen.to(values)
+    for _ in range(REWEIGHTED):
+        normal = torch.einsum("nf,fm,fk->nmk", weights, courses, courses)
+        prior = weights.sum(1) / seen.sum(1).clamp_min(1) + 1e-12  # as much as one look says
+        wanted = torch.einsum("nf,fm->nm", weights * left, courses)
+        numbers = torch.linalg.solve(normal + prior[:, None, None] * eye, wanted)
+        weights = seen / ((left - numbers @ courses.T).abs() + floor)
+    return start + numbers

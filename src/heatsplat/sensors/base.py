@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from heatsplat.contracts import Frame, SceneData
+from heatsplat.contracts import Course, Frame, SceneData
 
 
 class SensorPart(nn.Module, ABC):
@@ -46,6 +46,10 @@ class SensorPart(nn.Module, ABC):
     def effects(self) -> dict[str, dict[str, Any]]:
         """The effects that the part simulates: catalogue name -> settings (for metrics.json)."""
         return {}
+
+    def courses(self) -> list[Course]:
+        """What it has learned to change from image to image for all pixels, for a picture."""
+        return []
 
 
 class SensorChain(nn.Module):

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Frame, SceneData
+from heatsplat.contracts import SHARE_OF_RANGE, Course, Frame, SceneData
 from heatsplat.sensors.per_frame import PerFrame
 from heatsplat.sensors.sums import everywhere
 
@@ -70,6 +70,16 @@ class FrameOffset(PerFrame):
         if self.raw_gain is not None:
             penalty = penalty + self.gains().square().mean()
         return penalty
+
+    @torch.no_grad()
+    def courses(self) -> list[Course]:
+        if not self.timed:
+            return []
+        times = self.moments.tolist()
+        found = [Course("drift of the camera: offset", times, self.offsets().tolist(), SHARE_OF_RANGE)]
+        if self.raw_gain is not None:
+            found.append(Course("drift of the camera: gain", times, self.gains().tolist(), "share"))
+        return found
 
     def effects(self) -> dict[str, dict[str, Any]]:
         learned = "offset" if self.raw_gain is None else "offset and gain"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import Course, SceneData
+from heatsplat.physics.curves import cubic_rows
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.coordinates import Clock
@@ -20,17 +21,19 @@ LOG_DEPTHS = (-12.0, 3.0)  # of β times the typical distance: from nothing to a
 class Attenuation(HeatPart):
     """x e^{-β d} + A (1 - e^{-β d}) of what a surface emits at distance d from the camera (Beer and Lambert; air at A).
 
-    The extinction β is one number of the scene, or a curve over the record whose logarithm is linear between evenly spread
+    The extinction β is one number of the scene, or a curve over the record whose logarithm is cubic between evenly spread
     moments; a scene without time has one number.
     A is the temperature of the surroundings where it was measured, else it is learned.
 
     **Convention:** d and 1/β in world units. The distance passes no gradient to the positions: haze must not move walls.
 
     Args:
-        depth: β times the typical distance between cameras and points, at the start; positive.
+        depth: β times the typical distance between cameras and points (``SceneData.distance``), at the start, or at the start
+            at each of the moments; positive.
         moments: of the curve; 0 keeps β the same throughout.
-        smooth: weight of the penalty on the mean squared second difference of log β over the moments. Where no training
-            view looks, the curve goes on as it bends on both sides.
+        smooth: weight of the penalty on the mean squared second derivative of β times the typical distance, over the record as 1.
+            Where no training view looks, the curve goes on as it bends on both sides. It is not that of log β, which
+            bends less the thicker the air: heat that is lost everywhere alike would be given to it.
         lr, lr_end: learning rate of log β and of A, and the factor on it at the end of the run.
 
     Raises:
@@ -38,13 +41,23 @@ class Attenuation(HeatPart):
     """
 
     def __init__(
-        self, depth: float = 0.1, moments: int = 12, smooth: float = 3e-3, lr: float = 0.01, lr_end: float = 0.1
+        self,
+        depth: float | Sequence[float] = 0.1,
+        moments: int = 12,
+        smooth: float = 1e-8,
+        lr: float = 0.01,
+        lr_end: float = 0.1,
     ) -> None:
         super().__init__()
-        if depth <= 0 or moments == 1 or moments < 0:
+        depths = [depth] * max(1, moments) if isinstance(depth, (int, float)) else list(depth)
+        if min(depths, default=0.0) <= 0 or moments == 1 or moments < 0:
             raise ValueError(f"depth must be positive and moments 0 or at least 2, got {depth} and {moments}")
+        if len(depths) != max(1, moments):
+            raise ValueError(
+                f"depth must be one number or one for each of {max(1, moments)} moments, got {len(depths)}"
+            )
         self.moments, self.smooth, self.lr, self.lr_end = moments, smooth, lr, lr_end
-        self.log_depth = nn.Parameter(torch.full((max(1, moments),), math.log(depth)))
+        self.log_depth = nn.Parameter(torch.tensor(depths).log())
         self.register_buffer("level", torch.tensor(0.5))
         self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
         if moments > 0:
@@ -52,8 +65,7 @@ class Attenuation(HeatPart):
             self.beyond_record = "the air stays as at the nearest moment of the record"
 
     def prepare(self, scene: SceneData) -> None:
-        centers = torch.stack([frame.camera.center for frame in scene.train.frames])
-        self.typical.copy_((scene.points.double().median(0).values - centers).norm(dim=1).median())
+        self.typical.fill_(scene.distance)
         known = scene.thermal_range is not None and scene.ambient_c is not None
         level = torch.tensor(scene.thermal_range.to_unit(scene.ambient_c) if known else 0.5)
         if known:
@@ -64,7 +76,7 @@ class Attenuation(HeatPart):
         if self.moments > 0 and "time" not in scene.metadata:
             self.moments = 0
             del self.clock
-            self.log_depth = nn.Parameter(self.log_depth.detach()[:1])
+            self.log_depth = nn.Parameter(self.log_depth.detach().exp().mean().log()[None])
         if self.moments > 0:
             self.clock.prepare(scene)
 
@@ -86,14 +98,14 @@ class Attenuation(HeatPart):
     def _log_depth_at(self, time_s: float | None) -> Tensor:
         if self.moments == 0:
             return self.log_depth[0]
-        place = self.clock.within(time_s) * (self.moments - 1)
-        before = min(int(place), self.moments - 2)
-        return torch.lerp(self.log_depth[before], self.log_depth[before + 1], place - before)
+        place = torch.tensor([self.clock.within(time_s) * (self.moments - 1)], dtype=torch.float64)
+        return cubic_rows(place, self.moments)[0].to(self.log_depth) @ self.log_depth
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         if self.moments < 3 or self.smooth == 0:
             return {}
-        return {"extinction_smooth": self.smooth * self.log_depth.diff(n=2).square().mean()}
+        bends = self.log_depth.clamp(*LOG_DEPTHS).exp().diff(n=2) * (self.moments - 1) ** 2
+        return {"extinction_smooth": self.smooth * bends.square().mean()}
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         with torch.no_grad():
@@ -102,6 +114,16 @@ class Attenuation(HeatPart):
     def effects(self) -> dict[str, dict[str, Any]]:
         beta = (self.log_depth.detach().clamp(*LOG_DEPTHS).exp() / self.typical.to(self.log_depth)).mean()
         return {"attenuation": {"per_unit": beta.item(), "moments": self.moments}}
+
+    @torch.no_grad()
+    def courses(self) -> list[Course]:
+        if self.moments == 0:
+            return []
+        shares = torch.linspace(0, 1, 4 * (self.moments - 1) + 1, dtype=torch.float64)
+        times = (self.clock.first_s + self.clock.span_s * shares).tolist()
+        return [
+            Course("extinction of the air", times, [self.extinction(t).item() for t in times], "per unit of length")
+        ]
 
     @property
     def cost(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Camera, SceneData, SceneError
+from heatsplat.contracts import Camera, Course, SceneData, SceneError
 from heatsplat.splats import GAUSSIANS, Splats
 
 NORMALS = "normals"  # the tensor that ``surface_normals`` declares
@@ -216,6 +216,10 @@ class Heat(nn.Module, ABC):
     def effects(self) -> dict[str, dict[str, Any]]:
         """The physical effects that it simulates: catalogue name -> settings (for metrics.json)."""
         return {}
+
+    def courses(self) -> list[Course]:
+        """What it has learned to change over the record for the whole scene, for a picture."""
+        return []
 
     @property
     @abstractmethod

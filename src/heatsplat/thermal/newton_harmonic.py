@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.physics.first_look import RELAXES, first_rates
@@ -16,9 +16,8 @@ from heatsplat.physics.frequencies import SEPARATION, default_tau_min, frequency
 from heatsplat.physics.fused import visible_temperature
 from heatsplat.physics.relaxation import relax
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
-from heatsplat.thermal.clipping import CLIPS, clipped
-from heatsplat.thermal.coordinates import Clock, ImageRange
+from heatsplat.thermal.base import PerGaussian, Query, Seeds
+from heatsplat.thermal.relaxing import Relaxing
 from heatsplat.thermal.sparse_sources import SparseSources
 
 log = logging.getLogger(__name__)
@@ -31,7 +30,7 @@ SLOWEST = 100.0  # spans: time constants beyond this are shown as this
 LOG_RATES = (-80.0, 30.0)  # of the rate per span: from never to at once, while squares still fit float32
 
 
-class NewtonHarmonic(ThermalModel):
+class NewtonHarmonic(Relaxing):
     """Emission of C dT/dt = -h (T - T_ambient) + Σ_k A_k sin ω_k t + B_k cos ω_k t (ETGS, ICLR 2026, Eq. 3-9).
 
     Only h/C, A/C and B/C reach the image: scaling C, h, A and B together changes nothing but the penalty on A and B,
@@ -79,7 +78,6 @@ class NewtonHarmonic(ThermalModel):
         ValueError: an option is unknown.
     """
 
-    needs = frozenset({"time"})
     beyond_record = "heat sources are off, and every Gaussian relaxes to the ambient temperature at its own rate"
 
     def __init__(
@@ -105,32 +103,22 @@ class NewtonHarmonic(ThermalModel):
         source_floor: float = 30.0,
         source_noise: float | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(ambient, clip, lr_ambient, lr_end)
         check_option("param", param, PARAMS)
         check_option("penalty", penalty, PENALTIES)
         check_option("penalty_reduction", penalty_reduction, REDUCTIONS)
         check_option("penalty_units", penalty_units, UNITS)
-        check_option("clip", clip, CLIPS)
-        if isinstance(ambient, str) and ambient not in ("measured", "learned"):
-            raise ValueError(f"ambient must be measured, learned or a number in °C, got '{ambient}'")
         self.frequencies, self.param = frequencies, param
         self.tau_min_s, self.frequency_gain, self.separation = tau_min_s, frequency_gain, separation
         self.grouped, self.source_penalty, self.gauge_l2 = penalty == "group", source_penalty, gauge_l2
         self.over_mean, self.in_si = penalty_reduction == "mean_over_gaussians", penalty_units == "si"
-        self.clip = clip
         self.lr_initial, self.lr_source, self.lr_rate = lr_initial, lr_source, lr_rate
-        self.lr, self.lr_end = lr_ambient, lr_end
         self.sources = SparseSources(drop_sources_at, source_floor, source_noise) if drop_sources_at else None
-        self._ambient_from = ambient
-        self._ambient_unknown = False
         self.register_buffer("omega", torch.zeros(0, dtype=torch.float64))  # radians per span
-        self.clock, self.range = Clock(), ImageRange()
-        self.register_buffer("ambient", torch.tensor(0.5))
 
     def prepare(self, scene: SceneData) -> None:
+        super().prepare(scene)
         times = torch.tensor(scene.train.times_s, dtype=torch.float64)
-        self.clock.prepare(scene)
-        self.range.prepare(scene)
         if times.max() > times.min():
             tau_min_s = default_tau_min(times) if self.tau_min_s is None else self.tau_min_s
             grid = frequency_grid(times, self.frequencies, tau_min_s, self.frequency_gain, self.separation)
@@ -144,7 +132,6 @@ class NewtonHarmonic(ThermalModel):
             )
         if scene.thermal_range is None:
             log.warning("scene '%s' has no temperature range: heat is modelled in image values, not in °C", scene.name)
-        self._set_ambient(scene)
         if self.sources is not None and self.omega.numel() > 0:
             self.sources.prepare(scene, self.modality)
 
@@ -167,30 +154,9 @@ class NewtonHarmonic(ThermalModel):
         log.info("%d of %d heat sources stay, for %d Gaussians", stay, before, len(gone))
         yield "source_gains", gone, instead
 
-    def _set_ambient(self, scene: SceneData) -> None:
-        celsius = scene.ambient_c if isinstance(self._ambient_from, str) else self._ambient_from
-        if not isinstance(self._ambient_from, str) and scene.thermal_range is None:
-            raise SceneError(
-                f"ambient={celsius} is in °C, but scene '{scene.name}' has no temperature range to relate it to; "
-                "use thermal.ambient=learned"
-            )
-        known = celsius is not None and scene.thermal_range is not None
-        learned = self._ambient_from == "learned" or not known
-        value = torch.tensor(scene.thermal_range.to_unit(celsius) if known else 0.5, dtype=torch.float32)
-        if learned:
-            if self._ambient_from == "measured":
-                log.warning("scene '%s' has no measured ambient temperature: it is learned", scene.name)
-            del self.ambient
-            self.ambient = nn.Parameter(value)
-        else:
-            self.ambient = value
-        self._ambient_unknown = not known
-
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         initial = seeds.values.mean(1)
-        if self._ambient_unknown and len(initial) > 0:
-            with torch.no_grad():
-                self.ambient.copy_(initial.median())  # most of a scene is near its surroundings
+        self.guess_ambient(initial)
         tensors, harmonics = self._bodies(initial, self._first_rates(seeds)), self.omega.numel()
         if harmonics > 0:
             gains = initial.new_zeros(len(initial), 2, harmonics)
@@ -225,13 +191,6 @@ class NewtonHarmonic(ThermalModel):
 
     def _lr_gains(self, harmonics: int) -> float:
         return self.lr_source / harmonics
-
-    def features(self, splats: Splats, query: Query) -> Tensor:
-        state = self._state(splats, query.time_s, query.ids)
-        return clipped(state, self.clip)[:, None]
-
-    def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
-        return None if self.range.bounds is None else self.range.kelvin(self._state(splats, time_s, ids))
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
         """Temperature in image units of the Gaussians ``ids``, [n], not clipped.
@@ -291,8 +250,7 @@ class NewtonHarmonic(ThermalModel):
         return values
 
     def effects(self) -> dict[str, dict]:
-        ambient = "learned" if isinstance(self.ambient, nn.Parameter) else "fixed"
-        effects = {"relaxation": {"param": self.param, "ambient": ambient}}
+        effects = {"relaxation": {"param": self.param, "ambient": self.ambient_is}}
         if self.omega.numel() > 0:
             effects["harmonic_source"] = {"frequencies": self.omega.numel()}
         return effects

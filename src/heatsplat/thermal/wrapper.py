@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import Course, SceneData
 from heatsplat.splats import GAUSSIANS, Splats
 from heatsplat.thermal.base import NORMALS, Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
 
@@ -155,6 +155,9 @@ class Wrapper(ThermalModel):
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         return _merged(member.attributes(splats, query) for member in self.members.values())
+
+    def courses(self) -> list[Course]:
+        return [course for member in self.members.values() for course in member.courses()]
 
     def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return _merged(member.quotients(told) for member in self.members.values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,9 +16,15 @@ from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
+from heatsplat.physics.curves import smooth_values
 
 EVEN = "even"  # a share that each image loses from near and far alike
-MAX_DEPTH = 3.0  # optical depth at the typical distance
+MAX_DEPTH, THINNEST = (
+    3.0,
+    0.02,
+)  # optical depth at the typical distance: of the fit, and where training starts at the least
+MOMENTS = 32  # of the course over a record, at most
+BEND = 1e-4  # weight of its second differences, which decide where no image was taken
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -29,19 +36,33 @@ def evidence(inspected: Inspection) -> Evidence:
     if kind is None:
         return found
     fit, model = inspected.joint
-    seen = passing(fit, kind, fit.own_basis(model), fit.weights)[fit.weights > 0]
-    count = numbers(fit.data, kind)
-    return replace(
-        found,
-        settings={
-            "depth": round(max(-float(torch.log(seen).median()), 0.02), 3),
-            "moments": 0 if count == 1 else max(2, min(count // 2, 16)),
-        },
-    )
+    per_unit, _ = extinctions(fit, kind, fit.own_basis(model), fit.weights)
+    return replace(found, settings=settings(per_unit * inspected.given.distance, inspected))
+
+
+def settings(depths: Tensor, inspected: Inspection) -> dict[str, Any]:
+    """What the part starts from: optical depths at the typical distance, of the scene [1] or of each image [F].
+
+    What the joint fit knows of them to a thousandth training would have to find anew, beside surfaces that can be brighter
+    through thicker air.
+    """
+    if len(depths) == 1:
+        return {"depth": round(max(float(depths), THINNEST), 3), "moments": 0}
+    first, span = inspected.given.record
+    count = max(2, min(len(depths), MOMENTS))
+    places = (inspected.obs.times_s - first) / span * (count - 1)
+    curve = smooth_values(places, depths, count, BEND).clamp(THINNEST, MAX_DEPTH)
+    return {"depth": [round(depth, 4) for depth in curve.tolist()], "moments": count}
 
 
 def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
-    """Share of the excess over the surroundings that arrives [P, F].
+    """Share of the excess over the surroundings that arrives [P, F]."""
+    depths, columns = extinctions(fit, kind, basis, weights)
+    return torch.exp(-(columns @ depths))
+
+
+def extinctions(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Extinctions [c], and what each counts for in an observation [P, F, c]: distances in world units, or for ``EVEN`` 1.
 
     log(value - ambient) is linear in the extinction (Beer-Lambert), so it comes from one linear fit there.
     """
@@ -61,7 +82,8 @@ def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
     depths = -torch.linalg.solve(products[1:, 1:] + ridge, products[1:, 0])
     if kind == EVEN:
         depths = depths - depths.min()  # what all images lose, points lack themselves
-    return torch.exp(-(columns @ depths.clamp(0.0, MAX_DEPTH)))  # air only takes away
+    unit = 1.0 if kind == EVEN else typical
+    return depths.clamp(0.0, MAX_DEPTH) / unit, columns * unit  # air only takes away
 
 
 def numbers(data: Data, kind: object) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
@@ -16,12 +17,15 @@ from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.moments import share_of_points
-from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
+from heatsplat.effects.joint.terms import OWN_HURDLE, Own, Path, well_seen
 from heatsplat.effects.physical import relaxation
+from heatsplat.physics.common_course import RATES, common_course
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
 # Courses over time that points share: one source and bodies that follow it more or less slowly need a few.
 COURSES = (1, 2, 3)
+HARMONIC, COMMON = "harmonics", "common"  # values of effects.source
+ALIKE = 1.3  # times what all effects together leave of the points' values: a common course may leave so much
 HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
@@ -32,9 +36,44 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(0.0, "the recorded weather stands for what drives the scene")
     found = gained(inspected, "harmonic_source", f"points depart from {beside} by")
     count = selected_kind(inspected, "harmonic_source")
-    if count is not None:
-        return replace(found, settings={"frequencies": harmonics(inspected, count)})
-    return passing(inspected) or found
+    if count is None:
+        return passing(inspected) or found
+    harmonic = {"source": HARMONIC, "frequencies": harmonics(inspected, count)}
+    common = shared(inspected)
+    if common is None:
+        return replace(found, settings=harmonic)
+    course, misfit = common
+    said = f"{found.reason}; all points answer one course, but for {misfit:.2g} times that error"
+    return replace(found, reason=said, settings=harmonic | {"source": COMMON, "course": course})
+
+
+def shared(inspected: Inspection) -> tuple[list[float], float] | None:
+    """The course of one source that all points answer (``physics.common_course``), and what it leaves of the points' values, as
+    root mean square in units of the errors expected; None where it leaves more than effects without a common source do."""
+    fit, model = inspected.joint
+    data, others = fit.data, fit.terms(model, Path)
+    if data.ambient is None or others:
+        return None
+    first, span = inspected.scene.record
+    added = sum(fit.contributions(model).values())
+    values, weights = data.tracks.values - added - data.ambient, fit.weights
+    own = 2 * len(RATES)
+    counted = (weights > 0).sum(1) >= own + MIN_FREE
+    if not counted.any():
+        return None
+    weights = weights[counted]
+    course, left = common_course(values[counted], weights, (inspected.obs.times_s - first) / span)
+    misfit = _misfit(left, weights, own)
+    usual = _misfit(fit.residuals(model)[counted], weights, fit.own(model)[1].shape[2])
+    if misfit > max(ALIKE * usual, 1.0):
+        return None
+    return [round(power, 4) for power in course.tolist()], misfit
+
+
+def _misfit(left: Tensor, weights: Tensor, numbers: int) -> float:
+    """Root mean square of what is left of values [P, F], in units of errors, of points with so many numbers of their own."""
+    free = ((weights > 0).sum(1) - numbers).clamp_min(1).sum()
+    return float(((weights * left**2).sum() / free).sqrt())
 
 
 def passing(inspected: Inspection) -> Evidence | None:
@@ -46,7 +85,7 @@ def passing(inspected: Inspection) -> Evidence | None:
     if times <= EFFECT.threshold:
         return None
     said = f"{times:.1f} times as many points as by chance change by much at moments of their own, as where something passes them"
-    return Evidence(times, said, settings={"frequencies": HARMONICS[-1]})
+    return Evidence(times, said, settings={"source": HARMONIC, "frequencies": HARMONICS[-1]})
 
 
 def kinds(fit: Fit) -> Sequence[int]:
@@ -99,15 +138,17 @@ EFFECT = Effect(
     name="harmonic_source",
     stage="state",
     place=1,
-    summary="heat sources that are switched on and off, as a sum of K harmonics",
-    source="ETGS, Eq. 4, 7, 8",
+    summary="heat sources that are switched on and off: one course that all points answer, or K harmonics of each",
+    source="ETGS, Eq. 4, 7, 8; a common course: ours",
     needs=frozenset({"time"}),
     null="all changes are mixtures of relaxations",
     # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it. Of points that something passes: up to 1.5 and from 5.0.
     threshold=OWN_HURDLE,
-    adds="2 K amplitudes for each Gaussian, 11 K operations",
+    adds="2 K amplitudes for each Gaussian, 11 K operations; a common course: 6 numbers in place of all, 6 operations",
     evidence=evidence,
-    part=Part("state", "newton_harmonic", off={"frequencies": 0}),
+    part=Part(
+        "state", "newton_harmonic", {"frequencies": 0}, "source", {HARMONIC: "newton_harmonic", COMMON: "common_source"}
+    ),
     term=Own(
         basis=lambda fit, count: common_courses(
             fit, Model.of(relaxation=1), count
