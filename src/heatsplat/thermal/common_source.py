@@ -105,7 +105,8 @@ class CommonSource(Relaxing):
         return (self.lr_course, self.lr_end) if name == "course" else super().rate_of(name)
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
-        return self.ambient + Query(ids).rows(splats["modes"]) @ self._modes_at(time_s)
+        # Of all Gaussians, and then those in view: to pick rows and to spread their gradients takes twice as long.
+        return self.ambient + Query(ids).rows(splats["modes"] @ self._modes_at(time_s))
 
     def _modes_at(self, time_s: float | None) -> Tensor:
         """Courses of the modes at a time, [2 R]."""
