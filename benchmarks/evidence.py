@@ -61,11 +61,12 @@ the others.
   explain the images, and heat stays undecided while they are.
 
 **Heat sources.** A lamp, a heating or a burner is switched on and off once for all that it warms. Where something drives the
-points, one course of power is fitted to all of them (`physics/common_course.py`), each of which answers it in three exponentials. If
-that leaves at most 1.3 times what points' own courses leave, or less than the errors expected, `method=auto` learns that course and six
-numbers for each Gaussian, else K harmonics for each (ETGS). `effects.source=common` and `harmonics` choose by hand. The course starts at
-that of the points; so does the extinction of the air, which the joint fit knows to a thousandth of its largest at each image, while
-training alone confuses it with warmer surfaces. `renders/courses.png` shows what was learned.
+points, one course of power is fitted to all of them (`physics/common_course.py`), each of which answers it in three
+exponentials. If that leaves at most 1.3 times what points' own courses leave, or less than the errors expected, `method=auto`
+learns that course and six numbers for each Gaussian, else K harmonics for each (ETGS). `effects.source=common` and
+`harmonics` choose by hand. The course starts at that of the points; so does the extinction of the air, which the joint fit
+knows to a thousandth of its largest at each image, while training alone confuses it with warmer surfaces.
+`renders/courses.png` shows what was learned.
 
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms

@@ -37,10 +37,10 @@ def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):
 @pytest.mark.slow
 def test_what_passes_points_one_after_the_other_gives_each_its_own():
     found = harmonic_source.evidence(inspected("moving_source"))
-    assert found.settings["source"] == "harmonics" and "course" not in found.settings
+    assert found.settings["source"] == "harmonics"
 
 
 def test_points_that_depart_more_than_usual_share_no_course(heated, monkeypatch):
     monkeypatch.setattr(harmonic_source, "common_course", lambda values, weights, spans: (torch.ones(64), 10 * values))
-    assert harmonic_source.shared(heated) is None
-    assert harmonic_source.evidence(heated).settings["source"] == "harmonics"
+    found = harmonic_source.evidence(heated).settings
+    assert found["source"] == "harmonics" and len(found["course"]) == 64  # for who asks for it
