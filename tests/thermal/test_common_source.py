@@ -166,6 +166,15 @@ def test_a_checkpoint_carries_the_course_and_its_modes():
     torch.testing.assert_close(fresh.temperature(splats, 123.0), trained.temperature(splats, 123.0))
 
 
+def test_it_can_be_made_double_after_it_has_been_prepared():
+    model, given = ready(dtype=torch.float32), numbers()
+    narrow = model.temperature(splats_of(model, given.float()), 123.0)
+    model.double()
+    wide = model.temperature(splats_of(model, given), 123.0)
+    assert wide.dtype == torch.float64
+    torch.testing.assert_close(wide.float(), narrow, rtol=0, atol=2e-3)
+
+
 def test_a_course_of_another_length_is_resampled_and_none_is_always_on():
     assert CommonSource(moments=5, course=[0.0, 1.0]).course.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert CommonSource(moments=4).course.tolist() == [1.0] * 4

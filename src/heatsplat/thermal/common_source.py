@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -87,6 +87,10 @@ class CommonSource(Relaxing):
         sizes = squares.clamp_min(0.0).sqrt()
         self.mixing.copy_((along / sizes.clamp_min(LEAST * sizes[-1])).mT.flip(0))
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CommonSource:
+        self._answers.clear()  # they are of another type, or on another device
+        return super()._apply(fn, recurse)
+
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         initial = seeds.values.mean(1)
         self.guess_ambient(initial)
@@ -118,9 +122,10 @@ class CommonSource(Relaxing):
         if spans not in self._answers:
             if len(self._answers) >= 4096:
                 self._answers.clear()
-            faded = torch.exp(-self.rates * (spans - within))[:, None] if spans > within else 1.0
-            began = max(spans, -1.0 / float(self.rates.max()))
-            answers = torch.exp(-self.rates * began), faded * self._table.exact(within)
+            rates = self.rates.cpu()
+            faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0
+            began = max(spans, -1.0 / float(rates.max()))
+            answers = torch.exp(-rates * began), faded * self._table.exact(within)
             self._answers[spans] = tuple(tensor.to(self.course) for tensor in answers)
         decays, answers = self._answers[spans]
         return torch.cat([decays, answers @ self.course])
