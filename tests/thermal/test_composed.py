@@ -244,6 +244,14 @@ def test_extinction_goes_on_through_a_gap_as_it_bends_on_both_sides():
     assert Attenuation(moments=2).regularisers(None) == Attenuation(moments=0).regularisers(None) == {}
 
 
+@pytest.mark.parametrize(
+    ("moments", "expected"), [(0, [0.3]), (2, [0.1, 0.5]), (3, [0.1, 0.3, 0.5]), (5, [0.1, 0.2, 0.3, 0.4, 0.5])]
+)
+def test_depths_over_the_record_are_resampled_to_the_moments_that_are_asked_for(moments, expected):
+    part = Attenuation(depth=[0.1, 0.3, 0.5], moments=moments)
+    torch.testing.assert_close(part.log_depth.detach().exp(), torch.tensor(expected))
+
+
 def test_what_air_costs_does_not_depend_on_how_thick_it_is():
     """Or heat that is lost at all times alike would be given to the air, whose logarithm bends less then."""
     swing = [0.1, 0.3, 0.2, 0.5, 0.1]
@@ -363,7 +371,7 @@ def test_needs_are_those_of_all_owners():
         (lambda: Reflection(degree=3), "degree must be 0 to 2"),
         (lambda: Attenuation(depth=0), "depth must be positive and moments 0 or at least 2"),
         (lambda: Attenuation(moments=1), "depth must be positive and moments 0 or at least 2"),
-        (lambda: Attenuation(depth=[0.1, 0.2], moments=3), "one number or one for each of 3 moments, got 2"),
+        (lambda: Attenuation(depth=[0.1, 0.0], moments=3), "depth must be positive"),
         (lambda: Conducting(Static(), neighbours=0), "neighbours and every must be at least 1"),
     ],
 )

@@ -207,12 +207,10 @@ def _parts(slot: str, verdicts: Mapping[str, Verdict], templates: Mapping[str, A
     chosen = {effect.name: _part_of(effect, verdicts[effect.name], choices) for effect in users}
     parts = {}
     for name in dict.fromkeys(chosen[effect.name] for effect in users if verdicts[effect.name].on):
-        mine = [effect for effect in users if chosen[effect.name] == name]
-        parts[name] = _set(templates[name], [effect for effect in mine if verdicts[effect.name].on], verdicts)
-        for effect in mine:
-            parts[name] |= {} if verdicts[effect.name].on else effect.part.off
-        for effect in users:  # simulated by another one
-            if effect.part.name == name and chosen[effect.name] != name:
+        mine = [effect for effect in users if verdicts[effect.name].on and chosen[effect.name] == name]
+        parts[name] = _set(templates[name], mine, verdicts)
+        for effect in users:  # those that are off, or that another part simulates
+            if effect.part.name == name and effect not in mine:
                 parts[name] |= effect.part.off
     return parts
 

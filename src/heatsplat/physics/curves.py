@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 def cubic_rows(places: Tensor, count: int) -> Tensor:
@@ -21,6 +24,14 @@ def cubic_rows(places: Tensor, count: int) -> Tensor:
     beyond = torch.cat([2 * eye[:1] - eye[1:2], eye, 2 * eye[-1:] - eye[-2:-1]])
     a, b, c, d = (beyond[before + k] for k in range(4))
     return b + 0.5 * u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * (b - c) + d - a)))
+
+
+def resampled_values(values: Sequence[float], count: int) -> Tensor:
+    """``count`` values [count] float32 over the same span as those given, linear between them; for 1, their mean."""
+    given = torch.tensor(values, dtype=torch.float32)
+    if count == 1:
+        return given.mean()[None]
+    return functional.interpolate(given[None, None], count, mode="linear", align_corners=True)[0, 0]
 
 
 def smooth_values(places: Tensor, heights: Tensor, count: int, smooth: float) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Course, SceneData
-from heatsplat.physics.curves import cubic_rows
+from heatsplat.physics.curves import cubic_rows, resampled_values
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.coordinates import Clock
@@ -28,8 +28,8 @@ class Attenuation(HeatPart):
     **Convention:** d and 1/β in world units. The distance passes no gradient to the positions: haze must not move walls.
 
     Args:
-        depth: β times the typical distance between cameras and points (``SceneData.distance``), at the start, or at the start
-            at each of the moments; positive.
+        depth: β times the typical distance between cameras and points (``SceneData.distance``), at the start: a number, or
+            several that are evenly spread over the record and resampled to the moments; positive.
         moments: of the curve; 0 keeps β the same throughout.
         smooth: weight of the penalty on the mean squared second derivative of β times the typical distance, over the record as 1.
             Where no training view looks, the curve goes on as it bends on both sides. It is not that of log β, which
@@ -49,15 +49,11 @@ class Attenuation(HeatPart):
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
-        depths = [depth] * max(1, moments) if isinstance(depth, (int, float)) else list(depth)
+        depths = [depth] if isinstance(depth, (int, float)) else list(depth)
         if min(depths, default=0.0) <= 0 or moments == 1 or moments < 0:
             raise ValueError(f"depth must be positive and moments 0 or at least 2, got {depth} and {moments}")
-        if len(depths) != max(1, moments):
-            raise ValueError(
-                f"depth must be one number or one for each of {max(1, moments)} moments, got {len(depths)}"
-            )
         self.moments, self.smooth, self.lr, self.lr_end = moments, smooth, lr, lr_end
-        self.log_depth = nn.Parameter(torch.tensor(depths).log())
+        self.log_depth = nn.Parameter(resampled_values(depths, max(1, moments)).log())
         self.register_buffer("level", torch.tensor(0.5))
         self.register_buffer("typical", torch.ones((), dtype=torch.float64))  # distance in world units
         if moments > 0:

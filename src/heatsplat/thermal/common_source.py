@@ -7,11 +7,12 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from heatsplat.contracts import Course, SceneData
 from heatsplat.physics.common_course import BEND, MOMENTS, RATES, response_table
+from heatsplat.physics.curves import resampled_values
 from heatsplat.physics.first_look import first_numbers
+from heatsplat.physics.responses import MOMENTS_KEPT
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
 from heatsplat.thermal.relaxing import Relaxing
@@ -70,10 +71,7 @@ class CommonSource(Relaxing):
                 f"rates must be positive, moments at least 3 and smooth not negative, got {list(rates)}, {moments} and {smooth}"
             )
         self.moments, self.smooth, self.lr_modes, self.lr_course = moments, smooth, lr_modes, lr_course
-        given = torch.ones(2) if course is None else torch.tensor(course, dtype=torch.float32)
-        self.course = nn.Parameter(
-            functional.interpolate(given[None, None], moments, mode="linear", align_corners=True)[0, 0]
-        )
+        self.course = nn.Parameter(resampled_values([1.0] if course is None else course, moments))
         self.register_buffer("rates", torch.tensor(rates, dtype=torch.float64))
         self.register_buffer("mixing", torch.zeros(2 * len(rates), 2 * len(rates)))  # h and g of each mode, in rows
         self._table = response_table(self.rates, moments)
@@ -120,7 +118,7 @@ class CommonSource(Relaxing):
         """e^{-r_j t}, and the answers of bodies of these rates to the source, at a time, [2 R]."""
         spans, within = self.clock.spans(time_s), self.clock.within(time_s)
         if spans not in self._answers:
-            if len(self._answers) >= 4096:
+            if len(self._answers) >= MOMENTS_KEPT:
                 self._answers.clear()
             rates = self.rates.cpu()
             faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0

@@ -19,10 +19,8 @@ from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
 from heatsplat.physics.curves import smooth_values
 
 EVEN = "even"  # a share that each image loses from near and far alike
-MAX_DEPTH, THINNEST = (
-    3.0,
-    0.02,
-)  # optical depth at the typical distance: of the fit, and where training starts at the least
+MAX_DEPTH = 3.0  # optical depth at the typical distance
+THINNEST = 0.02  # optical depth there from which training starts at the least
 MOMENTS = 32  # of the course over a record, at most
 BEND = 1e-4  # weight of its second differences, which decide where no image was taken
 
