@@ -62,8 +62,9 @@ the others.
 
 **Heat sources.** A lamp, a heating or a burner is switched on and off once for all that it warms. Where something drives the
 points, one course of power is fitted to all of them (`physics/common_course.py`), each of which answers it in three
-exponentials. If that leaves at most 1.3 times what points' own courses leave, or less than the errors expected, `method=auto`
-learns that course and six numbers for each Gaussian, else K harmonics for each (ETGS). `effects.source=common` and
+exponentials. `method=auto` learns that course and six numbers for each Gaussian if, fitted to three of four images, it foresees
+the others better than K harmonics of each point do; else K harmonics for each Gaussian (ETGS). The fewer the images, the less
+the course bends between them. `effects.source=common` and
 `harmonics` choose by hand. The course starts at that of the points; so does the extinction of the air, which the joint fit
 knows to a thousandth of its largest at each image, while training alone confuses it with warmer surfaces.
 `renders/courses.png` shows what was learned.

@@ -60,6 +60,12 @@ LONGEST = (
 FILMED = {}  # settings of a recording -> the scene, which nobody changes
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """One process more than there are cores: tests wait for commands that they start."""
+    return cores() + 1
+
+
 def pytest_collection_modifyitems(items):
     place = {name: k for k, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get("/".join(item.path.parts[-2:]), len(LONGEST)))

@@ -14,7 +14,7 @@ from heatsplat.thermal.attenuation import Attenuation
 
 @pytest.fixture(scope="module")
 def haze():
-    return Synthetic(scene="haze", size="demo").scene
+    return Synthetic(scene="haze", size="tiny", frames=72).scene
 
 
 def test_training_starts_from_the_extinction_of_each_moment(haze):

@@ -1,23 +1,24 @@
 """Whether points answer the course of one source, and which."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.physical import harmonic_source
+from heatsplat.effects.physical import harmonic_source, relaxation
 from heatsplat.physics.common_course import MOMENTS
 
 
-def inspected(name):
-    return Inspection(Synthetic(scene=name, size="demo").scene, CATALOGUE)
+def inspected(name, **recorded):
+    return Inspection(Synthetic(scene=name, **recorded).scene, [relaxation.EFFECT, harmonic_source.EFFECT])
 
 
 @pytest.fixture(scope="module")
 def heated():
-    return inspected("heated")
+    return inspected("heated", size="tiny", frames=72)  # small images, as many as of a larger scene
 
 
 def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):
@@ -36,7 +37,7 @@ def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):
 
 @pytest.mark.slow
 def test_what_passes_points_one_after_the_other_gives_each_its_own():
-    found = harmonic_source.evidence(inspected("moving_source"))
+    found = harmonic_source.evidence(inspected("moving_source", size="demo"))
     assert found.settings["source"] == "harmonics"
 
 
@@ -44,3 +45,24 @@ def test_points_that_depart_more_than_usual_share_no_course(heated, monkeypatch)
     monkeypatch.setattr(harmonic_source, "common_course", lambda values, weights, spans: (torch.ones(64), 10 * values))
     found = harmonic_source.evidence(heated).settings
     assert found["source"] == "harmonics" and len(found["course"]) == 64  # for who asks for it
+
+
+def test_a_course_that_foresees_worse_than_harmonics_of_each_point_is_left(heated, monkeypatch):
+    worse = replace(harmonic_source.shared(heated, 12), foreseen=1.1, foreseen_by_harmonics=1.0)
+    monkeypatch.setattr(harmonic_source, "shared", lambda inspected, count: worse)
+    assert harmonic_source.evidence(heated).settings["source"] == "harmonics"
+    monkeypatch.setattr(harmonic_source, "shared", lambda inspected, count: replace(worse, foreseen=0.9))
+    assert harmonic_source.evidence(heated).settings["source"] == "common"
+
+
+def test_what_is_foreseen_comes_from_other_images_and_counts_in_errors():
+    """Each image from the mean of the other folds: 1 in the one that is 1, 1/3 in the others."""
+    values = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(3, 5)
+    weights = torch.full_like(values, 0.25)  # errors of 2
+    mean = lambda known: ((known * values).sum(1) / known.sum(1))[:, None].expand_as(values)  # noqa: E731
+    found = harmonic_source._foreseen(values, weights, mean)
+    assert found == pytest.approx((1.0 + 3 * (1 / 3)) / 4 / 2)
+    weights[:, 7] = 0.0  # not seen
+    values[:, 7] = 1e9
+    assert harmonic_source._foreseen(values, weights, mean) == pytest.approx(found, rel=0.2)
+    assert harmonic_source._foreseen(1e6 * values, weights, mean) <= harmonic_source.FARTHEST

@@ -21,9 +21,10 @@ from heatsplat.physics.responses import ResponseTable
 # a gap in the record better (0.37, 0.39 and 0.49 °C).
 RATES = (2.0, 8.0, 32.0)
 MOMENTS = 64  # of the record, between which a source's power is linear
-BEND = (
-    1e-10  # weight of the squared second derivative of the course where images tell it; it decides where none was taken
-)
+# Weight of the mean squared second derivative of the course, times the fourth power of the images' spacing, as of a spline
+# through them: it decides where none was taken. Where 16 to 31 images were, a course that bends as those of 63 may is as rough
+# as they are few, and foresees images that it was not fitted to by 1.5 to 2 times as much.
+BEND = 1.5e-3
 ROUNDS = (
     24  # in which numbers of surfaces and the course take turns; from the 15th on it moves by less than a hundredth
 )
@@ -56,60 +57,61 @@ def common_course(
         spans: [F] float64, when.
         rates: [R] float64; None: ``RATES``.
         moments: K.
-        smooth: weight of the mean squared second derivative of the course, relative to that of a moment.
+        smooth: as ``BEND``, relative to what values say on average of a moment.
     """
     rates = torch.tensor(RATES, dtype=torch.float64) if rates is None else rates
     values = torch.where(weights > 0, values, 0.0)
+    seen = max(int((weights > 0).any(0).sum()), 2)
     bends = torch.eye(moments, dtype=torch.float64).diff(n=2, dim=0) * (moments - 1) ** 2
+    bent = smooth / (seen - 1) ** 4 * bends.mT @ bends
     course = torch.ones(moments, dtype=torch.float64)
     for tried, explain in ((SINGLE, _of_one_rate), (rates, _of_all_rates)):
         table = response_table(tried, moments)
         unit = torch.stack([table.exact(float(at)) for at in spans])
         decays = torch.exp(-spans[:, None] * tried)
         for _ in range(ROUNDS):
-            kept, source = explain(values, weights, decays, unit @ course, unit)
-            course = _course(values - kept, weights, source, smooth * bends.mT @ bends)
-    kept, source = explain(values, weights, decays, unit @ course, unit)
-    return course, values - kept - source @ course
+            kept, gains = explain(values, weights, decays, unit @ course)
+            course = _course(values - kept, weights, gains, unit, bent)
+    driven = unit @ course
+    kept, gains = explain(values, weights, decays, driven)
+    return course, values - kept - gains @ driven.T
 
 
-def _course(values: Tensor, weights: Tensor, source: Tensor, bent: Tensor) -> Tensor:
-    """The course [K] that explains values [P, F] best, of what it becomes at surfaces [P, F, K]."""
-    normal = torch.einsum("pf,pfk,pfl->kl", weights, source, source)
-    wanted = torch.einsum("pf,pfk->k", weights * values, source)
+def _course(values: Tensor, weights: Tensor, gains: Tensor, unit: Tensor, bent: Tensor) -> Tensor:
+    """The course [K] that explains values [P, F] best, given gains [P, R] at rates and what moments become there [F, R, K]."""
+    squares = torch.stack([(gains * weight[:, None]).T @ gains for weight in weights.T])  # [F, R, R]
+    normal = (squares @ unit).flatten(0, 1).T @ unit.flatten(0, 1)
+    wanted = unit.flatten(0, 1).T @ ((weights * values).T @ gains).flatten()
     level = normal.diagonal().mean().clamp_min(1e-300)
     ridge = 1e-12 * torch.eye(len(bent), dtype=bent.dtype)
     course = torch.linalg.solve(normal + level * (bent + ridge), wanted)
     return course / course.abs().max().clamp_min(1e-300)
 
 
-def _of_one_rate(
-    values: Tensor, weights: Tensor, decays: Tensor, driven: Tensor, unit: Tensor
-) -> tuple[Tensor, Tensor]:
-    """What is left of the start [P, F] and what sources become [P, F, K] at surfaces, each with the rate that fits it best."""
+def _of_one_rate(values: Tensor, weights: Tensor, decays: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
+    """What is left of the start [P, F], and gains [P, R] of surfaces, each at the one rate that fits it best."""
     tried = [
         least_squares(values, weights, torch.stack([decays[:, rate], driven[:, rate]], 1))
         for rate in range(decays.shape[1])
     ]
     best = torch.stack([explained for _, explained in tried]).argmax(0)
     own = torch.stack([numbers for numbers, _ in tried])[best, torch.arange(len(values))]
-    return own[:, :1] * decays.T[best], own[:, 1, None, None] * unit.movedim(1, 0)[best]
+    gains = own.new_zeros(len(values), decays.shape[1]).scatter(1, best[:, None], own[:, 1:])
+    return own[:, :1] * decays.T[best], gains
 
 
-def _of_all_rates(
-    values: Tensor, weights: Tensor, decays: Tensor, driven: Tensor, unit: Tensor
-) -> tuple[Tensor, Tensor]:
-    """As ``_of_one_rate``, each surface with all of the rates."""
+def _of_all_rates(values: Tensor, weights: Tensor, decays: Tensor, driven: Tensor) -> tuple[Tensor, Tensor]:
+    """As ``_of_one_rate``, each surface at all of the rates."""
     numbers, _ = least_squares(values, weights, torch.cat([decays, driven], 1))
     count = decays.shape[1]
-    return numbers[:, :count] @ decays.T, torch.einsum("pr,frk->pfk", numbers[:, count:], unit)
+    return numbers[:, :count] @ decays.T, numbers[:, count:]
 
 
-def least_squares(values: Tensor, weights: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+def least_squares(values: Tensor, weights: Tensor, basis: Tensor, ridge: float = RIDGE) -> tuple[Tensor, Tensor]:
     """Numbers [P, m] of each surface for a basis [F, m] of its values [P, F], and the squares [P] that they explain."""
     normal = torch.einsum("pf,fm,fn->pmn", weights, basis, basis)
     wanted = torch.einsum("pf,fm->pm", weights * values, basis)
-    ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1).clamp_min(1e-300)
+    level = normal.diagonal(dim1=1, dim2=2).mean(1).clamp_min(1e-300)
     eye = torch.eye(basis.shape[1], dtype=basis.dtype)
-    numbers = torch.linalg.solve(normal + ridge[:, None, None] * eye, wanted)
+    numbers = torch.linalg.solve(normal + ridge * level[:, None, None] * eye, wanted)
     return numbers, (numbers * wanted).sum(1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Course, SceneData
-from heatsplat.physics.common_course import BEND, MOMENTS, RATES, response_table
+from heatsplat.physics.common_course import MOMENTS, RATES, response_table
 from heatsplat.physics.curves import resampled_values
 from heatsplat.physics.first_look import first_numbers
 from heatsplat.physics.responses import MOMENTS_KEPT
@@ -57,7 +57,7 @@ class CommonSource(Relaxing):
         rates: Sequence[float] = RATES,
         moments: int = MOMENTS,
         course: Sequence[float] | None = None,
-        smooth: float = BEND,
+        smooth: float = 1e-10,
         lr_modes: float = 1e-4,
         lr_course: float = 5e-4,
         ambient: str | float = "measured",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,16 +19,15 @@ from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.moments import share_of_points
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, Path, well_seen
 from heatsplat.effects.physical import relaxation
-from heatsplat.physics.common_course import RATES, common_course
+from heatsplat.physics.common_course import RATES, common_course, least_squares
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
 # Courses over time that points share: one source and bodies that follow it more or less slowly need a few.
 COURSES = (1, 2, 3)
 HARMONIC, COMMON = "harmonics", "common"  # values of effects.source
-# Times what all effects together leave of the points' values: a common course may leave so much. Under a lamp it leaves 0.6 to
-# 1.2 times as much, once 1.6 (where it would still gain 2.4 dB) and once 2.0 (behind haze: 0.6 dB, but 0.3 °C worse); where
-# something passes the points 1.6 (2.1 dB worse).
-ALIKE = 1.3
+FOLDS = 4  # of the images: each is foreseen from the others
+FARTHEST = 30.0  # errors expected, beyond which it does not matter how wrong a value is foreseen
+HARMONIC_RIDGE = 1e-5  # with which harmonics of points foresee best
 HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 
 
@@ -42,20 +41,36 @@ def evidence(inspected: Inspection) -> Evidence:
     if count is None:
         return passing(inspected) or found
     harmonic = {"source": HARMONIC, "frequencies": harmonics(inspected, count)}
-    common = shared(inspected)
+    common = shared(inspected, harmonic["frequencies"])
     if common is None:
         return replace(found, settings=harmonic)
-    course, misfit, usual = common
-    harmonic["course"] = course  # for who asks for it
-    if misfit > max(ALIKE * usual, 1.0):
+    harmonic["course"] = common.course  # for who asks for it
+    if common.foreseen > common.foreseen_by_harmonics:
         return replace(found, settings=harmonic)
-    said = f"{found.reason}; all points answer one course, but for {misfit:.2g} times that error"
+    said = (
+        f"{found.reason}; all points answer one course, which foresees images to {common.foreseen:.2g} times that error, "
+        f"where harmonics of each point do to {common.foreseen_by_harmonics:.2g} times"
+    )
     return replace(found, reason=said, settings=harmonic | {"source": COMMON})
 
 
-def shared(inspected: Inspection) -> tuple[list[float], float, float] | None:
-    """The course of one source that all points answer (``physics.common_course``); what it leaves of the points' values, as root
-    mean square in units of the errors expected; and what effects without a common source leave. None where nobody can tell."""
+@dataclass(frozen=True)
+class Shared:
+    """A source that all points answer (``physics.common_course``), and how well it says what they do.
+
+    Attributes:
+        course: its power.
+        foreseen: mean size of the errors at images that the course was not fitted to, in units of those expected.
+        foreseen_by_harmonics: the same of a few harmonics of each point.
+    """
+
+    course: list[float]
+    foreseen: float
+    foreseen_by_harmonics: float
+
+
+def shared(inspected: Inspection, count: int) -> Shared | None:
+    """The source that all points answer beside ``count`` harmonics of each; None where nobody can tell."""
     fit, model = inspected.joint
     data, others = fit.data, fit.terms(model, Path)
     if data.ambient is None or others:
@@ -68,16 +83,26 @@ def shared(inspected: Inspection) -> tuple[list[float], float, float] | None:
     if not counted.any():
         return None
     weights = weights[counted]
-    course, left = common_course(values[counted], weights, (inspected.obs.times_s - first) / span)
-    misfit = _misfit(left, weights, own)
-    usual = _misfit(fit.residuals(model)[counted], weights, fit.own(model)[1].shape[2])
-    return [round(power, 4) for power in course.tolist()], misfit, usual
+    values, spans = torch.where(weights > 0, values[counted], 0.0), (inspected.obs.times_s - first) / span
+    phases = (inspected.obs.times_s - first)[:, None] * frequencies(inspected, count)
+    decays = torch.exp(-spans[:, None] * torch.tensor(RATES, dtype=torch.float64))
+    basis = torch.cat([decays, phases.cos(), phases.sin()], 1)
+    return Shared(
+        [round(power, 4) for power in common_course(values, weights, spans)[0].tolist()],
+        _foreseen(
+            values, weights, lambda known: torch.where(known > 0, values, 0.0) - common_course(values, known, spans)[1]
+        ),
+        _foreseen(values, weights, lambda known: least_squares(values, known, basis, HARMONIC_RIDGE)[0] @ basis.T),
+    )
 
 
-def _misfit(left: Tensor, weights: Tensor, numbers: int) -> float:
-    """Root mean square of what is left of values [P, F], in units of errors, of points with so many numbers of their own."""
-    free = ((weights > 0).sum(1) - numbers).clamp_min(1).sum()
-    return float(((weights * left**2).sum() / free).sqrt())
+def _foreseen(values: Tensor, weights: Tensor, explained: Callable[[Tensor], Tensor]) -> float:
+    """Mean size of the errors, in units of those expected, of values [P, F] that are foreseen from other images."""
+    fold, errors = torch.arange(values.shape[1]) % FOLDS, []
+    for k in range(FOLDS):
+        left = (values - explained(weights * (fold != k))) * weights.sqrt()
+        errors.append(left[(weights > 0) & (fold == k)].abs().clamp_max(FARTHEST))
+    return float(torch.cat(errors).mean())
 
 
 def passing(inspected: Inspection) -> Evidence | None:
@@ -114,7 +139,6 @@ def harmonics(inspected: Inspection, count: int) -> int:
     and a decay.
     """
     fit, _ = inspected.joint
-    recorded = torch.tensor([t for t in inspected.scene.train.times_s if t is not None], dtype=torch.float64)
     shared = fit.basis("harmonic_source", count)
     frames = len(shared)
     passed = inspected.obs.times_s - inspected.obs.times_s.min()
@@ -125,7 +149,7 @@ def harmonics(inspected: Inspection, count: int) -> int:
     # A course is known as well as the mean over the points that show it; the noise of one point is the criterion's own.
     best, least = 1, math.inf
     for number in HARMONICS:
-        omega = frequency_grid(recorded, number, default_tau_min(recorded), math.sqrt(0.5))
+        omega = frequencies(inspected, number)
         phases = passed[:, None] * omega
         basis = torch.cat([torch.ones(frames, 1, dtype=torch.float64), decays, phases.cos(), phases.sin()], 1)
         if basis.shape[1] > frames - 2:
@@ -136,6 +160,12 @@ def harmonics(inspected: Inspection, count: int) -> int:
         if criterion < least:
             best, least = number, criterion
     return best
+
+
+def frequencies(inspected: Inspection, count: int) -> Tensor:
+    """Of the thermal model's grid, in radians per second."""
+    recorded = torch.tensor([t for t in inspected.scene.train.times_s if t is not None], dtype=torch.float64)
+    return frequency_grid(recorded, count, default_tau_min(recorded), math.sqrt(0.5))
 
 
 EFFECT = Effect(
