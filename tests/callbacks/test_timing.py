@@ -77,6 +77,14 @@ def test_a_resumed_run_goes_on_counting(tmp_path):
     )  # 3 views at steps 4, 12 and 16; the one at step 8 came after the checkpoint
 
 
+def test_what_was_chosen_before_training_has_its_own_time(tmp_path):
+    for config, seconds in (({}, 0.0), ({"choosing_seconds": 7.5}, 7.5)):
+        module = FakeModule(wall(), tmp_path, config)
+        fit(module, trainer(tmp_path, [CostMeter()], steps=5, every=5))
+        assert module.results.cost["choosing_seconds"] == seconds
+        assert module.results.cost["wall_seconds"] < 7.5
+
+
 def test_runs_without_timed_steps_say_so(tmp_path):
     module = FakeModule(wall(), tmp_path)
     job = trainer(tmp_path, [CostMeter()], steps=3, every=3)

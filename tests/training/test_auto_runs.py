@@ -48,7 +48,9 @@ def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(
         "quats",
         "opacity_logits",
     }
-    effects = RunResults.read(tmp_path / "metrics.json").effects
+    results = RunResults.read(tmp_path / "metrics.json")
+    effects = results.effects
+    assert results.cost["choosing_seconds"] > 0
     assert list(effects) == list(assembly.NAMES) and {n for n, e in effects.items() if e["on"]} == set(PRESENT)
     assert effects["relaxation"]["parameters"] == len(module.splats)  # a state and a rate in place of one value
     assert effects["frame_offset"]["parameters"] == len(module.scene.train)
@@ -90,6 +92,7 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
     assert len(scene_says) == 1
     half = tmp_path / "whole" / "checkpoints" / "step_000006.ckpt"
     second, _ = run(tmp_path / "resumed", *overrides, f"ckpt={half}")
+    assert second.results.cost["choosing_seconds"] == module.results.cost["choosing_seconds"] > 0
     assert len(scene_says) == 1  # the choice is the checkpoint's
     weights, again = module.state_dict(), second.state_dict()
     assert weights.keys() == again.keys() and all(torch.equal(weights[name], again[name]) for name in weights)

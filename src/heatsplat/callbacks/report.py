@@ -34,6 +34,7 @@ REPORT_FILE = "report.md"
 CURVES_FILE = "renders/curves.png"
 
 COST_UNITS = {
+    "choosing_seconds": "s",
     "train_seconds": "s",
     "cpu_seconds": "s",
     "steps_per_second": "1/s",

@@ -20,6 +20,8 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 class CostMeter(pl.Callback):
     """Measures what a run costs and puts it into ``module.results.cost``.
 
+    * ``choosing_seconds``: wall time before training in which the effects of the scene were chosen (method=auto), 0 where there
+      was nothing to choose; in none of the others.
     * ``train_seconds``: wall time of training steps, everything that happens in them included (data, render, backward,
       optimiser, density control, callbacks, writing checkpoints). Excluded: validation with its pictures and curves,
       the test, set-up, and the first ``warmup_steps`` steps after every start, in which kernels are compiled.
@@ -130,6 +132,7 @@ class CostMeter(pl.Callback):
         else:
             for name in ("train_seconds", "cpu_seconds", "steps_per_second"):
                 put("cost", name, None, f"the run was not longer than its {self.warmup_steps} steps of warm-up")
+        put("cost", "choosing_seconds", module.config.get("choosing_seconds", 0.0))
         put("cost", "warmup_seconds", seconds["warmup"])
         put("cost", "evaluation_seconds", seconds["evaluation"])
         put("cost", "wall_seconds", sum(seconds.values()))
@@ -140,6 +143,7 @@ class CostMeter(pl.Callback):
     def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if sum(self.seconds.values()) == 0:
             for name in (
+                "choosing_seconds",
                 "train_seconds",
                 "cpu_seconds",
                 "steps_per_second",

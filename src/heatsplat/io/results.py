@@ -24,6 +24,7 @@ FAILED = "FAILED"  # why it has no results
 # Keys that every metrics.json has, null with a reason where a run could not measure them.
 TEST = tuple(DEFINITIONS)
 COST = (
+    "choosing_seconds",
     "train_seconds",
     "cpu_seconds",
     "steps_per_second",

@@ -22,8 +22,8 @@ NOT_LEARNED = {"threads", "ckpt", "row", "table", "leaderboard", "test", "traine
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
     """The configuration with what an earlier run measured for it, and with ``ckpt``, where there is one to go on from.
 
-    "verdicts" are those on its scene; "budget" is its plan. A checkpoint of the last step of a run is not gone on from, for
-    there would be no step left in which the cost could be measured.
+    "verdicts" are those on its scene, which took "choosing_seconds"; "budget" is its plan. A checkpoint of the last step of a
+    run is not gone on from, for there would be no step left in which the cost could be measured.
 
     Args:
         config: as composed and checked.
@@ -40,7 +40,7 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         if changed:
             log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
             break
-        config = config | _measured(stored, path, "verdicts", "budget")
+        config = config | _measured(stored, path, "verdicts", "choosing_seconds", "budget")
         if checkpoint["global_step"] < planned_end(checkpoint):
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return config | {"ckpt": str(path)}
@@ -134,5 +134,5 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
                 f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "
                 "without ckpt"
             )
-        config = config | _measured(stored, ckpt, "verdicts")
+        config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
     return config

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
@@ -18,12 +19,14 @@ log = logging.getLogger("heatsplat")
 
 
 def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
-    """The configuration with "verdicts": on every effect, why, and what each that is on costs (unless effects.price=false).
+    """The configuration with "verdicts": on every effect, why, and what each that is on costs (unless effects.price=false);
+    and "choosing_seconds", which that took.
 
     The same configuration where nothing is left to be chosen, or an earlier run has chosen.
     """
     if "verdicts" in config or not assembly.chooses_effects(config):
         return config
+    began = time.perf_counter()
     verdicts, costs = decide_effects(config["effects"], scene), {}
     if config["effects"]["price"]:
 
@@ -40,7 +43,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     found = assembly.verdicts_as_dicts(verdicts, costs)
     for line in assembly.verdict_table(found):
         log.info("%s", line)
-    return config | {"verdicts": found}
+    return config | {"verdicts": found, "choosing_seconds": time.perf_counter() - began}
 
 
 def decide_effects(effects: Mapping[str, Any], scene: SceneData) -> dict[str, Verdict]:
