@@ -42,7 +42,7 @@ def test_what_passes_points_one_after_the_other_gives_each_its_own():
 
 
 def test_points_that_depart_more_than_usual_share_no_course(heated, monkeypatch):
-    monkeypatch.setattr(harmonic_source, "common_course", lambda values, weights, spans: (torch.ones(64), 10 * values))
+    monkeypatch.setattr(harmonic_source, "common_course", lambda values, *_, **__: (torch.ones(64), 10 * values))
     found = harmonic_source.evidence(heated).settings
     assert found["source"] == "harmonics" and len(found["course"]) == 64  # for who asks for it
 

@@ -94,6 +94,19 @@ def test_a_gap_in_the_record_is_bridged(excess):
     assert off.square().mean() < 0.7 * straight.square().mean()
 
 
+def test_a_course_to_start_from_ends_where_one_that_is_found_anew_does(excess):
+    weights = torch.ones_like(excess)
+    course, _ = common_course(excess, weights, SPANS)
+    weights[:, ::4] = 0.0
+    found, left = common_course(excess, weights, SPANS, start=course)
+    anew, left_anew = common_course(excess, weights, SPANS)
+    assert torch.corrcoef(torch.stack([found, anew]))[0, 1] > 0.95
+    off, off_anew = (
+        (excess + rest)[:, ::4].abs().mean() for rest in (left, left_anew)
+    )  # what was not seen counts as 0
+    assert float(off) == pytest.approx(float(off_anew), rel=0.15)
+
+
 def test_the_fewer_the_images_the_less_a_course_bends(excess):
     """18 images foresee others more than 1.5 times as well as with a course that may bend as that of all 70."""
     few, spans = excess[:, ::4], SPANS[::4]

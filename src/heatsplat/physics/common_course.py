@@ -45,10 +45,11 @@ def common_course(
     rates: Tensor | None = None,
     moments: int = MOMENTS,
     smooth: float = BEND,
+    start: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The course [K] of a common source, of at most 1 in size, and what it leaves of the values [P, F], those not seen being 0.
 
-    It starts with one rate for each surface, which find the course where sums of several, that can be anything at first,
+    Without a course to start from, one rate for each surface finds it where sums of several, that can be anything at first,
     would not.
 
     Args:
@@ -58,14 +59,16 @@ def common_course(
         rates: [R] float64; None: ``RATES``.
         moments: K.
         smooth: as ``BEND``, relative to what values say on average of a moment.
+        start: [K] course that was found in much the same values.
     """
     rates = torch.tensor(RATES, dtype=torch.float64) if rates is None else rates
     values = torch.where(weights > 0, values, 0.0)
     seen = max(int((weights > 0).any(0).sum()), 2)
     bends = torch.eye(moments, dtype=torch.float64).diff(n=2, dim=0) * (moments - 1) ** 2
     bent = smooth / (seen - 1) ** 4 * bends.mT @ bends
-    course = torch.ones(moments, dtype=torch.float64)
-    for tried, explain in ((SINGLE, _of_one_rate), (rates, _of_all_rates)):
+    course = torch.ones(moments, dtype=torch.float64) if start is None else start
+    stages = ((SINGLE, _of_one_rate), (rates, _of_all_rates))
+    for tried, explain in stages if start is None else stages[1:]:
         table = response_table(tried, moments)
         unit = torch.stack([table.exact(float(at)) for at in spans])
         decays = torch.exp(-spans[:, None] * tried)

@@ -87,11 +87,14 @@ def shared(inspected: Inspection, count: int) -> Shared | None:
     phases = (inspected.obs.times_s - first)[:, None] * frequencies(inspected, count)
     decays = torch.exp(-spans[:, None] * torch.tensor(RATES, dtype=torch.float64))
     basis = torch.cat([decays, phases.cos(), phases.sin()], 1)
+    course, _ = common_course(values, weights, spans)
+
+    def answered(known: Tensor) -> Tensor:
+        return torch.where(known > 0, values, 0.0) - common_course(values, known, spans, start=course)[1]
+
     return Shared(
-        [round(power, 4) for power in common_course(values, weights, spans)[0].tolist()],
-        _foreseen(
-            values, weights, lambda known: torch.where(known > 0, values, 0.0) - common_course(values, known, spans)[1]
-        ),
+        [round(power, 4) for power in course.tolist()],
+        _foreseen(values, weights, answered),
         _foreseen(values, weights, lambda known: least_squares(values, known, basis, HARMONIC_RIDGE)[0] @ basis.T),
     )
 
