@@ -64,10 +64,9 @@ the others.
 points, one course of power is fitted to all of them (`physics/common_course.py`), each of which answers it in three
 exponentials. `method=auto` learns that course and six numbers for each Gaussian if, fitted to three of four images, it foresees
 the others better than K harmonics of each point do; else K harmonics for each Gaussian (ETGS). The fewer the images, the less
-the course bends between them. `effects.source=common` and
-`harmonics` choose by hand. The course starts at that of the points; so does the extinction of the air, which the joint fit
-knows to a thousandth of its largest at each image, while training alone confuses it with warmer surfaces.
-`renders/courses.png` shows what was learned.
+the course bends between them. `effects.source=common` and `harmonics` choose by hand. The course starts at that of the points;
+so does the extinction of the air, which the joint fit knows to a thousandth of its largest at each image, while training alone
+confuses it with warmer surfaces. `renders/courses.png` shows what was learned.
 
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms

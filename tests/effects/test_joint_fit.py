@@ -327,8 +327,7 @@ def test_columns_of_single_images_count_as_any_others_do(at_once, monkeypatch):
     rest = (wanted - own @ torch.linalg.lstsq(own, wanted).solution).flatten(0, 1)
     found = least_squares.gram(basis, columns, weights)
     torch.testing.assert_close(found, rest.T @ rest, rtol=0, atol=1e-7)
-    assert (found[-2] == 0).all() and (
-        found[:, -2] == 0
-    ).all()  # what the points' own bases say is none of the shared ones'
+    # What the points' own bases say is none of the shared ones'.
+    assert (found[-2] == 0).all() and (found[:, -2] == 0).all()
     products = torch.cat([found[-1:], found[:-1]])[:, [-1, *range(len(found) - 1)]]
     assert least_squares.shared_weights(products).isfinite().all()

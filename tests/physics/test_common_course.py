@@ -101,9 +101,8 @@ def test_a_course_to_start_from_ends_where_one_that_is_found_anew_does(excess):
     found, left = common_course(excess, weights, SPANS, start=course)
     anew, left_anew = common_course(excess, weights, SPANS)
     assert torch.corrcoef(torch.stack([found, anew]))[0, 1] > 0.95
-    off, off_anew = (
-        (excess + rest)[:, ::4].abs().mean() for rest in (left, left_anew)
-    )  # what was not seen counts as 0
+    # What was not seen counts as 0.
+    off, off_anew = ((excess + rest)[:, ::4].abs().mean() for rest in (left, left_anew))
     assert float(off) == pytest.approx(float(off_anew), rel=0.15)
 
 

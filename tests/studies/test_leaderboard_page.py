@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from boards import board, protocol_folder, run_of
 
-from heatsplat.studies.leaderboard.page import page
+from heatsplat.io.pictures import THERMAL
+from heatsplat.studies.leaderboard.page import TEMPLATE, WIDTH, _picture, page
 from heatsplat.studies.leaderboard.standings import standings
 
 
@@ -36,3 +37,13 @@ def test_the_page_has_all_entries_pictures_and_links(tmp_path):
     assert entry["links"] == ["3dgs_cooling_steps_0/.hydra/config.yaml"] and len(entry["rank"]) == 2
     assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("it is for")
     assert content(page(found, asked, None))["entries"][0]["links"] == []
+
+
+def test_pictures_are_no_wider_than_they_are_shown():
+    assert f"figure img {{ display: block; width: {WIDTH}px;" in TEMPLATE.read_text(encoding="utf-8")
+    halves = np.repeat([[0.0, 1.0]], 256, 0).repeat(160, 1)
+    for values, size in ((halves, (160, WIDTH, 3)), (halves[:52, 128:192], (52, 64, 3))):
+        stored = np.frombuffer(base64.b64decode(_picture(values, 0.0, 1.0, THERMAL).partition(",")[2]), np.uint8)
+        picture = cv2.imdecode(stored, cv2.IMREAD_COLOR)
+        assert picture.shape == size
+        assert picture[:, : size[1] // 4].mean() + 80 < picture[:, -size[1] // 4 :].mean()  # dark and bright as before

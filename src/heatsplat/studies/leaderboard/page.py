@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from heatsplat.geometry.resampling import resampled
 from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
@@ -27,6 +29,7 @@ from heatsplat.studies.score import ENDINGS, TRUTH
 TEMPLATE = Path(__file__).with_name("page.html")
 SHOWN = ("views", "times")  # parts of which the view in the middle is shown
 QUALITY = 25  # of its WebP: hundreds of pictures are in one page
+WIDTH = 200  # pixels, in which the template shows a picture
 
 
 def page(found: Standings, board: Board, folder: Path | None) -> str:
@@ -113,24 +116,28 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
                 "low": low,
                 "high": high,
                 "limit": limit,
-                "truth": data_uri(colorize(exact, low, high, THERMAL), QUALITY),
+                "truth": _picture(exact, low, high, THERMAL),
                 "renders": {
                     **{method: earlier["renders"][method] for method in kept},
-                    **{
-                        method: data_uri(colorize(image, low, high, THERMAL), QUALITY)
-                        for method, image in renders.items()
-                    },
+                    **{method: _picture(image, low, high, THERMAL) for method, image in renders.items()},
                 },
                 "errors": {
                     **{method: earlier["errors"][method] for method in kept},
-                    **{
-                        method: data_uri(colorize(image, -limit, limit, ERROR), QUALITY)
-                        for method, image in errors.items()
-                    },
+                    **{method: _picture(image, -limit, limit, ERROR) for method, image in errors.items()},
                 },
             }
         )
     return shown
+
+
+def _picture(values: np.ndarray, low: float, high: float, colormap: str) -> str:
+    """Values [H, W] in colours as the ``src`` of an image, no wider than it is shown."""
+    picture = colorize(values, low, high, colormap)
+    height, width = picture.shape[:2]
+    if width > WIDTH:
+        shrunk = resampled(torch.from_numpy(picture).float(), round(height * WIDTH / width), WIDTH, "area")
+        picture = shrunk.round().byte().numpy()
+    return data_uri(picture, QUALITY)
 
 
 def _render(entry: Entry, name: str) -> np.ndarray | None:
