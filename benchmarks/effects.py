@@ -9,6 +9,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.effects import assembly
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults, write_atomically
@@ -16,11 +17,15 @@ from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import trained
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
+MOST_NAMED = 5  # effects that a cell of the table names
+CLOCKS = {
+    "train_seconds": "Milliseconds are those of whole training steps: compare them on a machine that does nothing else.",
+    "cpu_seconds": "Milliseconds are CPU time of whole training steps.",
+}
 NOTE = (
-    "Means over seeds on held-out images as the camera records them; clean is the image before the camera, against the truth "
-    "without its flaws, which matters where frames have numbers of their own that nobody knows of held-out ones. "
-    "Milliseconds are those of whole training steps of the run itself, one run after another: compare them on a machine that "
-    "does nothing else. Parameters are those at the end, after Gaussians were added and removed."
+    "Held-out images as the camera records them, mean ± standard deviation over the seeds; clean is the image before the camera, "
+    "against the truth without its flaws, which matters where frames have numbers of their own that nobody knows of held-out "
+    "ones. Parameters are those at the end, after Gaussians were added and removed."
 )
 
 
@@ -51,16 +56,21 @@ class Job:
 
 @dataclass(frozen=True)
 class Row:
-    """Means over the seeds of a job: PSNR in dB, of the recorded and of the clean image, MAE in °C, numbers that are learned,
-    milliseconds per step."""
+    """A job's results: by seed, PSNR in dB of the recorded and of the clean image (empty where none is known) and MAE in °C
+    (empty without temperatures); means of the numbers that are learned and of milliseconds per step."""
 
     job: Job
     effects: tuple[str, ...]
-    psnr: float
-    clean_psnr: float | None
-    mae_c: float | None
+    psnr: tuple[float, ...]
+    clean_psnr: tuple[float, ...]
+    mae_c: tuple[float, ...]
     parameters: float
     ms_per_step: float
+
+    @property
+    def shown(self) -> str:
+        """The effects that were on, by name, or how many where a cell cannot hold them."""
+        return ", ".join(self.effects) or "none" if len(self.effects) <= MOST_NAMED else f"{len(self.effects)} effects"
 
 
 def run(
@@ -72,6 +82,7 @@ def run(
     seeds: Sequence[int],
     overrides: Sequence[str],
     threads: int | None = None,
+    clock: str = "train_seconds",
 ) -> None:
     """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
 
@@ -86,10 +97,12 @@ def run(
         seeds: of every row.
         overrides: of every run.
         threads: CPU threads of every run; None takes all cores.
+        clock: the cost that counts as time, of CLOCKS.
 
     Raises:
-        SceneError: a run failed, or its folder holds a run of other settings.
+        SceneError: a run failed, its folder holds a run of other settings, or there is no such clock.
     """
+    check_option("study.clock", clock, CLOCKS, SceneError)
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *overrides]
     plain: dict[tuple[str, int], RunResults] = {}  # without any effect, by preset and seed
@@ -109,7 +122,7 @@ def run(
         for selection in selections:
             job, bare = Job(preset, selection, 0), selection == "none" or (selection == "oracle" and not truth)
             whole = [of(replace(job, seed=seed), bare) for seed in seeds]
-            rows.append(_mean(job, whole))
+            rows.append(_row(job, whole, clock))
             if selection == "auto" and leave_one_out:
                 for name in rows[-1].effects:
                     left = replace(job, left_out=name)
@@ -117,8 +130,8 @@ def run(
                         of(replace(left, seed=seed), _on(results) <= assembly.dependents(name))
                         for seed, results in zip(seeds, whole, strict=True)
                     ]
-                    rows.append(_mean(left, less))
-        write_atomically(folder / TABLE_FILE, tables(rows))  # what is known so far
+                    rows.append(_row(left, less, clock))
+        write_atomically(folder / TABLE_FILE, tables(rows, clock))  # what is known so far
     figure = picture(rows)
     if figure is not None:
         write_png(folder / PICTURE_FILE, figure_picture(figure))
@@ -129,44 +142,49 @@ def _on(results: RunResults) -> frozenset[str]:
     return frozenset(name for name, effect in results.effects.items() if effect["on"])
 
 
-def _mean(job: Job, results: Sequence[RunResults]) -> Row:
-    """The row of a job's runs; effects are those that were on in any of them."""
+def _row(job: Job, results: Sequence[RunResults], clock: str) -> Row:
+    """The row of a job's runs, one for each seed; effects are those that were on in any of them."""
     effects = {name: None for result in results for name, effect in result.effects.items() if effect["on"]}
 
-    def mean(name: str) -> float | None:
-        known = [result.test[name] for result in results if result.test.get(name) is not None]
-        return statistics.fmean(known) if known else None
+    def known(name: str) -> tuple[float, ...]:
+        return tuple(result.test[name] for result in results if result.test.get(name) is not None)
 
     return Row(
         job,
         tuple(effects),
-        statistics.fmean(result.test["psnr"] for result in results),
-        mean("clean_psnr"),
-        mean("mae_c"),
+        known("psnr"),
+        known("clean_psnr"),
+        known("mae_c"),
         statistics.fmean(result.run["parameters"] for result in results),
-        statistics.fmean(1000.0 / result.cost["steps_per_second"] for result in results),
+        statistics.fmean(1000.0 * result.cost[clock] / result.run["steps"] for result in results),
     )
 
 
-def tables(rows: Sequence[Row]) -> str:
+def tables(rows: Sequence[Row], clock: str) -> str:
     """Markdown: selections side by side, then what leaving each effect out costs."""
     chosen = [
         (
-            row.job.preset, row.job.selection, ", ".join(row.effects) or "none", number(row.psnr, 2), number(row.clean_psnr, 2),
-            number(row.mae_c, 3), number(row.parameters, 0), number(row.ms_per_step, 1),
+            row.job.preset, row.job.selection, row.shown, _told(row.psnr, 2), _told(row.clean_psnr, 2), _told(row.mae_c, 3),
+            number(row.parameters, 0), number(row.ms_per_step, 1),
         )
         for row in rows
         if row.job.left_out is None
     ]  # fmt: skip
     head = ("scene", "selection", "effects", "PSNR (dB)", "clean (dB)", "MAE (°C)", "parameters", "ms per step")
-    lines = ["# What selecting effects is worth", "", NOTE, "", *markdown_table(head, chosen, align="lllrrrrr")]
+    lines = [
+        "# What selecting effects is worth",
+        "",
+        f"{NOTE} {CLOCKS[clock]}",
+        "",
+        *markdown_table(head, chosen, align="lllrrrrr"),
+    ]
     whole = {row.job.preset: row for row in rows if row.job.selection == "auto" and row.job.left_out is None}
     left = []
     for row in (row for row in rows if row.job.left_out):
         auto = whole[row.job.preset]
-        worse, cleaner = _difference(row.mae_c, auto.mae_c), _difference(auto.clean_psnr, row.clean_psnr)
         left.append((
-            row.job.preset, row.job.left_out, number(auto.psnr - row.psnr, 2), number(cleaner, 2), number(worse, 3),
+            row.job.preset, row.job.left_out, _told(_less(auto.psnr, row.psnr), 2),
+            _told(_less(auto.clean_psnr, row.clean_psnr), 2), _told(_less(row.mae_c, auto.mae_c), 3),
             number(auto.parameters - row.parameters, 0), number(auto.ms_per_step - row.ms_per_step, 2),
         ))  # fmt: skip
     if left:
@@ -185,8 +203,16 @@ def tables(rows: Sequence[Row]) -> str:
     return "\n".join([*lines, ""])
 
 
-def _difference(more: float | None, less: float | None) -> float | None:
-    return None if more is None or less is None else more - less
+def _told(values: Sequence[float], digits: int) -> str:
+    """Mean of values by seed, with their standard deviation where there are several."""
+    if not values:
+        return number(None, digits)
+    return number(statistics.fmean(values), digits, statistics.stdev(values) if len(values) > 1 else None)
+
+
+def _less(more: Sequence[float], less: Sequence[float]) -> list[float]:
+    """Differences seed by seed; empty where one of the two does not know them."""
+    return [a - b for a, b in zip(more, less, strict=True)] if more and less else []
 
 
 def picture(rows: Sequence[Row]) -> Figure | None:
@@ -202,7 +228,8 @@ def picture(rows: Sequence[Row]) -> Figure | None:
         found = [row for row in found if row.job.preset in truths]
         heights = [names.index(row.job.preset) + 0.15 * (i - 1) for row in found]
         style = {"marker": "os^"[i], "linestyle": "", "color": f"C{i}", "label": selection}
-        left.plot([row.psnr - truths[row.job.preset].psnr for row in found], heights, **style)
+        gains = [statistics.fmean(_less(row.psnr, truths[row.job.preset].psnr)) for row in found]
+        left.plot(gains, heights, **style)
         right.plot([row.ms_per_step / truths[row.job.preset].ms_per_step for row in found], heights, **style)
     left.axvspan(-0.3, 0.3, color="0.9", zorder=0)  # what counts as equal
     left.set(xlabel="PSNR minus that of the true effects (dB)", yticks=range(len(names)), yticklabels=names)

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from benchmarks import effects as study
+from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS as ROOMS
 from heatsplat.effects import assembly
@@ -43,10 +44,11 @@ def commands(monkeypatch):
         for word in command:
             if word.endswith("=off"):
                 on -= dependents(word.removeprefix("effects.").partition("=")[0])
+        seed = next(int(word.partition("=")[2]) for word in command if word.startswith("seed="))
         results = RunResults(
-            run={"parameters": 1000 + 100 * len(on)},
-            test={"psnr": 30.0 + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},
-            cost={"steps_per_second": 1000.0 / (10 + len(on))},
+            run={"parameters": 1000 + 100 * len(on), "steps": 5},
+            test={"psnr": 30.0 + seed + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},
+            cost={"train_seconds": 5e-3 * (10 + len(on)), "cpu_seconds": 10e-3 * (10 + len(on))},
             effects={name: {"on": name in on} for name in ("relaxation", "harmonic_source", "agc")},
         )
         results.write(f"{place}/metrics.json")
@@ -62,13 +64,33 @@ def test_every_selection_runs_and_each_chosen_effect_is_left_out(commands, tmp_p
     oracle = [command for command in commands if "effects.relaxation=on" in command]
     assert len(oracle) == 2 and all("effects=none" in c and "effects.harmonic_source=on" in c for c in oracle)
     table = (tmp_path / study.TABLE_FILE).read_text()
-    assert "| heated | auto | relaxation, harmonic_source | 32.00 | 40.00 | 0.800 | 1,200 | 12.0 |" in table
-    assert "| static | all | relaxation, harmonic_source, agc | 30.00 | 40.00 | 1.000 | 1,300 | 13.0 |" in table
-    assert "| heated | oracle | relaxation, harmonic_source | 32.00 | 40.00 | 0.800 | 1,200 | 12.0 |" in table
-    assert "| static | none | none | 30.00 | 40.00 | 1.000 | 1,000 | 10.0 |" in table
-    assert "| heated | harmonic_source | 1.00 | 0.00 | 0.100 | 100 | 1.00 |" in table
-    assert "| heated | relaxation | 2.00 | 0.00 | 0.200 | 200 | 2.00 |" in table
+    every = "relaxation, harmonic_source"
+    assert f"| heated | auto | {every} | 32.50 ± 0.71 | 40.00 ± 0.00 | 0.800 ± 0.000 | 1,200 | 12.0 |" in table
+    assert f"| static | all | {every}, agc | 30.50 ± 0.71 | 40.00 ± 0.00 | 1.000 ± 0.000 | 1,300 | 13.0 |" in table
+    assert f"| heated | oracle | {every} | 32.50 ± 0.71 | 40.00 ± 0.00 | 0.800 ± 0.000 | 1,200 | 12.0 |" in table
+    assert "| static | none | none | 30.50 ± 0.71 | 40.00 ± 0.00 | 1.000 ± 0.000 | 1,000 | 10.0 |" in table
+    assert "| heated | harmonic_source | 1.00 ± 0.00 | 0.00 ± 0.00 | 0.100 ± 0.000 | 100 | 1.00 |" in table
+    assert "| heated | relaxation | 2.00 ± 0.00 | 0.00 ± 0.00 | 0.200 ± 0.000 | 200 | 2.00 |" in table
     assert (tmp_path / study.PICTURE_FILE).stat().st_size > 5000
+
+
+def test_one_seed_has_no_spread_and_processor_seconds_are_a_clock(commands, tmp_path):
+    settings = SETTINGS | {"seeds": [1], "selections": ["auto", "all"], "clock": "cpu_seconds"}
+    study.run(tmp_path, **settings)
+    table = (tmp_path / study.TABLE_FILE).read_text()
+    assert "| heated | auto | relaxation, harmonic_source | 33.00 | 40.00 | 0.800 | 1,200 | 24.0 |" in table
+    assert "| heated | relaxation | 2.00 | 0.00 | 0.200 | 200 | 4.00 |" in table and "CPU time" in table
+    with pytest.raises(SceneError, match="study.clock must be one of train_seconds, cpu_seconds, got 'hours'"):
+        study.run(tmp_path, **settings | {"clock": "hours"})
+
+
+def test_many_effects_are_counted(commands, tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "MOST_NAMED", 2)
+    study.run(tmp_path, **SETTINGS | {"seeds": [0], "leave_one_out": False})
+    table = (tmp_path / study.TABLE_FILE).read_text()
+    assert (
+        "| heated | all | 3 effects | 32.00 |" in table and "| heated | auto | relaxation, harmonic_source |" in table
+    )
 
 
 def test_the_truth_of_its_configuration_is_that_of_the_scenes():
