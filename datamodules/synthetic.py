@@ -22,7 +22,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor import (
     in_weather,
     training_frames,
 )
-from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, YARDS
+from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, OF_ANY_LENGTH, YARDS
 from heatsplat.datamodules.synthetic_scene.parts import TRAIN, parts_of, rules
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.rooms import ROOM, number_of, room
@@ -49,7 +49,7 @@ class Synthetic(SceneDataModule):
         scene_seed: of the hand's motion, the noise and the sparse points; another recording of the same scene.
         only: name of a surface; only its pixels count. None: all do.
         weather: outdoors: fair (None), calm, windy or overcast; all start from the same midnight.
-        days: of outdoor_true: 2 to 7, of which the last is held out; None takes 2.
+        days: of outdoor and outdoor_true: 2 to 7, of which the last is held out; None takes 2.
         split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere. "parts" holds
             out several parts, whose names begin those of their frames, and gives every view its exact image.
         parts: what "parts" leaves out (``synthetic_scene.parts.parts_of``).
@@ -84,9 +84,9 @@ class Synthetic(SceneDataModule):
         if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
             known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
-        if days is not None and (scene != "outdoor_true" or not 2 <= days <= MOST_DAYS):
+        if days is not None and (scene not in OF_ANY_LENGTH or not 2 <= days <= MOST_DAYS):
             raise SceneError(
-                f"data.days={days}: outdoor_true lasts 2 to {MOST_DAYS} days, other scenes are as long as they are"
+                f"data.days={days}: {' and '.join(OF_ANY_LENGTH)} last 2 to {MOST_DAYS} days, other scenes as long as they do"
             )
         if weather is not None and scene not in YARDS:
             why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"

@@ -1,4 +1,4 @@
-"""A yard over two days: a house, a shed, a car, a tank and a terrace under sun, wind and sky, seen by a drone.
+"""A yard over two days or more: a house, a shed, a car, a tank and a terrace under sun, wind and sky, seen by a drone.
 
 Metres; x is east, y north, z up. Every face of an object is of one temperature per shade of its paint: no surface casts
 a shadow on another, only its own orientation decides how the sun meets it, and a face that leans sees as much of its
@@ -125,7 +125,7 @@ YARD = (
 
 @dataclass(frozen=True)
 class Sky:
-    """How the two days go.
+    """How the days go.
 
     Args:
         warm_c, swing_k: mean and half the range of the day's air temperature.
@@ -307,7 +307,7 @@ class OutdoorScene(Scene):
         )  # to the camera, as after correction
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
-        self.weather = outdoor_weather(preset.weather)
+        self.weather = outdoor_weather(preset.weather, 0.0, preset.duration_s)
         if preset.hours is not None:
             self.weather = _within(self.weather, preset.hours)
         # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
@@ -315,7 +315,7 @@ class OutdoorScene(Scene):
         self.face_surface = torch.tensor([number for number, _ in faces])
         self.face_normals = torch.tensor([normal for _, normal in faces], dtype=torch.float64)
         self.shades = torch.stack([_shades(preset.surfaces[number].absorbs) for number, _ in faces])
-        self.history = _solved(preset.surfaces, preset.weather)
+        self.history = _solved(preset.surfaces, preset.weather, preset.duration_s)
 
     def heat_at(self, points: Tensor, which: Tensor) -> OutdoorHeat:  # type: ignore[override]
         """Face and absorptivity at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
@@ -415,7 +415,7 @@ def training_frames(frames: int) -> int:
 
 
 @cache
-def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
+def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str, duration_s: float) -> History:
     """Surface temperatures of all faces in all their shades; every weather starts from the same midnight."""
     slabs, normals = [], []
     for surface in surfaces:
@@ -425,7 +425,7 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str) -> History:
     before = forcing_of(outdoor_weather("fair", -_BEFORE_S, 0.0), np.array(normals))
     # How the surfaces got to their state at midnight need not be converged: it defines the start.
     midnight = integrate(slabs, before, float(before.air_k.mean()), cells=20, steps=4).states_k
-    return solve(slabs, forcing_of(outdoor_weather(weather), np.array(normals)), midnight)
+    return solve(slabs, forcing_of(outdoor_weather(weather, 0.0, duration_s), np.array(normals)), midnight)
 
 
 def _normals(shape: Box | Plane) -> list[tuple[float, float, float]]:

@@ -53,6 +53,7 @@ BODIES = {
 SHOWERS = ((18.5, 19.5, 2.0), (38.0, 38.7, 3.0), (70.0, 74.0, 1.5), (113.0, 114.0, 4.0), (140.0, 141.5, 2.0))
 """Start and end in hours of the record, and millimetres an hour."""
 MOST_DAYS = 7
+OF_ANY_LENGTH = ("outdoor", "outdoor_true")  # yards whose record lasts as many days as asked for
 
 
 @dataclass(frozen=True)

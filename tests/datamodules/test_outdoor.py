@@ -209,6 +209,18 @@ def test_the_first_day_trains_and_the_second_tests():
     assert len(mixed.test) == 3 and mixed.notes["split"] == "every_8th"
 
 
+def test_a_longer_record_begins_like_a_short_one_and_holds_out_its_last_day():
+    short, long = world(), OutdoorScene(replace(OUTDOOR["outdoor"], duration_s=3 * DAY_S))
+    roof, times = torch.tensor([[0.9, -1.2, 5.5]], dtype=torch.float64), torch.tensor([0.2, 0.9, 1.6]) * DAY_S
+    # The same solver and the same forcing; only how far it refines is decided by the whole record.
+    torch.testing.assert_close(long.truth(roof, times), short.truth(roof, times), rtol=0, atol=0.02)
+    scene = Synthetic(scene="outdoor", size="tiny", days=3).scene
+    zero = scene.weather.notes["utc_at_zero_s"]
+    days = [{(zero + t) // DAY_S - zero // DAY_S for t in views.times_s} for views in (scene.train, scene.test)]
+    assert days == [{0, 1}, {2}] and (len(scene.train), len(scene.test)) == (13, 6)
+    assert scene.weather.times_s[-1] - scene.weather.times_s[0] == 3 * DAY_S
+
+
 def test_images_show_the_truth_and_every_surface_is_seen():
     scene = tiny()
     errors = []

@@ -100,7 +100,7 @@ def replace_days(days: int):
     return type("Long", (), {"preset": replace(TRUE, duration_s=days * DAY_S)})()
 
 
-@pytest.mark.parametrize("options", [{"scene": "outdoor", "days": 3}, {"scene": "outdoor_true", "days": 8}])
+@pytest.mark.parametrize("options", [{"scene": "facade", "days": 3}, {"scene": "outdoor", "days": 8}])
 def test_days_that_a_scene_does_not_have_are_refused(options):
-    with pytest.raises(SceneError, match="outdoor_true lasts 2 to 7 days"):
+    with pytest.raises(SceneError, match="outdoor and outdoor_true last 2 to 7 days"):
         Synthetic(**options)
