@@ -86,7 +86,7 @@ def run(
 ) -> None:
     """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
 
-    Without any effect there is one recipe, whoever chose it: it is trained once.
+    One choice of effects is one recipe, whoever chose it: it is trained once.
 
     Args:
         output_dir: of the study; runs that have results there are not run again.
@@ -105,29 +105,28 @@ def run(
     check_option("study.clock", clock, CLOCKS, SceneError)
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *overrides]
-    plain: dict[tuple[str, int], RunResults] = {}  # without any effect, by preset and seed
+    known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on
 
-    def of(job: Job, bare: bool) -> RunResults:
-        """The results of a run; ``bare`` where it is known before that no effect will be on."""
-        if bare and (job.preset, job.seed) in plain:
-            return plain[job.preset, job.seed]
+    def of(job: Job, expected: frozenset[str] | None) -> RunResults:
+        """The results of a run; ``expected`` are the effects that will be on, None where only the run can tell."""
+        if expected is not None and (job.preset, job.seed, expected) in known:
+            return known[job.preset, job.seed, expected]
         place = folder / "runs" / job.folder / str(job.seed)
         results = trained(place, train, [*common, *job.overrides(presets[job.preset])], folder)
-        if not _on(results):
-            plain[job.preset, job.seed] = results
-        return results
+        return known.setdefault((job.preset, job.seed, _on(results)), results)
 
     rows = []
     for preset, truth in presets.items():
         for selection in selections:
-            job, bare = Job(preset, selection, 0), selection == "none" or (selection == "oracle" and not truth)
-            whole = [of(replace(job, seed=seed), bare) for seed in seeds]
+            job = Job(preset, selection, 0)
+            expected = {"none": frozenset(), "oracle": frozenset(truth)}.get(selection)
+            whole = [of(replace(job, seed=seed), expected) for seed in seeds]
             rows.append(_row(job, whole, clock))
             if selection == "auto" and leave_one_out:
                 for name in rows[-1].effects:
                     left = replace(job, left_out=name)
                     less = [
-                        of(replace(left, seed=seed), _on(results) <= assembly.dependents(name))
+                        of(replace(left, seed=seed), _on(results) - assembly.dependents(name))
                         for seed, results in zip(seeds, whole, strict=True)
                     ]
                     rows.append(_row(left, less, clock))

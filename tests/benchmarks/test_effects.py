@@ -16,7 +16,7 @@ from heatsplat.effects.assembly import dependents
 from heatsplat.io.results import RunResults
 from heatsplat.studies import child_runs
 
-PRESETS = {"static": [], "heated": ["relaxation", "harmonic_source"]}
+PRESETS = {"static": [], "heated": ["relaxation", "harmonic_source"], "sheets": ["relaxation", "conduction"]}
 SETTINGS = {
     "train": "train.py",
     "presets": PRESETS,
@@ -29,7 +29,10 @@ SETTINGS = {
 
 @pytest.fixture
 def commands(monkeypatch):
-    """Stands in for training: leaves results in which every effect that is on is worth one decibel and a millisecond."""
+    """Stands in for training: leaves results in which every effect that is on is worth one decibel and a millisecond.
+
+    The choice of effects finds all that are there but conduction.
+    """
     given = []
 
     def trained(command, **_):
@@ -38,7 +41,7 @@ def commands(monkeypatch):
         preset = next(word.partition("=")[2] for word in command if word.startswith("data.scene="))
         truth, on = set(PRESETS[preset]), set()
         if "effects=auto" in command or any(word.endswith("=on") for word in command):
-            on = set(truth)
+            on = truth - {"conduction"} if "effects=auto" in command else set(truth)
         if "effects=all" in command:
             on = {"relaxation", "harmonic_source", "agc"}
         for word in command:
@@ -49,7 +52,7 @@ def commands(monkeypatch):
             run={"parameters": 1000 + 100 * len(on), "steps": 5},
             test={"psnr": 30.0 + seed + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},
             cost={"train_seconds": 5e-3 * (10 + len(on)), "cpu_seconds": 10e-3 * (10 + len(on))},
-            effects={name: {"on": name in on} for name in ("relaxation", "harmonic_source", "agc")},
+            effects={name: {"on": name in on} for name in ("relaxation", "harmonic_source", "conduction", "agc")},
         )
         results.write(f"{place}/metrics.json")
         return SimpleNamespace(returncode=0)
@@ -60,14 +63,19 @@ def commands(monkeypatch):
 
 def test_every_selection_runs_and_each_chosen_effect_is_left_out(commands, tmp_path):
     study.run(tmp_path, **SETTINGS)
-    assert len(commands) == 2 * (2 + 5)  # static: auto, all; heated: auto, all, oracle, a source left out, and nothing
+    # static: auto, all; heated: auto, which is the truth, all, a source left out, and nothing; sheets: auto, all, oracle, nothing
+    assert len(commands) == 2 * (2 + 4 + 4)
     oracle = [command for command in commands if "effects.relaxation=on" in command]
-    assert len(oracle) == 2 and all("effects=none" in c and "effects.harmonic_source=on" in c for c in oracle)
+    assert len(oracle) == 2 and all("effects=none" in c and "effects.conduction=on" in c for c in oracle)
     table = (tmp_path / study.TABLE_FILE).read_text()
     every = "relaxation, harmonic_source"
     assert f"| heated | auto | {every} | 32.50 ± 0.71 | 40.00 ± 0.00 | 0.800 ± 0.000 | 1,200 | 12.0 |" in table
     assert f"| static | all | {every}, agc | 30.50 ± 0.71 | 40.00 ± 0.00 | 1.000 ± 0.000 | 1,300 | 13.0 |" in table
     assert f"| heated | oracle | {every} | 32.50 ± 0.71 | 40.00 ± 0.00 | 0.800 ± 0.000 | 1,200 | 12.0 |" in table
+    assert (
+        "| sheets | auto | relaxation | 31.50 ± 0.71 |" in table
+        and "| sheets | oracle | relaxation, conduction | 32.50" in table
+    )
     assert "| static | none | none | 30.50 ± 0.71 | 40.00 ± 0.00 | 1.000 ± 0.000 | 1,000 | 10.0 |" in table
     assert "| heated | harmonic_source | 1.00 ± 0.00 | 0.00 ± 0.00 | 0.100 ± 0.000 | 100 | 1.00 |" in table
     assert "| heated | relaxation | 2.00 ± 0.00 | 0.00 ± 0.00 | 0.200 ± 0.000 | 200 | 2.00 |" in table
