@@ -366,7 +366,8 @@ def at(config, key):
 
 
 @pytest.mark.parametrize(
-    ("steps", "rate", "rest"), [(20, 1e-2, 1.5e-3), (1500, 1e-2, 1.5e-3), (5000, 3e-3, 4.5e-4), (30000, 2.5e-3, 1.25e-4)]
+    ("steps", "rate", "rest"),
+    [(20, 1e-2, 1.5e-3), (1500, 1e-2, 1.5e-3), (5000, 3e-3, 4.5e-4), (30000, 2.5e-3, 1.25e-4)],
 )
 def test_short_runs_of_ravigs_reach_as_far_with_its_attributes(steps, rate, rest):
     thermal = compose(["method=ravigs", f"max_steps={steps}"])["thermal"]
