@@ -225,6 +225,8 @@ def picture(rows: Sequence[Row]) -> Figure | None:
     for i, selection in enumerate(("auto", "none", "all")):
         found = [row for row in rows if row.job.selection == selection and row.job.left_out is None]
         found = [row for row in found if row.job.preset in truths]
+        if not found:
+            continue
         heights = [names.index(row.job.preset) + 0.15 * (i - 1) for row in found]
         style = {"marker": "os^"[i], "linestyle": "", "color": f"C{i}", "label": selection}
         gains = [statistics.fmean(_less(row.psnr, truths[row.job.preset].psnr)) for row in found]
