@@ -86,7 +86,7 @@ class Synthetic(SceneDataModule):
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
         if days is not None and (scene not in OF_ANY_LENGTH or not 2 <= days <= MOST_DAYS):
             raise SceneError(
-                f"data.days={days}: {' and '.join(OF_ANY_LENGTH)} last 2 to {MOST_DAYS} days, other scenes as long as they do"
+                f"data.days={days}: {' and '.join(OF_ANY_LENGTH)} last 2 to {MOST_DAYS} days; leave it null elsewhere"
             )
         if weather is not None and scene not in YARDS:
             why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"
