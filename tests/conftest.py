@@ -18,16 +18,7 @@ if WORKERS:  # before torch is imported, which reads it once
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job: what it starts would not hear Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-RUNS = {
-    "benchmarks",
-    "callbacks",
-    "effects",
-    "losses",
-    "project",
-    "runs",
-    "studies",
-    "training",
-}  # folders with tests that train
+FILMING = {"datamodules"}  # folders with tests of filming itself
 # Files that take longest, begun first: side by side, no process is left with one of them while the others have none.
 LONGEST = (
     "physics/test_physics_energy_balance.py",
@@ -109,7 +100,7 @@ def configurations_read_once():
 @pytest.fixture(scope="module", autouse=True)
 def filmed_once(request):
     """Runs on the same recording share it: filming takes half of a tiny run. Tests of filming itself film."""
-    if request.path.parent.name not in RUNS:
+    if request.path.parent.name in FILMING:
         yield
         return
     from heatsplat.datamodules.synthetic import Synthetic

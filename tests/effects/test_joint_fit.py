@@ -240,8 +240,8 @@ SURE = SimpleNamespace(
 def look(fit, *names):
     """An inspection of what was fitted, by images that tell everything."""
     model = Model.of(**dict.fromkeys(names, 1))
-    certainty = SimpleNamespace(fit=fit, **SURE.__dict__)
-    return SimpleNamespace(joint=(fit, model), obs=SimpleNamespace(why=""), certainty=certainty)
+    certainty = SimpleNamespace(fit=fit, model=model, **SURE.__dict__)
+    return SimpleNamespace(joint=(fit, model), obs=SimpleNamespace(why=""), certainty=certainty, for_patterns=certainty)
 
 
 def sized(monkeypatch, **sizes):

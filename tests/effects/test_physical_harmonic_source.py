@@ -35,34 +35,21 @@ def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):
     assert best > 0.85
 
 
+def test_where_harmonics_of_each_point_foresee_better_they_are_taken(heated):
+    source = heated.heat_source
+    assert source.common
+    told = {}
+    for name, foreseen in (("harmonics", 1.1), ("common", 0.9)):
+        told[name] = Inspection(heated.given, heated.effects)
+        told[name].joint, told[name].heat_source = (
+            heated.joint,
+            replace(source, foreseen=foreseen, foreseen_by_harmonics=1.0),
+        )
+        found = harmonic_source.evidence(told[name]).settings
+        assert found["source"] == name and found["frequencies"] == source.harmonics and len(found["course"]) == MOMENTS
+
+
 @pytest.mark.slow
 def test_what_passes_points_one_after_the_other_gives_each_its_own():
     found = harmonic_source.evidence(inspected("moving_source", size="demo"))
     assert found.settings["source"] == "harmonics"
-
-
-def test_points_that_depart_more_than_usual_share_no_course(heated, monkeypatch):
-    monkeypatch.setattr(harmonic_source, "common_course", lambda values, *_, **__: (torch.ones(64), 10 * values))
-    found = harmonic_source.evidence(heated).settings
-    assert found["source"] == "harmonics" and len(found["course"]) == 64  # for who asks for it
-
-
-def test_a_course_that_foresees_worse_than_harmonics_of_each_point_is_left(heated, monkeypatch):
-    worse = replace(harmonic_source.shared(heated, 12), foreseen=1.1, foreseen_by_harmonics=1.0)
-    monkeypatch.setattr(harmonic_source, "shared", lambda inspected, count: worse)
-    assert harmonic_source.evidence(heated).settings["source"] == "harmonics"
-    monkeypatch.setattr(harmonic_source, "shared", lambda inspected, count: replace(worse, foreseen=0.9))
-    assert harmonic_source.evidence(heated).settings["source"] == "common"
-
-
-def test_what_is_foreseen_comes_from_other_images_and_counts_in_errors():
-    """Each image from the mean of the other folds: 1 in the one that is 1, 1/3 in the others."""
-    values = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(3, 5)
-    weights = torch.full_like(values, 0.25)  # errors of 2
-    mean = lambda known: ((known * values).sum(1) / known.sum(1))[:, None].expand_as(values)  # noqa: E731
-    found = harmonic_source._foreseen(values, weights, mean)
-    assert found == pytest.approx((1.0 + 3 * (1 / 3)) / 4 / 2)
-    weights[:, 7] = 0.0  # not seen
-    values[:, 7] = 1e9
-    assert harmonic_source._foreseen(values, weights, mean) == pytest.approx(found, rel=0.2)
-    assert harmonic_source._foreseen(1e6 * values, weights, mean) <= harmonic_source.FARTHEST

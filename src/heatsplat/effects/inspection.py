@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from heatsplat.contracts import SceneData
-from heatsplat.effects import weather_record
+from heatsplat.effects import heat_source, weather_record
 from heatsplat.effects.base import Effect
 from heatsplat.effects.image_motion import Delays, delays
 from heatsplat.effects.joint.certainty import Certainty
@@ -59,6 +59,21 @@ class Inspection:
     def certainty(self) -> Certainty | None:
         """What can be told from the joint fit; None where there is none."""
         return None if self.joint is None else Certainty(*self.joint)
+
+    @cached_property
+    def heat_source(self) -> heat_source.Source | None:
+        """What drives the scene; None where its points depart from no relaxation."""
+        count = None if self.joint is None else self.joint[1].kind(heat_source.NAME)
+        return None if count is None else heat_source.source(self, count)
+
+    @cached_property
+    def for_patterns(self) -> Certainty | None:
+        """What can be told of places in the image: beside the one source that all points answer, where there is one and images
+        are clearly uneven beside it; else from the joint fit. None where there is none."""
+        source = self.heat_source
+        alone = source is not None and source.common and self.scene.weather is None
+        beside = heat_source.beside(self, source.course) if alone and self.joint[0].data.moves else None
+        return self.certainty if beside is None else beside
 
     @cached_property
     def weathered(self) -> Weathered | None:

@@ -107,14 +107,14 @@ class Certainty:
 
     def _counts(self, name: str) -> bool:
         """Whether a selected effect gains so much on held-out observations that something would have to take its place."""
-        return self._compared(self.model, self.fit.without(self.model, name)).db > MIN_DB
+        return self.compared(self.model, self.fit.without(self.model, name)).db > MIN_DB
 
     def worth(self, name: str, more: Model | None = None, less: Model | None = None) -> Worth:
         """What is known of an effect; ``more`` and ``less`` are the models with and without it, those of the selection."""
         more = self.model if more is None else more
         less = self.fit.without(more, name) if less is None else less
         if (more, less) not in self._worths:
-            held_out = self._compared(more, less)
+            held_out = self.compared(more, less)
             self._worths[more, less] = Worth(held_out, self._doubt(name, more, less, held_out))
         return self._worths[more, less]
 
@@ -204,13 +204,14 @@ class Certainty:
 
     def _is_clear(self, more: Model, less: Model) -> bool:
         """Whether one model explains what was left out clearly better than another."""
-        gain = self._compared(more, less)
+        gain = self.compared(more, less)
         return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
 
     def _shows(self, more: Model, less: Model) -> bool:
-        return shows(self._compared(more, less))
+        return shows(self.compared(more, less))
 
-    def _compared(self, more: Model, less: Model) -> HeldOut:
+    def compared(self, more: Model, less: Model) -> HeldOut:
+        """What one model gains over another on observations that neither was fitted to."""
         return compared(self._squares_of(more), self._squares_of(less), self.fit.weights)
 
     def _beside_changes(self, name: str, more: Model, less: Model) -> bool:
@@ -224,7 +225,7 @@ class Certainty:
         if self.fit.data.effects[name].term.single_images:
             if unfollowed and rough:
                 return False  # surfaces under the sky change alike
-            return bool(changing) and all(self._compared(more, one).db > 0 for one in changing)
+            return bool(changing) and all(self.compared(more, one).db > 0 for one in changing)
         return bool(changing) and all(self._is_clear(more.plus(ANY, one.kind(ANY)), one) for one in changing)
 
     def _may_be_change(self, name: str) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import candidates, earns, worthwhile
 
@@ -19,7 +20,7 @@ def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
     fit, model = inspected.joint
     certainty = inspected.certainty
     if name in model.names:
-        return judged(inspected, name, sentence, model, fit.without(model, name))
+        return judged(certainty, name, sentence, model, fit.without(model, name))
     if name in certainty.doubts:
         return Evidence(None, f"cannot be told: {certainty.doubts[name]}", told=False)
     tried = [one for other, one in candidates(fit, model) if other == name]
@@ -44,14 +45,13 @@ def gained(inspected: Inspection, name: str, sentence: str) -> Evidence:
     return Evidence(gain, found if told else f"{found}: cannot be told, more frames would tell", told=told)
 
 
-def judged(inspected: Inspection, name: str, sentence: str, more: Model, less: Model) -> Evidence:
+def judged(certainty: Certainty, name: str, sentence: str, more: Model, less: Model) -> Evidence:
     """What an effect gains that was taken in, and whether that can be told from chance."""
-    fit = inspected.certainty.fit
-    gain, size = fit.gain(more, less), fit.effect_size(more, less)
-    worth = inspected.certainty.worth(name, more, less)
-    doubt = worth.doubt or inspected.certainty.doubts.get(name, "")
+    gain, size = certainty.fit.gain(more, less), certainty.fit.effect_size(more, less)
+    worth = certainty.worth(name, more, less)
+    doubt = worth.doubt or certainty.doubts.get(name, "")
     found = f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost, {worth.held_out.db:.1f} dB where left out"
-    if inspected.certainty.idle(name, more, less):
+    if certainty.idle(name, more, less):
         return Evidence(0.0, f"{found}: nothing is lost without it", gain_db=worth.held_out.db)
     return Evidence(
         gain, f"{found}: cannot be told, {doubt}" if doubt else found, told=not doubt, gain_db=worth.held_out.db

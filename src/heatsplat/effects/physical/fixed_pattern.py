@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.heat_source import PATTERNS
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside, judged
@@ -30,17 +31,18 @@ def evidence(inspected: Inspection) -> Evidence:
     part is left to vignetting."""
     if inspected.joint is None:
         return Evidence(None, inspected.obs.why)
-    fit, model = inspected.certainty.fit, inspected.joint[1]
+    certainty = inspected.for_patterns
+    fit = certainty.fit
     if not fit.data.moves:
         return Evidence(None, STILL)
-    none = inspected.certainty.beside_weather(model.minus({"fixed_pattern", "vignetting"}))
+    none = certainty.beside_weather(certainty.model.minus(PATTERNS))
     share, gain = vignetting.falloff(fit, none)
     fades = share < vignetting.MIN_FALLOFF and gain > vignetting.EFFECT.threshold
     less = none.plus("vignetting") if fades else none
     more = less.plus("fixed_pattern")
     found = "places in the image differ" + (" beside the falloff" if fades else "") + " by"
     if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
-        evidence = judged(inspected, "fixed_pattern", found, more, less)
+        evidence = judged(certainty, "fixed_pattern", found, more, less)
         much = fit.data.drivers is None and evidence.gain_db is not None and evidence.gain_db > FIFTH_DB
         if evidence.told and evidence.statistic < SURE and not much:
             return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")

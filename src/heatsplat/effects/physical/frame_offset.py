@@ -30,7 +30,7 @@ def evidence(inspected: Inspection) -> Evidence:
         fit, model = inspected.joint
         alone = fit.without(model, "agc")
         if inspected.certainty.idle("agc", model, alone):  # gains that are left out take no offsets
-            return judged(inspected, "frame_offset", sentence, alone, fit.without(alone, "frame_offset"))
+            return judged(inspected.certainty, "frame_offset", sentence, alone, fit.without(alone, "frame_offset"))
         found = "gains change from image to image, and their shift takes what offsets there are"
         doubt = inspected.certainty.doubts.get("agc")
         return Evidence(None, f"{found}, if they do: {doubt}", told=False) if doubt else Evidence(0.0, found)

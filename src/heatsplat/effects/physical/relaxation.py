@@ -9,6 +9,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.courses import DECAYS, DECAYS_FEW, LONG
 from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
@@ -16,11 +17,6 @@ from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
 from heatsplat.effects.weathered import MIN_DB, SIGMAS
 
-# Mixtures of these decays, as rates times the record's length, stand for any course that relaxes: the surface of a deep
-# body does not follow one exponential. Within 0.5 % of the excess for slabs of Biot number 0 to 3.
-DECAYS = (0.6, 2.5, 9.0, 40.0)
-LONG = 24  # observations of a point from which all of these can be told apart; below that, DECAYS_FEW
-DECAYS_FEW = (0.7, 3.0, 12.0)
 BESIDE_DRIFT = 0.25  # share of a common offset that other changes must exceed before a still camera
 
 

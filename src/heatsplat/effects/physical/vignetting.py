@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.heat_source import PATTERNS
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside
@@ -30,10 +31,11 @@ def evidence(inspected: Inspection) -> Evidence:
     """Whether the image fades towards its corners."""
     if inspected.joint is None:
         return Evidence(None, inspected.obs.why)
-    fit, model = inspected.certainty.fit, inspected.joint[1]
+    certainty = inspected.for_patterns
+    fit = certainty.fit
     if not fit.data.moves:
         return Evidence(None, STILL)
-    none = inspected.certainty.beside_weather(model.minus({"fixed_pattern", "vignetting"}))
+    none = certainty.beside_weather(certainty.model.minus(PATTERNS))
     radial = none.plus("vignetting")
     share, gain = falloff(fit, none)
     size = fit.effect_size(radial, none)
@@ -46,8 +48,8 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(0.0, f"{why}, which is no falloff")
     if not worthwhile(fit, radial, none, "vignetting"):
         return Evidence(0.0, why)
-    worth = inspected.certainty.worth("vignetting", radial, none)
-    doubt = worth.doubt or inspected.certainty.doubts.get("vignetting", "")
+    worth = certainty.worth("vignetting", radial, none)
+    doubt = worth.doubt or certainty.doubts.get("vignetting", "")
     if UNSURE[0] < gain < UNSURE[1]:
         doubt = "a pattern of the camera may have as much of a falloff; more frames would tell"
     told = gain <= UNSURE[0] or not doubt

@@ -1,0 +1,162 @@
+"""What drives a scene: one source that all points answer, or harmonics of each; and what else images show beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from heatsplat.effects.joint.certainty import MIN_SIGMAS, Certainty
+from heatsplat.effects.joint.courses import DECAYS_FEW
+from heatsplat.effects.joint.data import MIN_FREE
+from heatsplat.effects.joint.terms import Own, Path
+from heatsplat.physics.common_course import RATES, common_course, least_squares, response_table
+from heatsplat.physics.frequencies import default_tau_min, frequency_grid
+
+if TYPE_CHECKING:
+    from heatsplat.effects.inspection import Inspection
+
+NAME = "harmonic_source"  # of the effect
+KNOWN = "known"  # its kind in the joint fit where the course of the source is known
+PATTERNS = ("fixed_pattern", "vignetting")  # what a camera adds at places in the image, whatever drives the scene
+# On held-out observations, beside a known course: from 3.9 where a lamp stands before an uneven camera and images are enough
+# (0.7 to 1.6 in 16), 0.0 where it stands before an even one, and up to 0.9 where a gain control passes for the lamp.
+LEAST_DB = 2.0
+FOLDS = 4  # of the images: each is foreseen from the others
+FARTHEST = 30.0  # errors expected, beyond which it does not matter how wrong a value is foreseen
+HARMONIC_RIDGE = 1e-5  # with which harmonics of points foresee best
+HARMONICS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+RATES_OF_POINTS = torch.tensor(RATES, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What drives a scene.
+
+    Attributes:
+        harmonics: how many of each point say how it goes.
+        course: power of one source that all points answer (``physics.common_course``); None where nobody can tell.
+        foreseen: mean size of the errors at images that the course was not fitted to, in units of those expected.
+        foreseen_by_harmonics: the same of a few harmonics of each point.
+    """
+
+    harmonics: int
+    course: Tensor | None = None
+    foreseen: float = math.inf
+    foreseen_by_harmonics: float = math.inf
+
+    @property
+    def common(self) -> bool:
+        """Whether one course for all points foresees images better than harmonics of each."""
+        return self.course is not None and self.foreseen <= self.foreseen_by_harmonics
+
+
+def source(inspected: Inspection, count: int) -> Source:
+    """What drives a scene whose points share ``count`` courses over time beside any relaxation."""
+    found = Source(harmonics(inspected, count))
+    fit, model = inspected.joint
+    data = fit.data
+    if data.ambient is None or fit.terms(model, Path):
+        return found
+    added = sum(fit.contributions(model).values())
+    values, weights = data.tracks.values - added - data.ambient, fit.weights
+    own = 2 * len(RATES)
+    counted = (weights > 0).sum(1) >= own + MIN_FREE
+    if not counted.any():
+        return found
+    weights = weights[counted]
+    values, spans = torch.where(weights > 0, values[counted], 0.0), _spans(inspected)
+    phases = (inspected.obs.times_s - inspected.scene.record[0])[:, None] * frequencies(inspected, found.harmonics)
+    basis = torch.cat([torch.exp(-spans[:, None] * RATES_OF_POINTS), phases.cos(), phases.sin()], 1)
+    course, _ = common_course(values, weights, spans)
+
+    def answered(known: Tensor) -> Tensor:
+        return torch.where(known > 0, values, 0.0) - common_course(values, known, spans, start=course)[1]
+
+    return replace(
+        found,
+        course=course,
+        foreseen=_foreseen(values, weights, answered),
+        foreseen_by_harmonics=_foreseen(
+            values, weights, lambda known: least_squares(values, known, basis, HARMONIC_RIDGE)[0] @ basis.T
+        ),
+    )
+
+
+def beside(inspected: Inspection, course: Tensor) -> Certainty | None:
+    """What can be told of a camera's patterns where a source of this course drives the scene; None where they explain little.
+
+    The joint fit knows no physics of sources: the courses that it gives points, each in its own measure, are any that explain
+    most, and as points move through the image while time goes by, those take a pattern for heat. What surfaces can answer to a
+    known course does not.
+    """
+    fit, model = inspected.joint
+    spans = _spans(inspected)
+    table = response_table(RATES_OF_POINTS, len(course))
+    answers = torch.stack([table.exact(float(at)) @ course for at in spans])
+    basis = torch.cat([torch.exp(-spans[:, None] * RATES_OF_POINTS), answers], 1)
+    effect = replace(
+        fit.data.effects[NAME],
+        term=Own(basis=lambda at, kind: basis, kinds=lambda at: (KNOWN,), in_time=True),
+        stands_on=None,
+    )
+    even = model.minus({NAME, "relaxation", *PATTERNS}).plus(NAME, KNOWN)
+    uneven = even.plus(PATTERNS[0]).plus(PATTERNS[1])
+    fit = replace(fit, data=replace(fit.data, effects={**fit.data.effects, NAME: effect}), known={}, bases={})
+    # Twice: the first time, what multiplies an image is not yet linearised about one without the pattern.
+    certainty = Certainty(fit.accepted(uneven).accepted(uneven), even)
+    gain = certainty.compared(uneven, even)
+    return certainty if gain.db > LEAST_DB and gain.sigmas > MIN_SIGMAS else None
+
+
+def harmonics(inspected: Inspection, count: int) -> int:
+    """K for which the criterion is least when the courses that points share are written as K harmonics and a decay.
+
+    The grid of frequencies is that of the thermal model, whose response to a harmonic after its start is that harmonic
+    and a decay.
+    """
+    fit, _ = inspected.joint
+    shared = fit.basis(NAME, count)
+    frames = len(shared)
+    passed = inspected.obs.times_s - inspected.obs.times_s.min()
+    decays = torch.exp(-passed[:, None] / float(passed.max()) * torch.tensor(DECAYS_FEW, dtype=torch.float64))
+    used = (fit.weights > 0).sum(0).double()
+    # A course is known as well as the mean over the points that show it; the noise of one point is the criterion's own.
+    best, least = 1, math.inf
+    for number in HARMONICS:
+        omega = frequencies(inspected, number)
+        phases = passed[:, None] * omega
+        basis = torch.cat([torch.ones(frames, 1, dtype=torch.float64), decays, phases.cos(), phases.sin()], 1)
+        if basis.shape[1] > frames - 2:
+            break
+        left = shared - basis @ torch.linalg.lstsq(basis, shared).solution
+        variance = max(float((left**2).sum()) / (count * (frames - basis.shape[1])), 1e-12)
+        criterion = frames * count * math.log(variance) + 2 * len(omega) * count * math.log(float(used.mean()))
+        if criterion < least:
+            best, least = number, criterion
+    return best
+
+
+def frequencies(inspected: Inspection, count: int) -> Tensor:
+    """Of the thermal model's grid, in radians per second."""
+    recorded = torch.tensor([t for t in inspected.scene.train.times_s if t is not None], dtype=torch.float64)
+    return frequency_grid(recorded, count, default_tau_min(recorded), math.sqrt(0.5))
+
+
+def _spans(inspected: Inspection) -> Tensor:
+    """When images were taken, in spans of the record."""
+    first, span = inspected.scene.record
+    return (inspected.obs.times_s - first) / span
+
+
+def _foreseen(values: Tensor, weights: Tensor, explained: Callable[[Tensor], Tensor]) -> float:
+    """Mean size of the errors, in units of those expected, of values [P, F] that are foreseen from other images."""
+    fold, errors = torch.arange(values.shape[1]) % FOLDS, []
+    for k in range(FOLDS):
+        left = (values - explained(weights * (fold != k))) * weights.sqrt()
+        errors.append(left[(weights > 0) & (fold == k)].abs().clamp_max(FARTHEST))
+    return float(torch.cat(errors).mean())
