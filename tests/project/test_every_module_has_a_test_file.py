@@ -41,7 +41,6 @@ ELSEWHERE = {
     ),
     "effects/test_off_is_absent": "effects/physical/convection effects/physical/radiation effects/physical/solar",
     "io/test_tiff_and_pictures": "io/pictures io/tiff io/video",
-    "kernels/test_simd": "kernels/compile_time",
     "losses/test_compose": "losses/schedules",
     "losses/test_high_frequency": "losses/swinir losses/teacher",
     "losses/test_photometric": "kernels/ssim",
@@ -76,7 +75,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 127  # modules; lower it when some go
+LONGEST = 126  # modules; lower it when some go
 
 
 def modules() -> list[str]:

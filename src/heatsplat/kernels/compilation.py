@@ -21,7 +21,10 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.serialize import dumps
 from numba.core.typed_passes import NativeLowering
+from numba.core.untyped_passes import DeadBranchPrune
 from numba.np.ufunc.parallel import _launch_threads
+
+from heatsplat.kernels.compile_time import FoldConstants
 
 log = logging.getLogger(__name__)
 
@@ -101,9 +104,29 @@ _ONE_AT_A_TIME = threading.Lock()
 _start_pool = functools.cache(_launch_threads)  # once, before code that calls it is loaded
 
 
+def _passes(state: Any) -> list[tuple[type, str]]:
+    """Numba's, with branches pruned by values that are known when a kernel is compiled."""
+    found = DefaultPassBuilder.define_nopython_pipeline(state).passes
+    at = next(k for k, (step, _) in enumerate(found) if step is DeadBranchPrune)
+    return [*found[:at], (FoldConstants, "fold constants"), *found[at:]]
+
+
+class _Compiler(CompilerBase):
+    def define_pipelines(self) -> list:
+        return [_manager("nopython", _passes(self.state))]
+
+
+def _manager(name: str, passes: list[tuple[type, str]]) -> PassManager:
+    manager = PassManager(name)
+    for step, description in passes:
+        manager.add_pass(step, description)
+    manager.finalize()
+    return manager
+
+
 def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
-    compiled = numba.njit(fastmath=fastmath, error_model="numpy", nogil=True)(function)
+    compiled = numba.njit(fastmath=fastmath, error_model="numpy", nogil=True, pipeline_class=_Compiler)(function)
     _cache_on_disk(compiled, function)
 
     @functools.wraps(function)
@@ -150,11 +173,10 @@ class _LowerToLink(NativeLowering):
 
 class _CompilerToLink(CompilerBase):
     def define_pipelines(self) -> list:
-        manager = PassManager("to link")
-        for step, description in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
-            manager.add_pass(_LowerToLink if step is NativeLowering else step, description)
-        manager.finalize()
-        return [manager]
+        passes = [
+            (_LowerToLink if step is NativeLowering else step, description) for step, description in _passes(self.state)
+        ]
+        return [_manager("to link", passes)]
 
 
 def inline(function: Callable) -> Callable:
