@@ -10,7 +10,7 @@ from heatsplat.composition import compose, composed
 
 NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks.report.html=false")
 TINY = (
-    "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES, "threads=2",
+    "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES, "threads=1",
 )  # fmt: skip
 
 

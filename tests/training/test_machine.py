@@ -15,9 +15,16 @@ from heatsplat.training import machine
 SRC = Path(__file__).resolve().parents[2] / "src"
 
 
-@pytest.mark.parametrize(("asked", "expected"), [(None, 3), (2, 2)])
-def test_a_run_takes_the_cores_of_its_job_and_not_those_of_the_node(monkeypatch, asked, expected):
+@pytest.mark.parametrize(
+    ("asked", "told", "expected"),
+    [(None, None, 3), (2, None, 2), (None, "2", 2), (1, "2", 1), (None, "1,4", 1), (None, "", 3), (None, "0", 3)],
+)
+def test_a_run_takes_the_cores_of_its_job_and_not_those_of_the_node(monkeypatch, asked, told, expected):
+    """Fewer where it is told a number, or OpenMP is."""
     taken = []
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if told is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", told)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {4, 5, 6}, raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(scheduling, "use_threads", taken.append)

@@ -29,13 +29,19 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def usual_threads() -> int:
+    """Threads of a process that was told no number: OMP_NUM_THREADS, as all of OpenMP takes it; else a core each."""
+    given = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a number for each level of nesting
+    return int(given) if given.isdecimal() and int(given) > 0 else cores()
+
+
 def prepare_machine(threads: int | None) -> None:
-    """Fixes the number of CPU threads (None: the cores that it may use) and quietens messages that no user can act on."""
+    """Fixes the number of CPU threads (None: ``usual_threads``) and quietens messages that no user can act on."""
     import torch  # here, for it is heavy, as kernels are
 
     from heatsplat.kernels.scheduling import use_threads
 
-    threads = threads or cores()
+    threads = threads or usual_threads()
     # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
     use_threads(threads)
     torch.set_num_threads(threads)
