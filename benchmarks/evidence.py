@@ -16,7 +16,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 
 from benchmarks.strengths import strengths
@@ -26,7 +25,7 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
-from heatsplat.training.machine import cores
+from heatsplat.training.machine import cores, prepare_machine
 
 log = logging.getLogger("heatsplat")
 
@@ -257,11 +256,11 @@ def _outcomes(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], j
     if not cases:
         return
     if jobs == 1:
-        torch.set_num_threads(1)  # small tensors
+        prepare_machine(1)  # small tensors
         yield from (outcome_of(data, *case) for case in cases)
         return
     context = multiprocessing.get_context("spawn")  # a fork would share OpenMP's threads
-    with ProcessPoolExecutor(jobs, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(jobs, context, initializer=prepare_machine, initargs=(1,)) as pool:
         yield from pool.map(partial(outcome_of, data), *zip(*cases, strict=True))
 
 

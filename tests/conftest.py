@@ -9,7 +9,7 @@ import pytest
 from hydra._internal.config_repository import ConfigRepository
 
 from heatsplat.composition import CONF
-from heatsplat.training.machine import cores
+from heatsplat.training.machine import cores, prepare_machine
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
@@ -75,6 +75,12 @@ def logging_as_it_was():
         if hasattr(one, "level") and (name in before or name not in names):
             one.level, one.disabled, one.propagate = before.get(name, (logging.NOTSET, False, True))
     root.manager._clear_cache()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def threads_as_told():
+    """Before anything is timed or compared: a first kernel starts its threads, which sets torch's number to all cores."""
+    prepare_machine(None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,6 +10,7 @@ from effects.tracks import FRAMES, PASSED, POINTS, drawn, fit_to, levels, positi
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.effects.joint import least_squares, selection
 from heatsplat.effects.joint.certainty import Worth
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.held_out import HeldOut
@@ -306,28 +307,9 @@ def test_eliminating_points_gives_what_one_dense_system_gives():
     dense[:, 2 * points :] = columns.flatten(0, 1)
     root = weights.flatten().sqrt()[:, None]
     expected = torch.linalg.lstsq(root * dense, root * values.flatten()[:, None]).solution[:, 0]
-    products = least_squares.gram(basis, torch.cat([values[..., None], columns], 2), weights)
+    both = Columns.dense(torch.cat([values[..., None], columns], 2))
+    products = least_squares.gram(basis, both, weights)
     shared = least_squares.shared_weights(products)
     assert torch.allclose(shared, expected[2 * points :], atol=1e-6)
     own = least_squares.own_weights(basis, values - columns @ shared, weights)
     assert torch.allclose(own.flatten(), expected[: 2 * points], atol=1e-6)
-
-
-@pytest.mark.parametrize("at_once", [100, 400_000])
-def test_columns_of_single_images_count_as_any_others_do(at_once, monkeypatch):
-    monkeypatch.setattr(least_squares, "_AT_ONCE", at_once)
-    points, frames = 7, 9
-    basis, weights = drawn(points, frames, 2), drawn(points, frames, seed=3).abs()
-    basis[..., 0] = 1.0  # a level, which every offset together says too
-    one_hot = torch.eye(frames, dtype=torch.float64).expand(points, -1, -1)
-    values = drawn(points, frames, 1, seed=2)
-    columns = torch.cat([one_hot, drawn(points, frames, 3, seed=1), one_hot * values, basis[..., 1:], values], 2)
-    root = weights.sqrt()[..., None]
-    own, wanted = root * basis, root * columns
-    rest = (wanted - own @ torch.linalg.lstsq(own, wanted).solution).flatten(0, 1)
-    found = least_squares.gram(basis, columns, weights)
-    torch.testing.assert_close(found, rest.T @ rest, rtol=0, atol=1e-7)
-    # What the points' own bases say is none of the shared ones'.
-    assert (found[-2] == 0).all() and (found[:, -2] == 0).all()
-    products = torch.cat([found[-1:], found[:-1]])[:, [-1, *range(len(found) - 1)]]
-    assert least_squares.shared_weights(products).isfinite().all()

@@ -11,14 +11,13 @@ from heatsplat.effects import assembly, catalogue, physical
 from heatsplat.effects.joint.selection import selected
 
 TILT = """
-import torch
-
 from heatsplat.effects.base import Effect, Evidence, Part
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, where_moving
 
 
 def columns(data, image, known):
-    return data.tracks.positions[..., :1] * torch.eye(image.shape[1], dtype=image.dtype)
+    return Columns.of_images(data.tracks.positions[..., 0])
 
 
 EFFECT = Effect(

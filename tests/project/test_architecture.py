@@ -22,7 +22,7 @@ ALLOWED = {
     "renderers": {"contracts", "geometry", "splats", "kernels"},
     "thermal": {"contracts", "geometry", "physics", "splats", "kernels"},
     "density": {"contracts", "geometry", "physics", "splats"},
-    "effects": {"contracts", "geometry", "physics", "training"},
+    "effects": {"contracts", "geometry", "physics", "kernels", "training"},
     "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "geometry", "metrics", "physics", "io", "heatsplat", "shots", "uncertainty", "viewer"},
     "export": {"contracts", "geometry", "io", "physics", "renderers", "shots", "uncertainty"},

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect
 from heatsplat.effects.joint import least_squares
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import Own, Path, Shared
@@ -163,8 +164,8 @@ class Fit:
             self._images[key] = clean + (self.data.ambient if self.terms(model, Path) else 0.0)
         return self._images[key]
 
-    def shared_columns(self, model: Model, known: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-        """The columns [P, F, c] of the shared effects of a model.
+    def shared_columns(self, model: Model, known: Mapping[str, Tensor] | None = None) -> dict[str, Columns]:
+        """The columns of the shared effects of a model.
 
         What multiplies an image multiplies the points' own part of it and what earlier effects of the sensor, as far as
         the model has them, added to that: were it the values themselves, a gain per frame would explain everything.
@@ -176,8 +177,8 @@ class Fit:
             image = image + known.get(name, 0.0)
         return columns
 
-    def gram(self, basis: Tensor, columns: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Inner products [c, c] of columns [P, F, c] with what the points' own bases [P, F, k] can say taken away."""
+    def gram(self, basis: Tensor, columns: Columns, weights: Tensor | None = None) -> Tensor:
+        """Inner products [c, c] of columns with what the points' own bases [P, F, k] can say taken away."""
         weights = self.weights if weights is None else weights
         return least_squares.gram(basis, columns, weights / self.trust[:, None])
 
@@ -196,8 +197,8 @@ class Fit:
         if not columns:
             return {}
         values, basis = self.own(model, weights)
-        products = self.gram(basis, torch.cat([values[..., None], *columns.values()], dim=2), weights)
-        parts = least_squares.shared_weights(products).split([block.shape[2] for block in columns.values()])
+        products = self.gram(basis, Columns.joined([Columns.dense(values[..., None]), *columns.values()]), weights)
+        parts = least_squares.shared_weights(products).split([block.count for block in columns.values()])
         numbers = dict(zip(columns, parts, strict=True))
         terms = {name: self.data.effects[name].term for name in columns}
         added = {name: block @ terms[name].settled(numbers[name]) for name, block in columns.items()}

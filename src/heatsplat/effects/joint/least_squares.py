@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from heatsplat.effects.joint.columns import Columns
+from heatsplat.kernels import elimination
+
 RIDGE = 1e-9
 ROUNDING = 1e-11  # share of a column's square below which what is left of it is none
 _AT_ONCE = 400_000  # numbers that are held at once, and stay in the cache
@@ -25,36 +28,40 @@ def own_part(basis: Tensor, values: Tensor, weights: Tensor) -> Tensor:
     return (basis @ own_weights(basis, values, weights)[..., None])[..., 0]
 
 
-def gram(basis: Tensor, columns: Tensor, weights: Tensor) -> Tensor:
-    """Inner products [c, c] of columns [P, F, c] with what the points' own bases [P, F, k] can say taken away.
+def gram(basis: Tensor, columns: Columns, weights: Tensor) -> Tensor:
+    """Inner products [c, c] of columns with what the points' own bases [P, F, k] can say taken away; ``weights`` [P, F].
 
-    A column of which they say all but the rounding is 0 then. Columns that are there in one image alone, as offsets and gains of
-    single images are, cost as many operations as if there were one image.
+    A column of which they say all but the rounding is 0 then. Costs go with the entries that are not zero.
     """
-    images = (columns != 0).any(0)
-    single = images.sum(0) == 1
-    at, only, others = images[:, single].to(torch.uint8).argmax(0), single.nonzero()[:, 0], (~single).nonzero()[:, 0]
-    within, taken = (columns.new_zeros(columns.shape[2], columns.shape[2]) for _ in range(2))
-    same = at[:, None] == at
-    step = max(1, _AT_ONCE // (columns.shape[1] * (len(others) + basis.shape[2]) + len(only)))
-    for first in range(0, len(columns), step):
+    count, members = columns.count, basis.shape[2]
+    common = basis.stride(0) == 0  # one basis that all points share
+    within, taken = (basis.new_zeros(count, count) for _ in range(2))
+    step = max(1, _AT_ONCE // (count * members))
+    for first in range(0, len(weights), step):
         part = slice(first, first + step)
-        root = weights[part].sqrt()[..., None]
-        own, wanted = root * basis[part], root * (columns[part][..., others] if len(only) else columns[part])
-        own = own / own.norm(dim=1, keepdim=True).clamp_min(1e-300)
-        there = root[:, at, 0] * columns[part][:, at, only]  # [p, single ones]
-        within[only[:, None], only] += same * (there.T @ there)
-        within[only[:, None], others] += torch.einsum("ps,pso->so", there, wanted[:, at])
-        within[others[:, None], others] += wanted.flatten(0, 1).T @ wanted.flatten(0, 1)
-        said = columns.new_empty(len(root), own.shape[2], columns.shape[2])
-        said[..., only] = own[:, at].mT * there[:, None]
-        said[..., others] = own.mT @ wanted
-        inner = own.mT @ own + RIDGE * torch.eye(own.shape[2], dtype=own.dtype)
+        points = len(weights[part])
+        said, inner = basis.new_zeros(points, count, members), basis.new_zeros(points, members, members)
+        elimination.sum_products(
+            *(
+                one.contiguous().numpy()
+                for one in (
+                    basis[:1] if common else basis[part],
+                    weights[part],
+                    columns.slots[part],
+                    columns.values[part],
+                    within,
+                    said,
+                    inner,
+                )
+            )
+        )
+        inner = inner + inner.tril(-1).mT + RIDGE * torch.eye(members, dtype=inner.dtype)
+        said = said.mT
         found = torch.linalg.solve(inner, said).flatten(0, 1)
         said = said.flatten(0, 1)
         # What is left has the products W'W - B'S - r S'S, for (O'O + r) S = B = O'W.
         taken += (said + RIDGE * found).T @ found
-    within[others[:, None], only] = within[only[:, None], others].T
+    within = within + within.T
     left = within - taken
     told = left.diagonal() > ROUNDING * within.diagonal()
     return left * told * told[:, None]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.model import Model
 
@@ -93,7 +94,7 @@ class Shared(Term):
     """An effect with one set of numbers for all points.
 
     Args:
-        columns: (Data, image, known) -> what the numbers multiply, [P, F, c]. ``image`` [P, F] is the points' own part with
+        columns: (Data, image, known) -> what the numbers multiply. ``image`` [P, F] is the points' own part with
             what earlier terms added; ``known`` [P, F] by name is what terms added when the fit was linearised.
         order: in which terms act on the image. What multiplies an image takes that with all earlier terms.
         settled: the numbers without the part that only renames the scene's own levels and their scale, which otherwise
@@ -101,7 +102,7 @@ class Shared(Term):
         gain: whether its numbers are gains, whose mean multiplies what earlier terms added.
     """
 
-    columns: Callable[[Data, Tensor, Mapping[str, Tensor]], Tensor]
+    columns: Callable[[Data, Tensor, Mapping[str, Tensor]], Columns]
     order: int
     settled: Callable[[Tensor], Tensor] = lambda numbers: numbers
     gain: bool = False

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, outdone
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared, centred
@@ -25,9 +25,9 @@ def evidence(inspected: Inspection) -> Evidence:
     return gained(inspected, "agc", "gains of single images change values by")
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """A gain for each frame."""
-    return image[..., None] * torch.eye(image.shape[1], dtype=image.dtype)
+    return Columns.of_images(image)
 
 
 EFFECT = Effect(

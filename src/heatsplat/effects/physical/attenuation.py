@@ -11,6 +11,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
@@ -59,8 +60,8 @@ def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
     return torch.exp(-(columns @ depths))
 
 
-def extinctions(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Extinctions [c], and what each counts for in an observation [P, F, c]: distances in world units, or for ``EVEN`` 1.
+def extinctions(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> tuple[Tensor, Columns]:
+    """Extinctions [c], and what each counts for in an observation: distances in world units, or for ``EVEN`` 1.
 
     log(value - ambient) is linear in the extinction (Beer-Lambert), so it comes from one linear fit there.
     """
@@ -70,13 +71,10 @@ def extinctions(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> tuple
     clear = (excess.abs() > 8.0 * fit.errors) & (excess * sign > 0)
     logs = torch.where(clear, excess.abs(), torch.ones_like(excess)).log()
     typical = float((tracks.distances * tracks.weights).sum() / tracks.weights.sum())
-    columns = (tracks.distances / typical)[..., None]
-    if kind == EVEN:
-        columns = torch.ones_like(columns)
-    if kind in ("varying", EVEN):
-        columns = columns * torch.eye(fit.data.frames, dtype=excess.dtype)
-    products = fit.gram(basis, torch.cat([logs[..., None], columns], 2), weights * excess**2 * clear)
-    ridge = 1e-8 * products.diagonal()[1:].mean().clamp_min(1e-300) * torch.eye(columns.shape[2], dtype=products.dtype)
+    counted = torch.ones_like(excess) if kind == EVEN else tracks.distances / typical
+    columns = Columns.of_images(counted) if kind in ("varying", EVEN) else Columns.dense(counted[..., None])
+    products = fit.gram(basis, Columns.joined([Columns.dense(logs[..., None]), columns]), weights * excess**2 * clear)
+    ridge = 1e-8 * products.diagonal()[1:].mean().clamp_min(1e-300) * torch.eye(columns.count, dtype=products.dtype)
     depths = -torch.linalg.solve(products[1:, 1:] + ridge, products[1:, 0])
     if kind == EVEN:
         depths = depths - depths.min()  # what all images lose, points lack themselves

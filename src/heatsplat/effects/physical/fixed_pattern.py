@@ -11,6 +11,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.heat_source import PATTERNS
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside, judged
 from heatsplat.effects.joint.image_grid import STILL, grid_columns
@@ -55,7 +56,7 @@ def nodes(data: Data) -> int:
     return NODES if data.tracks.weights.sum() > MANY else NODES_FEW
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """Offsets and gains on a grid over the image."""
     return grid_columns(data.tracks, image, nodes(data))
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, judged, outdone
 from heatsplat.effects.joint.fit import Fit
@@ -37,9 +38,9 @@ def evidence(inspected: Inspection) -> Evidence:
     return gained(inspected, "frame_offset", sentence)
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """An offset for each frame."""
-    return torch.eye(image.shape[1], dtype=image.dtype).expand(len(image), -1, -1)
+    return Columns.of_images(torch.ones_like(image))
 
 
 def starts(data: Data) -> Sequence[Model]:

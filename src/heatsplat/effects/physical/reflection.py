@@ -9,6 +9,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
@@ -20,11 +21,11 @@ def evidence(inspected: Inspection) -> Evidence:
     return gained(inspected, "reflection", "mirrored surroundings add")
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """Harmonics to degree 2 of the direction that a mirror shows."""
     out, normals = data.tracks.directions, data.normals[:, None]
     x, y, z = (2.0 * (out * normals).sum(2, keepdim=True) * normals - out).unbind(2)
-    return torch.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 2)
+    return Columns.dense(torch.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 2))
 
 
 def kinds(fit: Fit) -> Sequence[object]:

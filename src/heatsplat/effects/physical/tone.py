@@ -9,6 +9,7 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
@@ -40,10 +41,10 @@ def _may_bend(fit: Fit, model: Model) -> bool:
     return at.gain(drifting.plus("tone"), drifting) > 1.0
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """A curve T turns an offset o of the level x into T'(x) o: what it bends goes with o times x and x²."""
     offset = known.get("frame_offset", torch.zeros_like(image))[..., None]
-    return torch.cat([offset * image[..., None], offset * image[..., None] ** 2], 2)
+    return Columns.dense(torch.cat([offset * image[..., None], offset * image[..., None] ** 2], 2))
 
 
 def kinds(fit: Fit) -> Sequence[object]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.heat_source import PATTERNS
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside
 from heatsplat.effects.joint.fit import Fit
@@ -56,10 +57,10 @@ def evidence(inspected: Inspection) -> Evidence:
     return Evidence(gain, why if told else f"{why}: cannot be told, {doubt}", told=told, gain_db=worth.held_out.db)
 
 
-def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Tensor:
+def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """A gain that goes with the second and the fourth power of the distance from the middle of the image."""
     r2 = data.tracks.radii
-    return torch.stack([r2, r2**2], 2) * image[..., None]
+    return Columns.dense(torch.stack([r2, r2**2], 2) * image[..., None])
 
 
 def falloff(fit: Fit, none: Model) -> tuple[float, float]:
@@ -77,10 +78,10 @@ def falloff(fit: Fit, none: Model) -> tuple[float, float]:
     image, shared = fit.image(none), fit.shared_columns(none)
     values, basis = fit.own(none)
     radial, field = columns(fit.data, image, fit.known), grid_columns(fit.data.tracks, image, FINE_NODES)
-    products = fit.gram(basis, torch.cat([values[..., None], field, radial, *shared.values()], dim=2))
+    products = fit.gram(basis, Columns.joined([Columns.dense(values[..., None]), field, radial, *shared.values()]))
     inner, right, scale = scaled(products)
     inner = inner + 1e-8 * torch.eye(len(inner), dtype=inner.dtype)
-    n, half = field.shape[2], field.shape[2] // 2
+    n, half = field.count, field.count // 2
     loose = torch.zeros(len(inner), dtype=inner.dtype)  # inverse variances of the field's nodes in scaled units
     loose[:n] = 1e-2 / scale[:n] ** 2
     for _ in range(STRENGTHS):
@@ -89,10 +90,10 @@ def falloff(fit: Fit, none: Model) -> tuple[float, float]:
         for part in (slice(0, half), slice(half, n)):
             loose[part] = 1.0 / (found[part].mean().clamp_min(1e-12) * scale[part] ** -2)
     inverse = torch.linalg.inv(inner + loose.diag())
-    two = slice(n, n + radial.shape[2])
+    two = slice(n, n + radial.count)
     numbers = (inverse @ right)[two]
     stands_out = float(numbers @ torch.linalg.solve(inverse[two, two], numbers))
-    return float((numbers * scale[two]).sum()), stands_out / (radial.shape[2] * math.log(n))
+    return float((numbers * scale[two]).sum()), stands_out / (radial.count * math.log(n))
 
 
 EFFECT = Effect(
