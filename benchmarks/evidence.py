@@ -67,6 +67,11 @@ the course bends between them. `effects.source=common` and `harmonics` choose by
 so does the extinction of the air, which the joint fit knows to a thousandth of its largest at each image, while training alone
 confuses it with warmer surfaces. `renders/courses.png` shows what was learned.
 
+**A camera before a heat source.** The joint fit gives points courses in common, each in its own measure, and those are any that
+explain most. As points move through the image while time goes by, they take a camera's pattern for heat. Where all points answer
+one source, fixed pattern and vignetting are therefore judged beside what surfaces can answer to that course
+(`effects/heat_source.py`), if together they gain 2 dB on held-out observations. On `uneven_heated` they gain 5 dB there.
+
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms
 them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.
