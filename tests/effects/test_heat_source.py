@@ -1,5 +1,7 @@
 """What drives a scene, and which patterns of a camera show beside it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,6 +9,9 @@ from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.effects import heat_source
 from heatsplat.effects.heat_source import KNOWN, NAME, PATTERNS, Source
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.certainty import Certainty
+from heatsplat.effects.joint.evidence import judged
+from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.physical import fixed_pattern, harmonic_source, relaxation, vignetting
 
 EFFECTS = [one.EFFECT for one in (relaxation, harmonic_source, fixed_pattern, vignetting)]
@@ -60,6 +65,28 @@ def test_before_an_even_camera_and_without_a_common_source_the_joint_fit_says_wh
     assert none.for_patterns is none.certainty
     for effect in (fixed_pattern, vignetting):
         assert effect.evidence(even).statistic == 0.0
+
+
+def test_a_lamp_that_no_camera_explains_as_well_is_certain_with_what_stands_on_it(even):
+    known = even.beside_source
+    assert known.sure and not known.uneven and known.gain.db > 1
+    assert not even.certainty.doubts.keys() & {NAME, "relaxation"}
+    found = harmonic_source.evidence(even)
+    assert found.told and found.gain_db == known.gain.db and "an offset and a gain in each image" in found.reason
+    assert relaxation.evidence(even).told
+
+
+@pytest.mark.parametrize(("db", "sure", "doubted"), [(1.0, True, False), (0.2, False, None), (-0.2, False, True)])
+def test_a_camera_that_explains_images_better_leaves_the_source_in_doubt(even, db, sure, doubted):
+    known = replace(even.beside_source, gain=HeldOut(db, 5.0, 36), sure=sure)
+    if doubted is None:
+        assert known.told == {}
+        return
+    certainty = Certainty(*even.joint, known.told)
+    assert all(bool(certainty.doubts.get(name)) == doubted for name in (NAME, "relaxation"))
+    fit, model = certainty.fit, certainty.model
+    found = judged(certainty, NAME, "", model, fit.without(model, NAME))
+    assert found.told != doubted and (heat_source.CAMERA in found.reason) == doubted
 
 
 def test_one_course_is_common_where_it_foresees_images_at_least_as_well_as_harmonics():

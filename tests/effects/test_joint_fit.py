@@ -232,7 +232,7 @@ def test_a_state_does_not_change_when_the_next_one_is_made(moving):
 
 
 SURE = SimpleNamespace(
-    doubts={}, explained=True, unseen_changes="", few=lambda name: "", undecided=lambda more, name: False,
+    doubts={}, told={}, explained=True, unseen_changes="", few=lambda name: "", undecided=lambda more, name: False,
     worth=lambda name, more=None, less=None: Worth(HeldOut(db=3.0, sigmas=9.0, images=FRAMES)),
     idle=lambda name, more, less: False, clear=lambda more, name: False, beside_weather=lambda model: model,
 )  # fmt: skip

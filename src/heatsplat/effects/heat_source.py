@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from heatsplat.effects.joint.certainty import MIN_SIGMAS, Certainty
+from heatsplat.effects.joint.certainty import MIN_DB, MIN_SIGMAS, Certainty
 from heatsplat.effects.joint.courses import DECAYS_FEW
 from heatsplat.effects.joint.data import MIN_FREE
+from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.joint.terms import Own, Path
 from heatsplat.physics.common_course import RATES, common_course, least_squares, response_table
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 NAME = "harmonic_source"  # of the effect
 KNOWN = "known"  # its kind in the joint fit where the course of the source is known
+DRIVEN = (NAME, "relaxation")
+CAMERA = "a camera with an offset and a gain of its own in each image would explain the images as well; more frames would tell"
 PATTERNS = ("fixed_pattern", "vignetting")  # what a camera adds at places in the image, whatever drives the scene
 # On held-out observations, beside a known course: from 3.9 where a lamp stands before an uneven camera and images are enough
 # (0.7 to 1.6 in 16), 0.0 where it stands before an even one, and up to 0.9 where a gain control passes for the lamp.
@@ -87,13 +90,36 @@ def source(inspected: Inspection, count: int) -> Source:
     )
 
 
-def beside(inspected: Inspection, course: Tensor) -> Certainty | None:
-    """What can be told of a camera's patterns where a source of this course drives the scene; None where they explain little.
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What images show where points answer a source whose course is known.
 
     The joint fit knows no physics of sources: the courses that it gives points, each in its own measure, are any that explain
-    most, and as points move through the image while time goes by, those take a pattern for heat. What surfaces can answer to a
-    known course does not.
+    most. They are hard to tell from what a camera does to single images; and as points move through the image while time goes
+    by, they take a pattern of the camera for heat. What surfaces can answer to a known course does neither.
+
+    Attributes:
+        certainty: of the fit beside that source, with the patterns where images are uneven.
+        uneven: whether a camera's patterns are clearly there.
+        gain: over surfaces that relax before a camera with an offset and a gain of its own in each image, where left out.
+        sure: whether that is clear, as what it gains over air that takes a share of its own from each image.
     """
+
+    certainty: Certainty
+    uneven: bool
+    gain: HeldOut
+    sure: bool
+
+    @property
+    def told(self) -> dict[str, str]:
+        """What it says of the effects of a driven scene (``Certainty``)."""
+        if self.sure:
+            return dict.fromkeys(DRIVEN, "")
+        return dict.fromkeys(DRIVEN, CAMERA) if self.gain.db < 0 else {}
+
+
+def beside(inspected: Inspection, course: Tensor) -> Known:
+    """What images show beside a source of this course."""
     fit, model = inspected.joint
     spans = _spans(inspected)
     table = response_table(RATES_OF_POINTS, len(course))
@@ -104,13 +130,19 @@ def beside(inspected: Inspection, course: Tensor) -> Certainty | None:
         term=Own(basis=lambda at, kind: basis, kinds=lambda at: (KNOWN,), in_time=True),
         stands_on=None,
     )
-    even = model.minus({NAME, "relaxation", *PATTERNS}).plus(NAME, KNOWN)
+    even = model.minus({*DRIVEN, *PATTERNS}).plus(NAME, KNOWN)
     uneven = even.plus(PATTERNS[0]).plus(PATTERNS[1])
     fit = replace(fit, data=replace(fit.data, effects={**fit.data.effects, NAME: effect}), known={}, bases={})
     # Twice: the first time, what multiplies an image is not yet linearised about one without the pattern.
     certainty = Certainty(fit.accepted(uneven).accepted(uneven), even)
     gain = certainty.compared(uneven, even)
-    return certainty if gain.db > LEAST_DB and gain.sigmas > MIN_SIGMAS else None
+    shows = gain.db > LEAST_DB and gain.sigmas > MIN_SIGMAS
+    driven = uneven if shows else even
+    still = driven.minus({NAME})
+    camera = certainty.compared(driven, still.plus("relaxation").plus("frame_offset").plus("agc"))
+    air = certainty.compared(driven, still.plus("attenuation", "varying"))
+    sure = all(one.db > MIN_DB and one.sigmas > MIN_SIGMAS for one in (camera, air))
+    return Known(certainty, shows, camera, sure)
 
 
 def harmonics(inspected: Inspection, count: int) -> int:

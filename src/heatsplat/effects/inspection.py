@@ -58,7 +58,9 @@ class Inspection:
     @cached_property
     def certainty(self) -> Certainty | None:
         """What can be told from the joint fit; None where there is none."""
-        return None if self.joint is None else Certainty(*self.joint)
+        if self.joint is None:
+            return None
+        return Certainty(*self.joint, {} if self.beside_source is None else self.beside_source.told)
 
     @cached_property
     def heat_source(self) -> heat_source.Source | None:
@@ -67,13 +69,19 @@ class Inspection:
         return None if count is None else heat_source.source(self, count)
 
     @cached_property
+    def beside_source(self) -> heat_source.Known | None:
+        """What images show beside the one source that all points answer; None where there is no such source, where a weather
+        record says more, and where the camera stands still."""
+        source = self.heat_source
+        alone = source is not None and source.common and self.scene.weather is None and self.joint[0].data.moves
+        return heat_source.beside(self, source.course) if alone else None
+
+    @cached_property
     def for_patterns(self) -> Certainty | None:
         """What can be told of places in the image: beside the one source that all points answer, where there is one and images
         are clearly uneven beside it; else from the joint fit. None where there is none."""
-        source = self.heat_source
-        alone = source is not None and source.common and self.scene.weather is None
-        beside = heat_source.beside(self, source.course) if alone and self.joint[0].data.moves else None
-        return self.certainty if beside is None else beside
+        known = self.beside_source
+        return known.certainty if known is not None and known.uneven else self.certainty
 
     @cached_property
     def weathered(self) -> Weathered | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -63,28 +63,33 @@ class Certainty:
 
     Args:
         fit, model: what was selected.
+        told: by name of an effect in it, what something that knows more says (``heat_source.Known``): why nobody can tell
+            whether it is there; empty where it is.
     """
 
-    def __init__(self, fit: Fit, model: Model) -> None:
+    def __init__(self, fit: Fit, model: Model, told: Mapping[str, str] | None = None) -> None:
         change = AnyChange(
             Own(basis=lambda at, count: common_courses(at, Model(), count), kinds=lambda at: (), in_time=True)
         )
         self.fit = replace(fit, data=replace(fit.data, effects={**fit.data.effects, ANY: change}))
-        self.model = model
+        self.model, self.told = model, told or {}
+        self.sure = frozenset(name for name, doubt in self.told.items() if not doubt)
         self._squares: dict[Model, Tensor] = {}
         self._worths: dict[tuple[Model, Model], Worth] = {}
 
     @cached_property
     def doubts(self) -> dict[str, str]:
         """Why nobody can tell whether an effect is there, by name: of those taken in, and of those that may be there instead."""
-        found = {name: self.worth(name).doubt for name in sorted(self.model.names)}
+        found = {
+            name: self.told[name] if name in self.told else self.worth(name).doubt for name in sorted(self.model.names)
+        }
         found = {name: doubt for name, doubt in found.items() if doubt}
-        sure = self.model.minus(found)  # of which each has to be clear without those that are not
-        for name in sorted(sure.names) if found else ():
+        others = self.model.minus(found)  # of which each has to be clear without those that are not
+        for name in sorted(others.names - self.sure) if found else ():
             in_time = self.fit.data.effects[name].term.in_time
-            if not in_time and not self._beside_changes(name, sure, self.fit.without(sure, name)):
+            if not in_time and not self._beside_changes(name, others, self.fit.without(others, name)):
                 found[name] = self._may_be_change(name) or ROUGH
-        for name in sorted(self.model.names):
+        for name in sorted(self.model.names - self.sure):
             for rivals in self.fit.data.effects[name].term.rivals:
                 if not self._counts(name) or self._outdoes(name, rivals):
                     continue
@@ -95,11 +100,13 @@ class Certainty:
         names = " and ".join(doubted)
         for name in self._instead_of(doubted):
             found.setdefault(name, f"it goes or comes with {names}, which nobody can tell from these images")
-        return found
+        return {name: doubt for name, doubt in found.items() if name not in self.sure}
 
     def idle(self, name: str, more: Model, less: Model) -> bool:
         """Whether nothing is lost without an effect: it gains nothing on held-out observations, nor does any course over time in
         its place; or it is a camera's change of single images that gains little and fails what such a change has to meet."""
+        if name in self.sure:
+            return False
         worth, term = self.worth(name, more, less), self.fit.data.effects[name].term
         if term.in_time:
             return not shows(worth.held_out) and not any(self._shows(one, less) for one in self._changing(less))

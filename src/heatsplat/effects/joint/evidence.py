@@ -49,7 +49,7 @@ def judged(certainty: Certainty, name: str, sentence: str, more: Model, less: Mo
     """What an effect gains that was taken in, and whether that can be told from chance."""
     gain, size = certainty.fit.gain(more, less), certainty.fit.effect_size(more, less)
     worth = certainty.worth(name, more, less)
-    doubt = worth.doubt or certainty.doubts.get(name, "")
+    doubt = certainty.told.get(name, worth.doubt) or certainty.doubts.get(name, "")
     found = f"{sentence} {beside(size)}; {gain:.1f} times what its parameters cost, {worth.held_out.db:.1f} dB where left out"
     if certainty.idle(name, more, less):
         return Evidence(0.0, f"{found}: nothing is lost without it", gain_db=worth.held_out.db)

@@ -40,7 +40,11 @@ def evidence(inspected: Inspection) -> Evidence:
         f"{found.reason}; all points answer one course, which foresees images to {source.foreseen:.2g} times that error, "
         f"where harmonics of each point do to {source.foreseen_by_harmonics:.2g} times"
     )
-    return replace(found, reason=said, settings=settings)
+    known = inspected.beside_source
+    if known is None or not known.sure:
+        return replace(found, reason=said, settings=settings)
+    said += f"; surfaces that relax before a camera with an offset and a gain in each image foresee {known.gain.db:.1f} dB less"
+    return replace(found, reason=said, settings=settings, gain_db=known.gain.db)
 
 
 def passing(inspected: Inspection) -> Evidence | None:
