@@ -53,8 +53,8 @@ FILMED = {}  # settings of a recording -> the scene, which nobody changes
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
-    """Two processes more than there are cores: tests wait for commands that they start."""
-    return cores() + 2
+    """One process more than there are cores: tests wait for commands that they start."""
+    return cores() + 1
 
 
 def pytest_collection_modifyitems(items):
