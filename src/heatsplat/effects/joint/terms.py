@@ -94,8 +94,9 @@ class Shared(Term):
     """An effect with one set of numbers for all points.
 
     Args:
-        columns: (Data, image, known) -> what the numbers multiply. ``image`` [P, F] is the points' own part with
-            what earlier terms added; ``known`` [P, F] by name is what terms added when the fit was linearised.
+        columns: (Data, image, known) -> what the numbers multiply, as ``Columns`` of P points in F images. ``image`` [P, F] is
+            the points' own part with what earlier terms added; ``known`` [P, F] by name is what terms added when the fit was
+            linearised.
         order: in which terms act on the image. What multiplies an image takes that with all earlier terms.
         settled: the numbers without the part that only renames the scene's own levels and their scale, which otherwise
             wander off from one linearisation to the next.
