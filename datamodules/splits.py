@@ -53,11 +53,6 @@ def block(order: Sequence[int], fraction: float = 0.125, position: float = 0.5) 
         fraction: share of the frames to hold out, in (0, 1).
         position: where the stretch lies: 0 at the beginning, 1 at the end (extrapolation), 0.5 in the middle.
     """
-    if not 0 < fraction < 1 or not 0 <= position <= 1:
-        raise SceneError(
-            f"data.split=block needs data.split_fraction in (0, 1) and data.split_position in [0, 1], "
-            f"got {fraction} and {position}"
-        )
     count = min(max(1, round(fraction * len(order))), len(order))
     start = round(position * (len(order) - count))
     return _complement(len(order), order[start : start + count])
@@ -136,6 +131,9 @@ class SplitRule:
         rule: every_8th, quarter_centre, block, names, folders, json (what the data set itself lists) or list.
         fraction, position: of ``block``.
         file: of ``list``.
+
+    Raises:
+        SceneError: the rule is unknown, or ``block`` or ``list`` lacks what it needs: before any image is read.
     """
 
     rule: str
@@ -145,8 +143,19 @@ class SplitRule:
 
     RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list")
 
+    def __post_init__(self) -> None:
+        if self.rule not in self.RULES:
+            raise SceneError(f"data.split={self.rule} is no split; choose one of {', '.join(self.RULES)}")
+        if self.rule == "block" and not (0 < self.fraction < 1 and 0 <= self.position <= 1):
+            raise SceneError(
+                "data.split=block needs data.split_fraction in (0, 1) and data.split_position in [0, 1], "
+                f"got {self.fraction} and {self.position}"
+            )
+        if self.rule == "list" and self.file is None:
+            raise SceneError("data.split=list needs data.split_file: a file with one test name per line")
+
     def __call__(self, names: Sequence[str], order: Sequence[int], subsets: Sequence[str | None]) -> Positions:
-        """(train, test) positions. Raises SceneError when the rule is unknown or leaves one of the two empty."""
+        """(train, test) positions. Raises SceneError when the rule leaves one of the two empty."""
         rules = {
             "every_8th": lambda: every_nth(names, 8),
             "quarter_centre": lambda: quarter_centre(order),
@@ -154,10 +163,8 @@ class SplitRule:
             "names": lambda: by_name(names),
             "folders": lambda: by_subset(subsets) if any(subsets) else by_folder(names),
             "json": lambda: by_subset(subsets),
-            "list": lambda: by_list(names, self._file()),
+            "list": lambda: by_list(names, self.file),
         }
-        if self.rule not in rules:
-            raise SceneError(f"data.split={self.rule} is no split; choose one of {', '.join(self.RULES)}")
         train, test = rules[self.rule]()
         if not train or not test:
             raise SceneError(
@@ -165,8 +172,3 @@ class SplitRule:
                 f"choose another of {', '.join(self.RULES)}"
             )
         return train, test
-
-    def _file(self) -> Path:
-        if self.file is None:
-            raise SceneError("data.split=list needs data.split_file: a file with one test name per line")
-        return self.file

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -50,6 +50,8 @@ class Synthetic(SceneDataModule):
         only: name of a surface; only its pixels count. None: all do.
         weather: outdoors: fair (None), calm, windy or overcast; all start from the same midnight.
         days: of outdoor and outdoor_true: 2 to 7, of which the last is held out; None takes 2.
+        hours: of outdoor and outdoor_true: first and last hour of the day, in UTC, between which images are taken, such as
+            (20, 4) for nights; None takes images at all hours. The weather of all hours is known.
         split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere. "parts" holds
             out several parts, whose names begin those of their frames, and gives every view its exact image.
         parts: what "parts" leaves out (``synthetic_scene.parts.parts_of``).
@@ -70,6 +72,7 @@ class Synthetic(SceneDataModule):
         only: str | None = None,
         weather: str | None = None,
         days: int | None = None,
+        hours: Sequence[float] | None = None,
         split: str | None = None,
         parts: Mapping[str, Any] | None = None,
         root: str | None = None,
@@ -87,6 +90,16 @@ class Synthetic(SceneDataModule):
         if days is not None and (scene not in OF_ANY_LENGTH or not 2 <= days <= MOST_DAYS):
             raise SceneError(
                 f"data.days={days}: {' and '.join(OF_ANY_LENGTH)} last 2 to {MOST_DAYS} days; leave it null elsewhere"
+            )
+        if hours is not None and scene not in OF_ANY_LENGTH:
+            raise SceneError(
+                f"data.hours={list(hours)}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
+            )
+        if hours is not None and not (
+            len(hours) == 2 and all(0 <= hour <= 24 for hour in hours) and hours[0] != hours[1]
+        ):
+            raise SceneError(
+                f"data.hours={list(hours)}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
             )
         if weather is not None and scene not in YARDS:
             why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"
@@ -113,6 +126,7 @@ class Synthetic(SceneDataModule):
         self.scene_seed = scene_seed
         self.only = only
         self.weather, self.days = weather, days
+        self.hours = None if hours is None else (float(hours[0]), float(hours[1]))
         self.parts = rules(parts) if in_parts else None
 
     def load(self) -> SceneData:
@@ -186,7 +200,9 @@ class Synthetic(SceneDataModule):
         if self.scene_name in YARDS:
             solved, known = YARDS[self.scene_name]
             known = in_weather(known, self.weather)
-            return solved(known if self.days is None else replace(known, duration_s=self.days * DAY_S))
+            if self.days is not None:
+                known = replace(known, duration_s=self.days * DAY_S)
+            return solved(known if self.hours is None else replace(known, hours=self.hours))
         preset = None if self.drawn is None else self.drawn.preset
         return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else None
 

@@ -193,7 +193,7 @@ def _yard(dice: _Dice) -> Preset:
     preset = OutdoorPreset(
         surfaces=surfaces,
         weather=sky,
-        hours=NIGHT_S if night else None,
+        part_s=NIGHT_S if night else None,
         effects=frozenset(name for name, there in shown.items() if there),
     )
     return _seen_by(preset, {name for name in ("blur", "pattern", "corners", "drift") if dice.happens(0.15)}, dice)

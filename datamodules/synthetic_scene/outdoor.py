@@ -159,7 +159,9 @@ class OutdoorPreset(Preset):
         weather: name of its weather in ``SKIES``.
         bounds_c: temperatures of black and white, the same in every weather, so that one model serves them all.
         labels: names of the classes.
-        hours: part of the solved record that is filmed, and whose weather is known, in seconds; None: all of it.
+        part_s: part of the solved record that is filmed, and whose weather is known, in seconds; None: all of it.
+        hours: first and last hour of the day, in UTC, between which images are taken, past midnight where the second is the
+            smaller; None: at all hours.
         split: rule by which frames are held out (``datamodules.splits``); json: the last day.
     """
 
@@ -171,6 +173,7 @@ class OutdoorPreset(Preset):
     weather: str = "fair"
     bounds_c: tuple[float, float] = (0.0, 70.0)
     labels: tuple[str, ...] = CLASSES
+    part_s: tuple[float, float] | None = None
     hours: tuple[float, float] | None = None
     split: str = "json"
 
@@ -217,9 +220,9 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
     )
 
 
-def _within(weather: Weather, hours: tuple[float, float]) -> Weather:
+def _within(weather: Weather, part_s: tuple[float, float]) -> Weather:
     """The samples of a record between two times in seconds, and one more on either side."""
-    kept = (weather.times_s >= hours[0] - SAMPLE_S) & (weather.times_s <= hours[1] + SAMPLE_S)
+    kept = (weather.times_s >= part_s[0] - SAMPLE_S) & (weather.times_s <= part_s[1] + SAMPLE_S)
     series = {name: value[kept] for name, value in vars(weather).items() if name not in ("up", "notes")}
     return replace(weather, **series)
 
@@ -308,8 +311,8 @@ class OutdoorScene(Scene):
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         self.thermal_range = ThermalRange(*preset.bounds_c)
         self.weather = outdoor_weather(preset.weather, 0.0, preset.duration_s)
-        if preset.hours is not None:
-            self.weather = _within(self.weather, preset.hours)
+        if preset.part_s is not None:
+            self.weather = _within(self.weather, preset.part_s)
         # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
         faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
         self.face_surface = torch.tensor([number for number, _ in faces])
@@ -393,9 +396,9 @@ class OutdoorScene(Scene):
         days = self.preset.duration_s / DAY_S - 1.0  # before the last
         slot = np.concatenate([days * np.arange(first) / first, days + np.arange(frames - first) / (frames - first)])
         width = np.where(np.arange(frames) < first, days / first, 1.0 / (frames - first))
-        times = np.round(DAY_S * (slot + width * (0.2 + 0.6 * jitter)), 3)
-        if self.preset.hours is not None:
-            start_s, end_s = self.preset.hours
+        times = np.round(DAY_S * at_hours(slot + width * (0.2 + 0.6 * jitter), self.preset.hours), 3)
+        if self.preset.part_s is not None:
+            start_s, end_s = self.preset.part_s
             times = np.round(start_s + (end_s - start_s) * (np.arange(frames) + 0.2 + 0.6 * jitter) / frames, 3)
 
         wobble = torch.rand(frames, 4, generator=generator_for(seed, 0, "flight path"), dtype=torch.float64)
@@ -407,6 +410,18 @@ class OutdoorScene(Scene):
         flat = radius * torch.cos(elevation)
         center = aim + torch.stack([flat * azimuth.sin(), -flat * azimuth.cos(), radius * elevation.sin()], dim=1)
         return times, looking(center, aim)
+
+
+def at_hours(days: np.ndarray, hours: tuple[float, float] | None) -> np.ndarray:
+    """Moments spread evenly over days [n], in days, as they lie between two hours of each day instead, in the same order."""
+    if hours is None:
+        return days
+    first, last = hours[0] / 24.0, hours[1] / 24.0
+    share, whole = np.modf(days)
+    if first < last:
+        return whole + first + share * (last - first)
+    place = share * (1.0 - first + last)  # until the last hour in the morning, then from the first on in the evening
+    return whole + np.where(place < last, place, place - last + first)
 
 
 def training_frames(frames: int) -> int:

@@ -55,8 +55,8 @@ def scene_of(preset: Preset) -> Scene:
 
 def _at_rest(scene: Scene) -> Scene:
     """The scene as it is at one moment, always."""
-    hours = getattr(scene.preset, "hours", None) or (0.0, scene.preset.duration_s)
-    moving, middle = scene.celsius, 0.5 * sum(hours)
+    filmed_s = getattr(scene.preset, "part_s", None) or (0.0, scene.preset.duration_s)
+    moving, middle = scene.celsius, 0.5 * sum(filmed_s)
 
     def celsius(heat: object, times_s: Tensor) -> Tensor:
         return moving(heat, torch.full_like(times_s, middle))

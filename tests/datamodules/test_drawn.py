@@ -29,7 +29,7 @@ def test_every_effect_is_drawn_and_left_out_and_no_condition_is_missing():
     assert min(one.frames for one in MANY) < 12 and max(one.frames for one in MANY) > 40
     assert any(one.pose_error_px == 0 for one in MANY) and max(one.pose_error_px for one in MANY) > 0.8
     yards = [one.preset for one in MANY if isinstance(one.preset, OutdoorPreset)]
-    assert any(yard.hours for yard in yards) and any("radiation" not in yard.effects for yard in yards)
+    assert any(yard.part_s for yard in yards) and any("radiation" not in yard.effects for yard in yards)
 
 
 @pytest.mark.parametrize("number", [next(i for i, one in enumerate(MANY) if one.bits == 8 and one.pose_error_px > 0.1)])

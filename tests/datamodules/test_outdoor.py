@@ -20,6 +20,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor import (
     METAL_ROOF,
     OUTDOOR,
     SKIES,
+    START_UTC_S,
     YARD,
     OutdoorScene,
     forcing_of,
@@ -219,6 +220,26 @@ def test_a_longer_record_begins_like_a_short_one_and_holds_out_its_last_day():
     days = [{(zero + t) // DAY_S - zero // DAY_S for t in views.times_s} for views in (scene.train, scene.test)]
     assert days == [{0, 1}, {2}] and (len(scene.train), len(scene.test)) == (13, 6)
     assert scene.weather.times_s[-1] - scene.weather.times_s[0] == 3 * DAY_S
+
+
+@pytest.mark.parametrize(("hours", "inside"), [((20, 4), lambda h: h >= 20 or h < 4), ((9, 17), lambda h: 9 <= h < 17)])
+def test_images_of_some_hours_keep_the_days_that_are_held_out_and_the_weather_of_all(hours, inside):
+    scene, always = Synthetic(scene="outdoor", size="tiny", hours=hours).scene, tiny()
+    zero = scene.weather.notes["utc_at_zero_s"]
+    for day, views, others in ((0, scene.train, always.train), (1, scene.test, always.test)):
+        seconds = np.array(views.times_s) + zero
+        assert len(views) == len(others) and (np.diff(seconds) > 0).all()
+        assert all(inside(hour) for hour in seconds % DAY_S / 3600)
+        assert {s // DAY_S - START_UTC_S // DAY_S for s in seconds} == {day}
+    assert scene.weather.times_s[-1] - scene.weather.times_s[0] == 2 * DAY_S
+
+
+def test_hours_are_those_of_a_day():
+    for hours in ((20,), (20, 25), (4, 4)):
+        with pytest.raises(SceneError, match=r"data.hours=.*the first and the last hour in UTC"):
+            Synthetic(scene="outdoor", hours=hours)
+    with pytest.raises(SceneError, match="outdoor and outdoor_true know the hour of the day"):
+        Synthetic(scene="cooling", hours=(20, 4))
 
 
 def test_images_show_the_truth_and_every_surface_is_seen():

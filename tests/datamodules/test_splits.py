@@ -44,7 +44,7 @@ def test_block_holds_out_one_stretch(position, first):
 
 def test_block_refuses_impossible_fractions():
     with pytest.raises(SceneError, match="data.split_fraction in"):
-        block(range(10), fraction=1.5)
+        SplitRule("block", fraction=1.5)
 
 
 def test_names_and_folders():
@@ -78,7 +78,10 @@ def test_rules_that_leave_nothing_to_train_or_test_are_refused():
         SplitRule("every_8th")(["a"], [0], [None])
     with pytest.raises(SceneError, match="data.split=json leaves 0 training and 0 test"):
         SplitRule("json")(["a"], [0], [None])
+
+
+def test_what_is_no_split_is_refused_before_anything_is_read():
     with pytest.raises(SceneError, match="data.split=thirds is no split; choose one of every_8th, quarter_centre"):
-        SplitRule("thirds")(["a"], [0], [None])
+        SplitRule("thirds")
     with pytest.raises(SceneError, match="data.split=list needs data.split_file"):
-        SplitRule("list")(["a", "b"], [0, 1], [None, None])
+        SplitRule("list")
