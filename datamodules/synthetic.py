@@ -93,13 +93,12 @@ class Synthetic(SceneDataModule):
             )
         if hours is not None and scene not in OF_ANY_LENGTH:
             raise SceneError(
-                f"data.hours={list(hours)}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
+                f"data.hours={hours}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
             )
-        if hours is not None and not (
-            len(hours) == 2 and all(0 <= hour <= 24 for hour in hours) and hours[0] != hours[1]
-        ):
+        numbers = hours is not None and all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours)
+        if hours is not None and not (numbers and len(hours) == 2 and hours[0] != hours[1]):
             raise SceneError(
-                f"data.hours={list(hours)}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
+                f"data.hours={hours}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
             )
         if weather is not None and scene not in YARDS:
             why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"

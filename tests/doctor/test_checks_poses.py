@@ -4,6 +4,10 @@ from dataclasses import replace
 
 from materials import checks, clean
 
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.doctor.base import material_of
+from heatsplat.doctor.checks.poses import find
+
 
 def test_poses_of_another_frame_are_found():
     cameras = list(clean().cameras)
@@ -12,3 +16,9 @@ def test_poses_of_another_frame_are_found():
 
 def test_images_that_are_upside_down_against_their_poses_are_found():
     assert "poses" in checks(replace(clean(), images=clean().images.flip(1, 2)))
+
+
+def test_cameras_that_see_the_same_from_wide_apart_are_not_compared():
+    """Night in a yard: cameras of one half hour look from 24° and more apart, at surfaces that face neither of them."""
+    scene = Synthetic(scene="outdoor", hours=(20, 4)).scene
+    assert find(material_of(scene)) == []

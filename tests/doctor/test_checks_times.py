@@ -4,6 +4,8 @@ from dataclasses import replace
 
 from materials import checks, clean
 
+from heatsplat.doctor.checks.times import find
+
 
 def test_clocks_that_run_back_repeats_and_gaps_are_found():
     times = [10.0 * i for i in range(len(clean().names))]
@@ -18,3 +20,12 @@ def test_a_second_camera_that_began_earlier_is_no_clock_that_runs_back():
     of_two = replace(clean(), times_s=[10.0 * i if i < 8 else 10.0 * i - 75 for i in range(count)])
     assert "times" in checks(of_two)
     assert "times" not in checks(replace(of_two, lenses=[int(i >= 8) for i in range(count)]))
+
+
+def test_gaps_are_told_in_the_unit_that_people_would_take():
+    times = [0.04 * i if i < 8 else 0.04 * i + 57_920.0 for i in range(len(clean().names))]
+    (found,) = find(replace(clean(), times_s=times))
+    assert "of 16.1 h (usual: 0.04 s)" in found.what
+    times = [10.0 * i if i < 8 else 10.0 * i + 490.0 for i in range(len(clean().names))]
+    (found,) = find(replace(clean(), times_s=times))
+    assert "of 8.33 min (usual: 10 s)" in found.what

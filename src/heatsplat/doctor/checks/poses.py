@@ -17,6 +17,9 @@ MIN_POINTS = 12
 # A frame is wrong where more than this share of its points lies further off: a part of them may lie behind glass, or hidden.
 SHARE, FAR_PX = 0.7, 2.5
 WRONG = 1 / 3  # share of such frames from which poses are wrong; panes and what moves take some
+# Cosine between two cameras' axes, 18°: with exact poses, patches are alike at one to three in four points at 2 to 12°, and at
+# one in four at 24 to 31°, where surfaces no longer look as if they faced the camera.
+SAME_WAY = 0.95
 LATER_S = 1800.0  # what sun and shade do in longer makes the same surface look like another
 
 
@@ -73,7 +76,7 @@ def _beside(cameras: list[Camera], one: int, near: Tensor) -> int | None:
     axes = torch.stack([camera.viewmat[2, :3] for camera in cameras])
     apart = (centers - centers[one]).norm(dim=1)
     size = (centers - centers.mean(0)).norm(dim=1).max()
-    usable = near & (axes @ axes[one] > 0.85) & (apart > 1e-3 * size)
+    usable = near & (axes @ axes[one] > SAME_WAY) & (apart > 1e-3 * size)
     if not usable.any():
         return None
     return int(torch.where(usable, apart, torch.inf).argmin())

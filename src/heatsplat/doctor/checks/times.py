@@ -52,13 +52,21 @@ def find(material: Material) -> list[Finding]:
             Finding(
                 "times",
                 0.03,
-                f"{len(gaps)} gap(s) in the record; the longest, of {float(steps[longest]):.4g} s (usual: {usual:.3g} s), "
+                f"{len(gaps)} gap(s) in the record; the longest, of {_spoken(float(steps[longest]))} (usual: {_spoken(usual)}), "
                 f"comes before {material.names[int(at[longest + 1])]}.",
                 "What happened within a gap is a guess; check that no frames were lost.",
                 tuple(material.names[int(at[i + 1])] for i in gaps),
             )
         )
     return found
+
+
+def _spoken(seconds: float) -> str:
+    """A length of time in the unit that people would take."""
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.3g} s"
 
 
 CHECK = Check("times", "order of times against names, repeats and gaps", find)
