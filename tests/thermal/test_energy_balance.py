@@ -404,3 +404,12 @@ def test_convection_that_was_measured_is_what_the_balance_has():
     told = calm.attributes(splats, Query(time_s=0.0))
     torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), 8.0))
     assert "wind_share" not in told
+
+
+@pytest.mark.parametrize(("solution", "follow"), [("linear", True), ("corrected", False)])
+def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(solution, follow):
+    model, _ = ready(solution=solution)
+    seeds = Seeds(torch.zeros(2, 3), torch.full((2, 1), 0.4), torch.Generator())
+    paced = {name: item.paced for name, item in model.per_gaussian(seeds).items()}
+    assert paced["raw_share"] is paced["raw_wind"] is follow
+    assert paced["log_rate"] and paced["raw_sun"]

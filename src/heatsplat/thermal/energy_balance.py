@@ -250,13 +250,16 @@ class EnergyBalance(ThermalModel):
         if self.inner:
             tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
+        # Few images tell the shares apart, and at a short run's pace they would follow single ones: nothing that the trained
+        # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out.
+        share = partial(tensor, paced=self.solution == "linear")
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
         if drivers.sky is not None and self._convection is None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
-            tensors["raw_share"] = tensor(torch.full_like(grey, start).logit(), self.lr_share)
+            tensors["raw_share"] = share(torch.full_like(grey, start).logit(), self.lr_share)
         if drivers.wind_anomaly is not None and self._convection is None:
-            tensors["raw_wind"] = tensor(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
+            tensors["raw_wind"] = share(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         if self.solution == "corrected":
             given = 0 if self._convection is None else 1 + self._wind  # shares of radiation and of wind
             numbers = len(tensors) + given
