@@ -15,7 +15,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from heatsplat import CHECKOUT
 from heatsplat.training.machine import cores
@@ -45,10 +45,8 @@ def composed(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
         return hydra.compose(name, list(overrides))
     with hydra.initialize_config_dir(CONF, version_base="1.3"):
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
-    HydraConfig.instance().set_config(config)  # which keeps a copy
-    with open_dict(config):
-        del config["hydra"]
-    return config
+    HydraConfig.instance().set_config(config)
+    return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
 
 
 def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
