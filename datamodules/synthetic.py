@@ -95,8 +95,10 @@ class Synthetic(SceneDataModule):
             raise SceneError(
                 f"data.hours={hours}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
             )
-        numbers = hours is not None and all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours)
-        if hours is not None and not (numbers and len(hours) == 2 and hours[0] != hours[1]):
+        pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1]
+        if hours is not None and not (
+            pair and all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours)
+        ):
             raise SceneError(
                 f"data.hours={hours}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
             )

@@ -413,7 +413,8 @@ class OutdoorScene(Scene):
 
 
 def at_hours(days: np.ndarray, hours: tuple[float, float] | None) -> np.ndarray:
-    """Moments spread evenly over days [n], in days, as they lie between two hours of each day instead, in the same order."""
+    """Moments [n] that are spread over whole days, in days, as they lie between two ``hours`` of each day (UTC, 0 to 24) instead,
+    in the same order; past midnight where the second hour is the smaller, and where they were without hours."""
     if hours is None:
         return days
     first, last = hours[0] / 24.0, hours[1] / 24.0
