@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import WEATHER_COLUMNS, Camera, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
+from heatsplat.contracts import (
+    WEATHER_COLUMNS,
+    WEATHER_DERIVED,
+    Camera,
+    SceneData,
+    SceneError,
+    ThermalRange,
+    View,
+    ViewSet,
+    Weather,
+)
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.physics.units import DAY_S
 
@@ -200,8 +210,8 @@ def _weather(records: Sequence[Weather | None], delays: Sequence[float]) -> Weat
     up = records[0].up
     if any(float(record.up @ up) < 0.999 for record in records):
         raise SceneError("scenes to be joined must agree on what is up (weather.up); turn their worlds first")
-    series = {field.name for field in fields(Weather)} & {*WEATHER_COLUMNS, "direct_w_m2", "diffuse_w_m2", "sun"}
-    known = {name for name in series if all(getattr(record, name) is not None for record in records)}
+    series = (*WEATHER_COLUMNS, *WEATHER_DERIVED)
+    known = [name for name in series if all(getattr(record, name) is not None for record in records)]
     return Weather(
         torch.cat([record.times_s + delay for record, delay in zip(records, delays, strict=True)]),
         up=up,

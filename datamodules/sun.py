@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Axis = tuple[float, float, float]
+# Sine of the sun's height from which its light tells clouds (10 degrees; below, haze and hills take as much), and the time over
+# which it does: a cloud before the sun is not one before all of the sky.
+CLOUDS_SINE, CLOUDS_S = 0.17, 3600.0
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,29 @@ def split_irradiance(site: Site, utc_s: np.ndarray, global_w_m2: np.ndarray) -> 
     parts = irradiance.erbs_driesse(np.asarray(global_w_m2, dtype=np.float64), zenith, _moments(utc_s))
     day = zenith < 90.0
     return tuple(np.where(day, np.nan_to_num(np.asarray(parts[key])), 0.0).clip(0.0) for key in ("dni", "dhi"))
+
+
+def clouds(site: Site, utc_s: np.ndarray, global_w_m2: np.ndarray) -> np.ndarray | None:
+    """Share [T] of the clear sky's light that clouds take, in [0, 1]; None where the sun never stands high enough to tell.
+
+    The hour about each moment counts, and by night what lies between dusk and dawn on a straight line (Crawford and Duchon 1999,
+    Eq. 5).
+
+    **Convention:** ``utc_s`` [T] seconds since 1970 UTC, increasing.
+    """
+    high = sun_directions(site, utc_s) @ site.axes()[2] > CLOUDS_SINE
+    if not high.any():
+        return None
+    measured, clear = (_within_the_hour(utc_s, light) for light in (global_w_m2, clear_sky(site, utc_s)))
+    share = 1.0 - measured[high] / clear[high]
+    return np.interp(utc_s, utc_s[high], share.clip(0.0, 1.0))
+
+
+def _within_the_hour(utc_s: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Integral [T] over the hour about each moment, as far as the record reaches."""
+    so_far = np.concatenate([[0.0], np.cumsum(0.5 * (light[1:] + light[:-1]) * np.diff(utc_s))])
+    before, after = (np.interp(utc_s + 0.5 * way * CLOUDS_S, utc_s, so_far) for way in (-1.0, 1.0))
+    return after - before
 
 
 def _moments(utc_s: np.ndarray) -> pd.DatetimeIndex:

@@ -1,8 +1,9 @@
 """Weather records: tables of air, wind, humidity, sunlight and pressure over time, checked, and with the sun added.
 
-A table has a column of times and any of the five quantities, each with its unit at the end of its name: ``air_c``,
+A table has a column of times and any of the six quantities, each with its unit at the end of its name: ``air_c``,
 ``air_k``, ``air_f``; ``wind_m_s``, ``wind_km_h``, ``wind_kn``; ``humidity_percent``; ``irradiance_w_m2``;
-``pressure_hpa``, ``pressure_pa``. Names as people write them are understood ("Air temperature [°C]", "GHI (W/m²)").
+``pressure_hpa``, ``pressure_pa``; ``cloud_cover_percent``, ``cloud_cover_oktas``. Names as people write them are
+understood ("Air temperature [°C]", "GHI (W/m²)").
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import torch
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
 from heatsplat.datamodules.assemble import on_clock, weather_of
 from heatsplat.datamodules.side_files import finite, read_table, shortened
-from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
 from heatsplat.datamodules.timestamps import zone_of
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,8 @@ SUN_STEP_S = 600.0
 PYRANOMETER_OFFSET = -5.0
 # Numbers from here on are seconds since 1970, below it seconds on the clock of the frames.
 FIRST_EPOCH_S = 1e8
+# Light that clouds of full cover take, and the power of the cover with which that falls (Kasten and Czeplak 1980).
+KASTEN_CZEPLAK, KASTEN_CZEPLAK_POWER = 0.75, 3.4
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 
@@ -48,6 +51,7 @@ class Quantity:
     high: float
 
 
+COVER = "cloud_cover"  # share of the sky that clouds take, of which light that they take follows (Weather.clouds)
 QUANTITIES: dict[str, Quantity] = {
     "air_c": Quantity(
         ("air", "air_temperature", "temperature", "temp", "t_air", "t2m", "temperature_2m"),
@@ -78,6 +82,12 @@ QUANTITIES: dict[str, Quantity] = {
         {"hpa": (1.0, 0.0), "mbar": (1.0, 0.0), "kpa": (10.0, 0.0), "pa": (0.01, 0.0)},
         300.0,
         1100.0,
+    ),
+    COVER: Quantity(
+        ("cloud_cover", "cloudcover", "clouds", "total_cloud_cover"),
+        {"fraction": (1.0, 0.0), "percent": (0.01, 0.0), "pct": (0.01, 0.0), "oktas": (0.125, 0.0), "octas": (0.125, 0.0)},
+        0.0,
+        1.0,
     ),
 }  # fmt: skip
 TIME_NAMES = ("time", "utc", "time_utc", "timestamp", "timestamp_utc", "datetime", "datetime_utc", "date", "date_time",
@@ -119,7 +129,7 @@ def make_weather(
 
     Args:
         times_s: [T] seconds since 1970 UTC, or on the clock of the frames (below 1e8: then there is no sun).
-        columns: values [T] by name in ``WEATHER_COLUMNS``, NaN where missing.
+        columns: values [T] by name in ``QUANTITIES``, NaN where missing.
         site, max_gap_s: as in ``read_weather``.
         source: what messages call it.
         notes: for the report, added to.
@@ -141,6 +151,9 @@ def make_weather(
         if below.any():
             notes["irradiance_offset"] = f"{int(below.sum())} values between {PYRANOMETER_OFFSET:g} and 0 W/m² set to 0"
             columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
+    if COVER in columns:
+        columns["clouds"] = KASTEN_CZEPLAK * columns.pop(COVER) ** KASTEN_CZEPLAK_POWER
+        notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
     missing = [name for name in WEATHER_COLUMNS if name not in columns]
     if missing:
         notes["missing"] = ", ".join(missing)
@@ -400,7 +413,8 @@ def _with_sun(
     columns = {name: np.interp(fine, times_s, values) for name, values in columns.items()}
     sun = sun_directions(site, fine)
     height = np.degrees(np.arcsin((sun @ site.axes()[2]).clip(-1.0, 1.0)))
-    if "irradiance_w_m2" in columns:
+    measured = "irradiance_w_m2" in columns
+    if measured:
         impossible = (height < -3.0) & (columns["irradiance_w_m2"] > 50.0)
         if impossible.any():
             first = int(np.argmax(impossible))
@@ -415,6 +429,12 @@ def _with_sun(
         columns["irradiance_w_m2"] = clear_sky(site, fine)
         notes["irradiance"] = "none in the record: that of a cloudless sky (Ineichen and Perez)"
     direct, diffuse = split_irradiance(site, fine, columns["irradiance_w_m2"])
+    told = None if "clouds" in columns or not measured else clouds(site, fine, columns["irradiance_w_m2"])
+    if told is not None:
+        columns["clouds"] = told
+        notes["clouds"] = (
+            "of the light that is missing to that of a clear sky, by night between dusk and dawn (Crawford, Duchon)"
+        )
     notes["night_share"] = round(float((height <= 0).mean()), 3)
     if (height <= 0).all():
         notes["night_only"] = "the sun never rises in this record: it says nothing about how surfaces absorb sunlight"

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, ThermalRange, Weather
-from heatsplat.datamodules.sun import clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import clear_sky, clouds, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene import layered_heat
 from heatsplat.datamodules.synthetic_scene.layered_heat import Body, Course, Layer, Patches
 from heatsplat.datamodules.synthetic_scene.outdoor import (
@@ -232,6 +232,7 @@ def winter_weather(start_s: float, end_s: float) -> Weather:
         "irradiance_w_m2": irradiance,
         "direct_w_m2": direct,
         "diffuse_w_m2": diffuse,
+        "clouds": clouds(SITE, utc_s, irradiance),
         "sun": sun_directions(SITE, utc_s),
     }
     notes = {

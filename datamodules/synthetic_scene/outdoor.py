@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, ThermalRange, Weather
-from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     Forcing,
     History,
@@ -190,11 +190,7 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
     light pass (Kasten and Czeplak 1980); what passes is split into sun and sky as a measured irradiance would be.
     """
     times = np.arange(start_s, end_s + 0.5 * SAMPLE_S, SAMPLE_S)
-    air, wind, humidity, passing = _series(SKIES["fair"], times)
-    if name != "fair":
-        share = np.clip(times / 3600.0, 0.0, 1.0)
-        pairs = zip((air, wind, humidity, passing), _series(SKIES[name], times), strict=True)
-        air, wind, humidity, passing = (fair + share * (other - fair) for fair, other in pairs)
+    air, wind, humidity, passing = _under(name, times)
     utc_s = START_UTC_S + times
     irradiance = clear_sky(SITE, utc_s) * passing
     direct, diffuse = split_irradiance(SITE, utc_s, irradiance)
@@ -207,6 +203,7 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
         pressure_hpa=torch.from_numpy(955.0 + 4.0 * _drift("pressure", times, (53.0, 23.0))),
         direct_w_m2=torch.from_numpy(direct),
         diffuse_w_m2=torch.from_numpy(diffuse),
+        clouds=clouds_of_light(utc_s, irradiance),
         sun=torch.from_numpy(sun_directions(SITE, utc_s)),
         notes={
             "source": f"made up: {name}",
@@ -218,6 +215,26 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
             "utc_at_zero_s": START_UTC_S,
         },
     )
+
+
+def cloud_cover(name: str, times_s: np.ndarray) -> np.ndarray:
+    """Share of the sky [T] that clouds of a sky in ``SKIES`` take, by night too."""
+    return ((1.0 - _under(name, times_s)[3]) / 0.75) ** (1.0 / 3.4)
+
+
+def clouds_of_light(utc_s: np.ndarray, irradiance_w_m2: np.ndarray) -> Tensor | None:
+    """What a record of this light tells of clouds (``Weather.clouds``)."""
+    told = clouds(SITE, utc_s, irradiance_w_m2)
+    return None if told is None else torch.from_numpy(told)
+
+
+def _under(name: str, times_s: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``_series`` of a sky in ``SKIES``, which takes over from "fair" within the first hour of the record."""
+    fair = _series(SKIES["fair"], times_s)
+    if name == "fair":
+        return fair
+    share = np.clip(times_s / 3600.0, 0.0, 1.0)
+    return tuple(one + share * (other - one) for one, other in zip(fair, _series(SKIES[name], times_s), strict=True))
 
 
 def _within(weather: Weather, part_s: tuple[float, float]) -> Weather:

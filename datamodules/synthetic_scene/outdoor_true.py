@@ -30,6 +30,8 @@ from heatsplat.datamodules.synthetic_scene.outdoor import (
     YARD,
     OutdoorPreset,
     OutdoorScene,
+    cloud_cover,
+    clouds_of_light,
     outdoor_weather,
 )
 from heatsplat.datamodules.synthetic_scene.presets import Surface
@@ -94,7 +96,7 @@ class OutdoorTrueScene(OutdoorScene):
         self.light, self.course = _solved(
             preset.surfaces, preset.weather, preset.duration_s, preset.patch_m, preset.ground_m
         )
-        self.sky = sky_of(self.weather)
+        self.sky = sky_of(preset.weather, self.weather)
         self.emissivity = torch.tensor([*(body.emissivity for body in self.materials), 1.0], dtype=torch.float64)
 
     def heat_at(self, points: Tensor, which: Tensor) -> PatchHeat:  # type: ignore[override]
@@ -171,7 +173,8 @@ def true_weather(name: str, duration_s: float) -> Weather:
     irradiance = weather.irradiance_w_m2.numpy() * (1.0 - 0.6 * _raining(times))
     direct, diffuse = split_irradiance(SITE, START_UTC_S + times, irradiance)
     light = {"irradiance_w_m2": irradiance, "direct_w_m2": direct, "diffuse_w_m2": diffuse}
-    return replace(weather, **{key: torch.from_numpy(series) for key, series in light.items()})
+    clouds = clouds_of_light(START_UTC_S + times, irradiance)
+    return replace(weather, clouds=clouds, **{key: torch.from_numpy(series) for key, series in light.items()})
 
 
 def _raining(times_s: np.ndarray) -> np.ndarray:
@@ -180,11 +183,11 @@ def _raining(times_s: np.ndarray) -> np.ndarray:
     return np.max([(hours >= start) & (hours <= end) for start, end, _ in SHOWERS], axis=0).astype(np.float64)
 
 
-def sky_of(weather: Weather) -> layered_heat.Sky:
-    """What a weather does to all patches alike.
+def sky_of(name: str, weather: Weather) -> layered_heat.Sky:
+    """What the weather of a name does to all patches alike.
 
-    Long waves of the clear sky by Prata (1996), with clouds c + (1 - c) of it (Crawford and Duchon 1999). Clouds are told
-    by the light that passes them, by night by the humidity of the air (a haze of at most a third).
+    Long waves of the clear sky by Prata (1996), with a cover c of black clouds c + (1 - c) of it, by night too. Rain falls from
+    a closed cover.
     """
     times, air_k = weather.times_s.numpy(), weather.air_c.numpy() + KELVIN_AT_0_C
     saturated, _ = layered_heat.saturated_kg_m3(air_k)
@@ -192,7 +195,7 @@ def sky_of(weather: Weather) -> layered_heat.Sky:
     hpa = 0.01 * vapour * VAPOUR_J_KG_K * air_k
     moist = 46.5 * hpa / air_k
     clear = 1.0 - (1.0 + moist) * np.exp(-np.sqrt(1.2 + 3.0 * moist))
-    cover = _clouds(weather)
+    cover = np.maximum(cloud_cover(name, times), _raining(times))
     rain = np.zeros(len(times))
     for start, end, millimetres in SHOWERS:
         rain[(times >= 3600.0 * start) & (times <= 3600.0 * end)] = millimetres / 3600.0
@@ -204,15 +207,6 @@ def sky_of(weather: Weather) -> layered_heat.Sky:
         rain,
         (cover + (1 - cover) * clear) * STEFAN_BOLTZMANN * air_k**4,
     )
-
-
-def _clouds(weather: Weather) -> np.ndarray:
-    """Share of the sky [T] that clouds take: of the day's light the diffuse share above a clear day's; held over night."""
-    day = weather.irradiance_w_m2.numpy() > 50.0
-    share = weather.diffuse_w_m2.numpy()[day] / weather.irradiance_w_m2.numpy()[day]
-    cover = np.clip((share - 0.15) / 0.85, 0.0, 1.0)
-    times = weather.times_s.numpy()
-    return np.maximum(np.interp(times, times[day], cover), _raining(times))
 
 
 @cache
@@ -233,7 +227,7 @@ def _solved(
         patches = Patches(
             light.surface.numpy(), absorbs.numpy(), light.sky_share.numpy(), light.sunlight(record), ground
         )
-        return layered_heat.solve(bodies, patches, sky_of(record), start)
+        return layered_heat.solve(bodies, patches, sky_of(name, record), start)
 
     midnight = course("fair", DAY_S, 288.0)
     return light, course(weather, duration_s, midnight)

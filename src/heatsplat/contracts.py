@@ -149,6 +149,7 @@ class Environment:
 
 
 WEATHER_COLUMNS = ("air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "pressure_hpa")
+WEATHER_DERIVED = ("direct_w_m2", "diffuse_w_m2", "clouds", "sun")  # series that follow from these and the place
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,8 @@ class Weather:
         pressure_hpa: air pressure.
         direct_w_m2: irradiance by the sun alone on a surface that faces it (direct normal).
         diffuse_w_m2: irradiance by the sky alone on a horizontal surface (diffuse horizontal).
+        clouds: share of the clear sky's light that clouds take over an hour, 0 to 1; by night from cover that was recorded, or
+            linear between dusk and dawn.
         sun: [T, 3] direction towards the sun, below the horizon too.
         up: [3] direction away from the ground.
         notes: what the reader found, left out and assumed, for the report.
@@ -180,6 +183,7 @@ class Weather:
     pressure_hpa: Tensor | None = None
     direct_w_m2: Tensor | None = None
     diffuse_w_m2: Tensor | None = None
+    clouds: Tensor | None = None
     sun: Tensor | None = None
     up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     notes: dict[str, Any] = field(default_factory=dict)
@@ -188,7 +192,7 @@ class Weather:
         count = len(self.times_s)
         if self.times_s.dtype != torch.float64 or count < 2 or not bool((self.times_s.diff() > 0).all()):
             raise SceneError("weather needs two or more samples at strictly increasing times, as float64 seconds")
-        for name in (*WEATHER_COLUMNS, "direct_w_m2", "diffuse_w_m2", "sun"):
+        for name in (*WEATHER_COLUMNS, *WEATHER_DERIVED):
             series = getattr(self, name)
             if series is not None and (len(series) != count or not bool(series.isfinite().all())):
                 raise SceneError(f"weather.{name} must hold {count} finite samples, as many as weather.times_s")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import SceneData, SceneError, Weather
-from heatsplat.datamodules.sun import Site, clear_sky, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
 from heatsplat.datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
 
 SITE = Site(47.0, 9.0, 500.0)
@@ -244,6 +244,41 @@ def test_light_is_split_so_that_it_adds_up_and_night_is_exactly_zero():
     assert (bright[height <= 0] == 0).all()
     clear, _ = split_irradiance(SITE, when, bright)
     assert clear.max() > 600.0 and direct.max() < 100.0  # of a cloudy sky little comes straight
+
+
+def test_clouds_are_told_by_the_light_of_an_hour_and_by_night_lie_between_dusk_and_dawn():
+    when = MIDNIGHT_S + 600.0 * np.arange(145)
+    bright = clear_sky(SITE, when)
+    noon, night = slice(66, 79), slice(0, 18)
+    assert np.abs(clouds(SITE, when, bright)).max() < 1e-12
+    assert np.allclose(clouds(SITE, when, 0.3 * bright), 0.7)
+    assert (clouds(SITE, when, 1.2 * bright) == 0.0).all()  # light from the edges of clouds is not less than none
+    shaded = bright.copy()
+    shaded[72] = 0.0  # ten minutes of an hour, as two halves of neighbouring steps
+    assert clouds(SITE, when, shaded)[noon].max() == pytest.approx(1 / 6, abs=0.01)
+    evening = np.where(when > when[72], 0.5, 1.0) * bright
+    told = clouds(SITE, when, evening)
+    assert told[night].max() < 1e-12 and told[-1] == pytest.approx(0.5)
+    assert clouds(SITE, when[:18], bright[:18]) is None  # nothing but night
+
+
+def test_a_record_tells_clouds_by_its_cover_or_by_its_light(table):
+    measured = read_weather(table("utc,ghi_w_m2,air_c", *day("300.0,15")), site=SITE)
+    assert measured.clouds.max() > 0.6 and "Crawford" in measured.notes["clouds"]
+    covered = read_weather(table("utc,cloud cover (%),ghi_w_m2", *day("100,300.0")), site=SITE)
+    assert (
+        torch.allclose(covered.clouds, torch.tensor(0.75, dtype=torch.float64)) and "Kasten" in covered.notes["clouds"]
+    )
+    by_eighths = read_weather(table("utc,cloud_cover_oktas", *day("4")))
+    assert torch.allclose(by_eighths.clouds, torch.tensor(0.75 * 0.5**3.4, dtype=torch.float64))
+    assert read_weather(table("utc,air_c", *day("15")), site=SITE).clouds is None  # light of a cloudless sky tells none
+    with pytest.raises(SceneError, match="cloud_cover is 1.2"):
+        read_weather(table("utc,cloud_cover_percent", *day("120")))
+
+
+def day(cells: str) -> list[str]:
+    """A line for every hour of daylight."""
+    return [f"2024-07-11T{hour:02d}:00:00Z,{cells}" for hour in range(6, 18)]
 
 
 def test_the_sun_shines_until_it_sets():

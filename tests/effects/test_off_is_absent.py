@@ -467,11 +467,10 @@ def test_image_and_gradients_are_those_of_a_model_without_it_to_the_last_bit(nam
 @pytest.mark.parametrize("name", EFFECTS)
 def test_with_it_on_all_of_that_differs(name):
     off, on = switched_off(name), switched_on(name)
-    assert on.operators - off.operators
+    if name != "albedo":  # one more driver in the kernel that marches the balance
+        assert on.operators - off.operators
     shown, without = on.shown, off.shown  # which draws a graph of neighbours, where there is one
-    if CASES[
-        name
-    ].traces:  # albedo is one more driver, bodies without an end other tables, pixels an average: nothing to learn
+    if CASES[name].traces:  # bodies without an end have other tables, pixels are averages: nothing to learn
         assert on.held() != off.held()
         assert on.numbers() > off.numbers()
     if name == "thermal_opacity":  # the visible image beside the thermal one, each with opacities of its own
@@ -640,7 +639,7 @@ def written_out(model, splats, query, off):
 
 
 def under_weather(off):
-    model = air(**WEATHER[off][0])
+    model = air(solution="linear", **WEATHER[off][0])
     run, query = Run(ByHand(model)), Query(torch.arange(0, COUNT, 2), camera(0.0), 3 * HOUR_S)
     return model, lambda: model.features(run.splats, query), lambda: written_out(model, run.splats, query, off)
 

@@ -1,5 +1,6 @@
 """Balances of heat with and without sun, sky and wind, on points whose heat is known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -26,14 +27,17 @@ from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 POINTS, FRAMES, STEP_S = 60, 48, 120.0
 
 
-def recorded(without="", depth=0.0, lit=None, **seen):
+def recorded(without="", depth=0.0, lit=None, clouds=None, **seen):
     """Points under a weather, integrated in small steps; noise of 0.1 K.
 
     Args:
+        clouds: (hours of the record) -> share of the sky that they close; None: the sky is clear, and the record tells none.
         lit: (the sun's direction) -> whether each point is lit by its beams; None: they are level, and irradiance is all light.
         seen: what ``Weathered`` knows beside temperatures.
     """
     weather = make_weather()
+    if clouds is not None:
+        weather = replace(weather, clouds=clouds(weather.times_s / HOUR_S))
     generator = torch.Generator().manual_seed(3)
     rate = torch.exp(torch.rand(POINTS, generator=generator, dtype=torch.float64) * 2.0) / (4 * HOUR_S)
     takes = 0.3 + 0.5 * torch.rand(POINTS, generator=generator, dtype=torch.float64)
@@ -46,12 +50,13 @@ def recorded(without="", depth=0.0, lit=None, **seen):
             here = weather.at(now)
             air_k = torch.tensor(here.air_c + KELVIN_AT_0_C, dtype=torch.float64)
             moist = torch.tensor(here.humidity_percent, dtype=torch.float64)
-            net = STEFAN_BOLTZMANN * float(sky_temperature_k(air_k, moist, "brutsaert") ** 4 - air_k**4)
+            at = int((weather.times_s - now).abs().argmin())
+            closed = 0.0 if clouds is None or without == "clouds" else float(weather.clouds[at])
+            net = STEFAN_BOLTZMANN * float(sky_temperature_k(air_k, moist, "brutsaert", closed) ** 4 - air_k**4)
             wind = 1.0 if without == "convection" else (1 + 1.5 * here.wind_m_s / float(weather.wind_m_s.mean())) / 2.5
             driven = wind * (here.air_c - temperature)
             light = here.irradiance_w_m2
             if lit is not None:
-                at = int((weather.times_s - now).abs().argmin())
                 beam = float(weather.direct_w_m2[at] * weather.sun[at, 2].clamp_min(0))
                 light = beam * lit(weather.sun[at]) + float(weather.diffuse_w_m2[at])
             driven = driven + (without != "solar") * takes * light / EXCHANGE_W_M2_K
@@ -78,6 +83,15 @@ def test_what_drives_a_scene_is_told():
 def test_what_does_not_drive_a_scene_is_not_taken_in(name):
     evidence = judged(recorded(without=name), name, "")
     assert not (evidence.told and evidence.statistic > PART_SIGMAS), evidence
+
+
+def test_a_sky_under_clouds_is_told_from_a_clear_one():
+    def passing(hours):
+        return 0.5 + 0.5 * torch.sin(2.0 * torch.pi * hours / 5.0)
+
+    assert recorded(clouds=passing).clouded
+    assert not recorded(clouds=passing, without="clouds").clouded
+    assert not recorded().clouded
 
 
 def test_a_body_with_a_core_has_two_nodes():

@@ -153,6 +153,23 @@ def test_effects_that_are_off_or_unknown_are_absent():
     assert model.temperature(splats, 5 * HOUR).isfinite().all()
 
 
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_clouds_close_the_sky_as_far_as_the_record_says(solution):
+    """A closed sky is as warm as the air: surfaces end where those that lose no heat to the sky do."""
+    nights = weather(irradiance_w_m2=None, direct_w_m2=None, diffuse_w_m2=None, wind_m_s=None)
+    closed = scene(replace(nights, clouds=torch.ones_like(nights.times_s)))
+    half = scene(replace(nights, clouds=torch.full_like(nights.times_s, 0.5)))
+    air, splats = ready(closed, sky=None, solution=solution)
+    under = [ready(data, clouds=True, solution=solution)[0] for data in (closed, half)]
+    clear, full = ready(closed, solution=solution)
+    at = [model.temperature(full, 27 * HOUR) for model in (*under, clear)]
+    torch.testing.assert_close(at[0], air.temperature(splats, 27 * HOUR), rtol=0, atol=0.1)
+    assert (at[0] > at[1] + 0.5).all() and (at[1] > at[2] + 0.5).all()
+    assert "clouds" in under[0].effects()["radiation"] and "clouds" not in clear.effects()["radiation"]
+    with pytest.raises(SceneError, match="the weather tells no clouds, which clouds=true needs"):
+        ready(scene(nights), clouds=True)
+
+
 def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():
     model, splats = ready(scene(weather(sun=None, direct_w_m2=None, diffuse_w_m2=None)))
     assert model.effects()["solar"]["left_out"] == "the direction of the sun, which the weather lacks"
@@ -245,7 +262,7 @@ def test_a_night_only_record_works_without_sun():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solution": "best"}, "solution must be one of linear, corrected, got 'best'"),
+        ({"solution": "best"}, "solution must be one of auto, linear, corrected, got 'best'"),
         ({"sky": "blue"}, "sky must be one of auto, brutsaert"),
         ({"normals": "up"}, "normals must be one of seen, level, got 'up'"),
         ({"clip": "soft"}, "clip must be one of"),
@@ -271,6 +288,8 @@ def test_a_night_only_record_works_without_sun():
         ({"indoor_c": 20.0}, "indoor_c has no effect without heat from within: give inner=true"),
         ({"albedo": 1.0}, r"albedo must lie in \(0, 1\), or be null"),
         ({"shadows": True, "sun": False}, "give sun=true, normals=seen"),
+        ({"clouds": True, "sky": None}, "clouds are of the sky: give sky=auto"),
+        ({"share_prior": -1.0}, "share_prior must not be negative, got -1.0"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )
@@ -406,9 +425,34 @@ def test_convection_that_was_measured_is_what_the_balance_has():
     assert "wind_share" not in told
 
 
-@pytest.mark.parametrize(("solution", "follow"), [("linear", True), ("corrected", False)])
-def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(solution, follow):
-    model, _ = ready(solution=solution)
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_shares_are_pulled_to_the_mean_of_all_and_only_they(solution):
+    model, splats = ready(solution=solution, share_prior=0.3)
+    for name in ("raw_share", "raw_wind"):
+        splats[name].requires_grad_().data.copy_(torch.arange(6.0) ** 2)
+    (term,) = model.regularisers(splats).values()
+    squares = torch.arange(6.0, dtype=torch.float64) ** 2
+    torch.testing.assert_close(term.double(), 2 * 0.3 * (squares - squares.mean()).square().mean(), rtol=1e-6, atol=0)
+    term.backward()
+    pull = 0.3 * 2 * (squares - squares.mean()) / 6
+    for name in ("raw_share", "raw_wind"):
+        torch.testing.assert_close(splats[name].grad.double(), pull, rtol=1e-6, atol=1e-6)
+
+
+def test_a_prior_on_shares_is_absent_where_it_is_off_or_shares_are_none():
+    no_shares = ready(share_prior=0.3, exchange="iso_6946"), ready(share_prior=0.3, sky=None, wind=False)
+    for model, splats in (ready(), *no_shares):
+        assert model.regularisers(splats) == {}
+    model, _ = ready(share_prior=0.3)
+    assert model.regularisers(splats_of(model, 0)) == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "follow"),
+    [({"solution": "linear"}, True), ({}, False), ({"share_prior": 0.2}, True)],
+)
+def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(options, follow):
+    model, _ = ready(**options)
     seeds = Seeds(torch.zeros(2, 3), torch.full((2, 1), 0.4), torch.Generator())
     paced = {name: item.paced for name, item in model.per_gaussian(seeds).items()}
     assert paced["raw_share"] is paced["raw_wind"] is follow

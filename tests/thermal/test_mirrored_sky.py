@@ -1,12 +1,14 @@
 """The sky in a mirror: what a closed form says of level ground, walls and the horizon."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
 from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import SKY_SEEN, Query, Seeds
 from heatsplat.thermal.mirrored_sky import MirroredSky
@@ -34,10 +36,15 @@ def scene(record: Weather) -> SceneData:
     return SceneData("ground", views, views, views, torch.zeros(2, 3), None, ThermalRange(-40.0, 60.0), weather=record)
 
 
-def ready(normal=(0.0, 0.0, 1.0), share: float = 0.2, **extra) -> tuple[MirroredSky, Splats]:
-    part = MirroredSky(reflectance=share)
-    part.check(scene(weather()))
-    part.prepare(scene(weather()))
+def ready(
+    normal=(0.0, 0.0, 1.0), share: float = 0.2, closed: float | None = None, **extra
+) -> tuple[MirroredSky, Splats]:
+    record = weather()
+    if closed is not None:
+        record = replace(record, clouds=torch.full_like(record.times_s, closed))
+    part = MirroredSky(reflectance=share, clouds=closed is not None)
+    part.check(scene(record))
+    part.prepare(scene(record))
     seeds = Seeds(torch.zeros(1, 3), torch.zeros(1, 1), torch.Generator())
     declared = {name: item.initial for name, item in part.per_gaussian(seeds).items()}
     tensors = {"means": torch.zeros(1, 3), "log_scales": torch.zeros(1, 3), "quats": torch.ones(1, 4)}
@@ -69,6 +76,15 @@ def test_level_ground_shows_the_zenith_and_a_roof_under_trees_the_air():
     assert shown(part, splats, 20.0, looking_down((5.0, 0.0, 5.0))) == pytest.approx(hidden, abs=1e-3)
     part, splats = ready(share=1e-6)
     assert shown(part, splats, 20.0) == pytest.approx(20.0, abs=1e-3)
+
+
+def test_under_clouds_a_mirror_shows_the_warmth_of_the_air():
+    clear, half, closed = (shown(*ready(closed=share), 20.0) for share in (0.0, 0.5, 1.0))
+    assert clear == pytest.approx(shown(*ready(), 20.0), abs=1e-4) and clear + 0.5 < half < closed - 0.5
+    air = (0.8 * (20.0 + KELVIN_AT_0_C) ** 4 + 0.2 * (AIR_C + KELVIN_AT_0_C) ** 4) ** 0.25 - KELVIN_AT_0_C
+    assert closed == pytest.approx(air, abs=0.05)
+    with pytest.raises(SceneError, match="weather of scene 'ground' tells no clouds, which clouds=true needs"):
+        MirroredSky(clouds=True).prepare(scene(weather()))
 
 
 def test_its_share_is_learned_and_what_it_needs_is_asked_for():

@@ -7,7 +7,7 @@ import torch
 from running import TINY, run
 from scipy import constants, integrate, optimize
 
-from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Query, Seeds
@@ -108,3 +108,10 @@ def test_a_run_learns_and_its_response_never_falls(tmp_path):
     module, _ = run(tmp_path, *TINY, "method=physir", "data.scene=fog", "max_steps=60", "test=false")
     assert (module.sensor.parts["response"].rises.softmax(0) > 0).all()
     assert module.thermal.air.extinction() > 0
+
+
+def test_a_range_that_kelvin_in_float32_do_not_resolve_is_refused():
+    views = ViewSet([Frame("0.png", 0, CAMERA)], lambda i: None)
+    narrow = SceneData("yard", views, views, views, torch.zeros(1, 3), None, ThermalRange(15.0, 15.0 + 1e-9))
+    with pytest.raises(SceneError, match=r"RadiativeTransfer\s+computes in kelvin"):
+        RadiativeTransfer(Static(floor=False)).check(narrow)

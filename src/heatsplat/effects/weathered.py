@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -35,10 +35,12 @@ NO_SUN = "the record has no irradiance, or the sun does not shine in it"
 NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
+CLOUDS = "clouds"  # clouds of the record warm the sky
 ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
 # What the scene's own geometry does, which is asked for beside all of these: shadows, light that comes back from the ground, sky
 # that is mirrored; and hidden sky, which shows where beams and diffuse light are taken in one measure (ONE_LIGHT).
 SHADOWS, ALBEDO, MIRRORED, SKY_VIEW, ONE_LIGHT = "shadows", "albedo", "mirrored_sky", "sky_view", "one light"
+BEAMS = 5  # drivers before those of the sun's beams, one for each way that points face (``Weathered._drivers``)
 SKY_PARTS = 64  # of the sky that are asked whether they are open
 NEIGHBOURS = 6  # of a point, of whose temperature it takes a share where heat flows between them
 FLOW = 0.5  # that share, as expected
@@ -95,7 +97,8 @@ def around(inspected: Inspection, name: str) -> Evidence:
     if name == SHADOWS:  # which add no number to a balance: where there are none, they make it worse
         return weighed(gain, found, least_db=NOTHING_DB)
     # What balances miss is taken for these, which have numbers of their own: up to 0.5 dB where none of them is there.
-    return weighed(gain, found, least_db=MUCH_DB, nothing_db=MIN_DB)
+    evidence = weighed(gain, found, least_db=MUCH_DB, nothing_db=MIN_DB)
+    return replace(evidence, settings={"clouds": weathered.clouded}) if name == MIRRORED else evidence
 
 
 def weighed(
@@ -155,6 +158,14 @@ class Weathered:
         """Temperatures that a body has: 2, surface and core, where that explains observations better that were left out."""
         gain = self.gain(DEPTH)
         return 2 if gain.sigmas > SIGMAS and gain.db > MIN_DB else 1
+
+    @cached_property
+    def clouded(self) -> bool:
+        """Whether a sky under the clouds of the record explains observations better that were left out than a clear one."""
+        if self.weather.clouds is None or "radiation" not in self.parts:
+            return False
+        gain = compared(self.squares((*self.parts, CLOUDS)), self._whole, self.weights)
+        return gain.sigmas > SIGMAS and gain.db > MIN_DB
 
     def gain(self, name: str) -> HeldOut:
         """What one of the parts gains beside the others."""
@@ -325,6 +336,8 @@ class Weathered:
         names += ["deep air"] if DEPTH in parts else []
         names += ["deep light"] if DEPTH in parts and "solar" in parts else []
         names += ["sky"] if "radiation" in parts else []
+        if CLOUDS in parts:
+            courses = courses | {"sky": courses["clouded sky"]}
         basis = [(EXPECTED[name] * courses[name]).expand(len(self.values), -1) for name in names]
         basis += [EXPECTED["mirror"] * self._mirrored] if MIRRORED in parts else []
         return courses["air"], torch.stack(basis, 2), names
@@ -353,7 +366,7 @@ class Weathered:
         measure: ONE_LIGHT, or SKY_VIEW, where what stands around hides sky."""
         if light not in self._variants:
             weather = self.weather
-            beams = self._drivers[0][:, 4:]
+            beams = self._drivers[0][:, BEAMS:]
             if light == SHADOWS:
                 ways = sun_directions(weather.sun, weather.up)
                 lit = lit_beside(self.tracks.points, self.around, ways)
@@ -365,10 +378,10 @@ class Weathered:
                     facing = facing * lit_beside(self.tracks.points, self.around, ways)
                 # Of an even sky a level surface takes all, a wall a half.
                 beams = beams + self._drivers[0][:, 2:3] * facing.mean(1) / (weather.up @ ways.T).mean()
-            drivers = torch.cat([self._drivers[0][:, :4], beams], 1)
+            drivers = torch.cat([self._drivers[0][:, :BEAMS], beams], 1)
             near, _ = self._answers((drivers, self._drivers[1]), self.wind, RATES_PER_S)
             self._variants[light] = {
-                (self.wind, number): self._courses[self.wind, number] | {"beam": near[number, :, 4:].T}
+                (self.wind, number): self._courses[self.wind, number] | {"beam": near[number, :, BEAMS:].T}
                 for number in range(len(RATES_PER_S))
             }
         return self._variants[light]
@@ -382,7 +395,7 @@ class Weathered:
         """By how much colder than the air what the points mirror looks [P, F], in kelvin."""
         weather, normals = self.weather, self.normals[:, None]
         air_k = kelvin(weather_record.at(weather, weather.air_c, self.times_s))
-        sky_k = weather_record.at(weather, self._sky_k, self.times_s)
+        sky_k = weather_record.at(weather, self._clouded_k if self.clouded else self._sky_k, self.times_s)
         out = self.tracks.directions
         sine = (2.0 * (out * normals).sum(2, keepdim=True) * normals - out) @ weather.up
         emissivity = emissivity_towards(optical_depth((sky_k / air_k) ** 4), sine)
@@ -405,23 +418,35 @@ class Weathered:
 
     @cached_property
     def _drivers(self) -> tuple[Tensor, Tensor]:
-        """Air in °C, then sky, diffuse, level light and beams in kelvin [T, d]; and wind over its mean [T]."""
+        """Air in °C, then sky, diffuse and level light, the sky under clouds and beams in kelvin [T, d]; and wind over its
+        mean [T]."""
         weather = self.weather
         zero = torch.zeros_like(weather.times_s)
         wind = zero + 1.0 if weather.wind_m_s is None else weather.wind_m_s / weather.wind_m_s.mean().clamp_min(0.1)
         light = zero if weather.irradiance_w_m2 is None else weather.irradiance_w_m2
-        net = STEFAN_BOLTZMANN * (self._sky_k**4 - kelvin(weather.air_c) ** 4)
+        clear, clouded = (
+            STEFAN_BOLTZMANN * (sky_k**4 - kelvin(weather.air_c) ** 4)[:, None]
+            for sky_k in (self._sky_k, self._clouded_k)
+        )
         beam, diffuse = light[:, None], zero
         if self.normals is not None and weather.direct_w_m2 is not None and weather.sun is not None:
             beam = weather.direct_w_m2[:, None] * (weather.sun @ self.normals.T).clamp_min(0.0)
             diffuse = zero if weather.diffuse_w_m2 is None else weather.diffuse_w_m2
-        power = torch.cat([net[:, None], diffuse[:, None], light[:, None], beam], 1) / EXCHANGE_W_M2_K
+        power = torch.cat([clear, diffuse[:, None], light[:, None], clouded, beam], 1) / EXCHANGE_W_M2_K
         return torch.cat([weather.air_c[:, None], power], 1), wind
 
     @cached_property
     def _sky_k(self) -> Tensor:
+        return self._sky_under(0.0)
+
+    @cached_property
+    def _clouded_k(self) -> Tensor:
+        return self._sky_k if self.weather.clouds is None else self._sky_under(self.weather.clouds)
+
+    def _sky_under(self, clouds: Tensor | float) -> Tensor:
         humidity = self.weather.humidity_percent
-        return sky_temperature_k(kelvin(self.weather.air_c), humidity, "swinbank" if humidity is None else "brutsaert")
+        law = "swinbank" if humidity is None else "brutsaert"
+        return sky_temperature_k(kelvin(self.weather.air_c), humidity, law, clouds)
 
     def _answers(
         self, drivers: tuple[Tensor, Tensor], winds: float, rates_per_s: Sequence[float]
@@ -459,5 +484,6 @@ class Weathered:
 
 def _named(answers: Tensor, start: Tensor) -> dict[str, Tensor]:
     """Answers [F, d] to ``Weathered._drivers`` and the decay of the start [F] by name."""
-    air, sky, diffuse, _ = answers[:, :4].unbind(1)
-    return {"air": air, "sky": sky, "diffuse": diffuse, "beam": answers[:, 4:].T, "start": start}
+    air, sky, diffuse, _, clouded = answers[:, :BEAMS].unbind(1)
+    beam = answers[:, BEAMS:].T
+    return {"air": air, "sky": sky, "clouded sky": clouded, "diffuse": diffuse, "beam": beam, "start": start}

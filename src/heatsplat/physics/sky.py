@@ -1,4 +1,4 @@
-"""Temperature of the clear sky in the thermal band: how cold a surface finds it, from what a weather station measures.
+"""Temperature of the sky in the thermal band: how cold a surface finds it, from what a weather station measures.
 
 **Convention:** kelvin; the sky's long waves are those of a black body at this temperature, σ T_sky⁴.
 """
@@ -28,22 +28,29 @@ def dew_point_c(vapour_hpa: Tensor) -> Tensor:
     return 243.04 * log / (17.625 - log)
 
 
-def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str) -> Tensor:
-    """Temperature of the clear sky in kelvin, of any shape.
+def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str, clouds: Tensor | float = 0.0) -> Tensor:
+    """Temperature of the sky in kelvin, of any shape.
 
     Args:
         air_k: near the ground.
         humidity_percent: relative; needed by all laws but Swinbank's.
         law: "brutsaert" (1975): emissivity 1.24 (e/T)^(1/7); "brunt" (1932, coefficients of Sellers 1965): 0.605 +
             0.048 √e; "berdahl_martin" (1984, without the hour of the day): 0.711 + 0.0056 d + 0.000073 d² with the dew
-            point d in °C; "swinbank" (1963): T_sky = 0.0552 T^1.5, from air temperature alone.
+            point d in °C; "swinbank" (1963): T_sky = 0.0552 T^1.5, from air temperature alone. All are of clear skies.
+        clouds: share of the clear sky's light that clouds take, in [0, 1]: as much of the sky is a black body of the air's
+            temperature (Crawford and Duchon 1999, Eq. 5 and 20).
 
     Raises:
         ValueError: the law is unknown, or lacks the humidity.
     """
     check_option("law of the sky", law, LAWS)
+    clear = _clear_emissivity(air_k, humidity_percent, law)
+    return air_k * (clear + clouds * (1.0 - clear)) ** 0.25
+
+
+def _clear_emissivity(air_k: Tensor, humidity_percent: Tensor | None, law: str) -> Tensor:
     if law == "swinbank":
-        return 0.0552 * air_k**1.5
+        return (0.0552 * air_k**0.5).clamp(max=1.0) ** 4
     if humidity_percent is None:
         raise ValueError(f"law of the sky '{law}' needs the humidity; without it there is swinbank")
     vapour = vapour_pressure_hpa(air_k, humidity_percent)
@@ -54,7 +61,7 @@ def sky_temperature_k(air_k: Tensor, humidity_percent: Tensor | None, law: str) 
     else:
         dew = dew_point_c(vapour)
         emissivity = 0.711 + 0.0056 * dew + 0.000073 * dew * dew
-    return air_k * emissivity.clamp(max=1.0) ** 0.25
+    return emissivity.clamp(max=1.0)
 
 
 def optical_depth(emissivity: Tensor) -> Tensor:

@@ -34,10 +34,11 @@ from heatsplat.thermal.base import (
 )
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
+from heatsplat.thermal.weather_drive import NO_CLOUDS
 
 log = logging.getLogger(__name__)
 
-SOLUTIONS = ("linear", "corrected")
+SOLUTIONS = ("auto", "linear", "corrected")
 EXCHANGES = ("learned", "iso_6946")
 MOST_CONVECTION = 100.0  # W/(m² K) and W s/(m³ K): ten times what outer surfaces have
 SURFACES = ("seen", "level")
@@ -55,6 +56,7 @@ LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 secon
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inner_rise")
 LEARNED += ("initial_core", "log_core_rate", "log_coupling")
+SHARES = ("raw_share", "raw_wind")
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
 COSTS = {"linear": 400, "corrected": 3000}
 
@@ -93,12 +95,13 @@ class EnergyBalance(ThermalModel):
     Gaussian was last marched.
 
     Args:
-        solution: "linear" has T⁴ and wind linearised about the surface's own mean temperature and costs the same for any
-            record; "corrected" solves the full balance along the record, for all training frames at once and anew where
-            parameters have moved (heatsplat.physics.marching).
+        solution: "corrected" solves the full balance along the record, for all training frames at once and anew where
+            parameters have moved (heatsplat.physics.marching); "linear" has T⁴ and wind linearised about the surface's own mean
+            temperature and costs the same for any record. "auto" is linear for bodies without an end, else corrected.
         nodes: 1, or 2 for bodies with a core.
         sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
             humidity and the last without), or None: nothing radiates.
+        clouds: whether the clouds of the record warm the sky (``Weather.clouds``); laws are of clear skies.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
@@ -117,6 +120,9 @@ class EnergyBalance(ThermalModel):
         sky_view: whether it hides sky as well.
         albedo: of the ground, for sunlight that comes back from what is not sky; None: nothing comes back.
         emissivity: assumed for ``attributes``, in (0, 1].
+        share_prior: weight of the variance over the scene of radiation's and of wind's share, before their sigmoids: a
+            normal prior on each Gaussian's about the mean of all, which is better in other weather where the record and the
+            balance are right, and worse where they are not. 0: each is on its own.
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
         lr_initial, lr_rate, lr_sun, lr_share, lr_wind, lr_inner: learning rates.
         lr_end: factor on them at the last step, log-linear in between.
@@ -131,9 +137,10 @@ class EnergyBalance(ThermalModel):
 
     def __init__(
         self,
-        solution: str = "linear",
+        solution: str = "auto",
         nodes: int = 1,
         sky: str | None = "auto",
+        clouds: bool = False,
         wind: bool = True,
         sun: bool = True,
         semi_infinite: bool = False,
@@ -146,6 +153,7 @@ class EnergyBalance(ThermalModel):
         sky_view: bool = False,
         albedo: float | None = None,
         emissivity: float = 0.95,
+        share_prior: float = 0.0,
         clip: str = "straight_through",
         lr_initial: float = 2.5e-3,
         lr_rate: float = 2e-2,
@@ -164,7 +172,11 @@ class EnergyBalance(ThermalModel):
         ):
             check_option(name, value, known)
         check_option("nodes", nodes, (1, 2))
+        if clouds and sky is None:
+            raise ValueError("clouds are of the sky: give sky=auto or another law, or clouds=false")
         convection = _convection(exchange)
+        if solution == "auto":
+            solution = "linear" if semi_infinite else "corrected"
         if semi_infinite and solution != "linear":
             raise ValueError(
                 "semi_infinite works only with the linearised balance: give solution=linear or semi_infinite=false"
@@ -187,9 +199,11 @@ class EnergyBalance(ThermalModel):
             raise ValueError(f"convection_error must lie in [0, 1), got {convection_error}")
         if not 0 < emissivity <= 1:
             raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
+        if share_prior < 0:
+            raise ValueError(f"share_prior must not be negative, got {share_prior}")
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
-        self.shadows, self.sky_view, self.albedo = shadows, sky_view, albedo
-        self._sky, self._wind, self._sun, self.nodes = sky, wind, sun, nodes
+        self.shadows, self.sky_view, self.albedo, self.share_prior = shadows, sky_view, albedo, share_prior
+        self._sky, self._clouds, self._wind, self._sun, self.nodes = sky, clouds, wind, sun, nodes
         self.exchange, self._convection = exchange, convection
         self.convection_error, self._convects = convection_error, 1.0
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
@@ -251,8 +265,9 @@ class EnergyBalance(ThermalModel):
             tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
         # Few images tell the shares apart, and at a short run's pace they would follow single ones: nothing that the trained
-        # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out.
-        share = partial(tensor, paced=self.solution == "linear")
+        # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out, and a
+        # prior holds them together at any pace.
+        share = partial(tensor, paced=self.solution == "linear" or self.share_prior > 0)
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
         if drivers.sky is not None and self._convection is None:
@@ -281,6 +296,12 @@ class EnergyBalance(ThermalModel):
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         return self._temperature(splats, Query(ids, time_s=time_s)) + self.reference_k.item()
+
+    def regularisers(self, splats: Splats) -> dict[str, Tensor]:
+        shares = [splats[name] for name in SHARES if name in splats]
+        if self.share_prior == 0 or not shares or len(splats) == 0:
+            return {}
+        return {"share_prior": self.share_prior * sum(share.var(correction=0) for share in shares)}
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of
@@ -463,10 +484,15 @@ class EnergyBalance(ThermalModel):
                 raise SceneError(
                     f"sky={law} needs humidity_percent, which the weather does not have; use sky=swinbank or sky=auto"
                 )
-            sky_k = sky.sky_temperature_k(air_k, weather.humidity_percent, law)
+            closed = weather.clouds if self._clouds else 0.0
+            if closed is None:
+                raise SceneError(f"the weather {NO_CLOUDS}")
+            sky_k = sky.sky_temperature_k(air_k, weather.humidity_percent, law, closed)
             parts["sky"] = power_excess(sky_k - reference, reference)
             parts["around"] = None if up is None else power_excess(air_k - reference, reference)
             effects["radiation"] = {"sky": law, "power": "T⁴" if self.solution == "corrected" else "about each mean"}
+            if self._clouds:
+                effects["radiation"]["clouds"] = weather.notes.get("clouds", "recorded")
             if not humid:
                 effects["radiation"]["left_out"] = "humidity, which the weather lacks"
         if self._wind and self.mean_wind > 0:

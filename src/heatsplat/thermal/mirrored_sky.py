@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from heatsplat.splats import Splats
 from heatsplat.thermal.base import SKY_SEEN, PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.part import HeatPart
+from heatsplat.thermal.weather_drive import NO_CLOUDS
 
 
 class MirroredSky(HeatPart):
@@ -28,7 +30,7 @@ class MirroredSky(HeatPart):
     Tensor: "sky_reflectance_logit" [N], of ρ.
 
     Args:
-        law: of the sky's temperature; see ``EnergyBalance``.
+        law, clouds: of the sky's temperature; see ``EnergyBalance``.
         reflectance: ρ at the start, in (0, 1).
         lr_reflectance: learning rate of its logit.
 
@@ -38,18 +40,22 @@ class MirroredSky(HeatPart):
 
     needs = frozenset({"time", "weather", "thermal_range"})
 
-    def __init__(self, law: str = "auto", reflectance: float = 0.08, lr_reflectance: float = 5e-3) -> None:
+    def __init__(
+        self, law: str = "auto", clouds: bool = False, reflectance: float = 0.08, lr_reflectance: float = 5e-3
+    ) -> None:
         super().__init__()
         check_option("law", law, ("auto", *sky.LAWS))
         if not 0 < reflectance < 1:
             raise ValueError(f"reflectance must lie in (0, 1), got {reflectance}")
-        self.law, self.reflectance, self.lr_reflectance = law, reflectance, lr_reflectance
+        self.law, self.clouds, self.reflectance, self.lr_reflectance = law, clouds, reflectance, lr_reflectance
         self.range = ImageRange()
         self._weather: Weather | None = None
 
     def prepare(self, scene: SceneData) -> None:
         if scene.weather.air_c is None:
             raise SceneError(f"the weather of scene '{scene.name}' has no air_c, the temperature of the air; add it")
+        if self.clouds and scene.weather.clouds is None:
+            raise SceneError(f"the weather of scene '{scene.name}' {NO_CLOUDS}")
         self.range.prepare(scene)
         self._weather = scene.weather
 
@@ -87,14 +93,17 @@ class MirroredSky(HeatPart):
         law = ("brutsaert" if humid else "swinbank") if self.law == "auto" else self.law
         air_k = torch.tensor(kelvin(now.air_c), dtype=torch.float64)
         humidity = torch.tensor(now.humidity_percent, dtype=torch.float64) if humid else None
-        emissivity = (sky.sky_temperature_k(air_k, humidity, law) / air_k) ** 4
+        closed = 0.0
+        if self.clouds:
+            closed = float(np.interp(time_s, self._weather.times_s.numpy(), self._weather.clouds.numpy()))
+        emissivity = (sky.sky_temperature_k(air_k, humidity, law, closed) / air_k) ** 4
         return float(air_k), sky.optical_depth(emissivity)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         return {"sky_reflectance": query.rows(splats["sky_reflectance_logit"]).sigmoid()}
 
     def effects(self) -> dict[str, dict[str, Any]]:
-        return {"mirrored_sky": {"law": self.law}}
+        return {"mirrored_sky": {"law": self.law} | ({"clouds": "recorded"} if self.clouds else {})}
 
     @property
     def cost(self) -> int:

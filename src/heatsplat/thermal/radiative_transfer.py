@@ -11,7 +11,7 @@ from heatsplat.contracts import SceneData, check_option
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.band_scale import DEGREE, BandScale
-from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.wrapper import Wrapper
 
@@ -46,6 +46,8 @@ class RadiativeTransfer(Wrapper):
     Raises:
         ValueError: an option is unknown or out of its range, or the state does not explain one thermal channel.
     """
+
+    narrowest_range_k = KELVIN_RANGE
 
     def __init__(
         self,

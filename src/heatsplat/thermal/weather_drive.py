@@ -11,6 +11,11 @@ from torch import Tensor
 from heatsplat.contracts import WEATHER_COLUMNS, Weather
 from heatsplat.physics.units import DAY_S
 
+NO_CLOUDS = (
+    "tells no clouds, which clouds=true needs: add cloud_cover_percent, or irradiance with latitude and longitude, or give "
+    "clouds=false for a clear sky"
+)
+
 
 def columns_at(weather: Weather, time_s: float) -> Tensor:
     """The five weather values at a moment, [5] float64 in the order of ``WEATHER_COLUMNS``; NaN where one is missing.

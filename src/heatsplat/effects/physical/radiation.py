@@ -22,8 +22,10 @@ def evidence(inspected: Inspection) -> Evidence:
         return found
     bent = weather_record.bent(obs)
     # A balance that is solved about its mean alone has bodies with a core.
-    nodes = 1 if bent or inspected.weathered is None else inspected.weathered.nodes
-    return replace(found, settings={"solution": "corrected" if bent else "linear", "nodes": nodes})
+    weathered = inspected.weathered
+    nodes = 1 if bent or weathered is None else weathered.nodes
+    settings = {"solution": "corrected" if bent else "linear", "nodes": nodes}
+    return replace(found, settings=settings | {"clouds": weathered is not None and weathered.clouded})
 
 
 EFFECT = Effect(
