@@ -16,6 +16,8 @@ Axis = tuple[float, float, float]
 # Sine of the sun's height from which its light tells clouds (10 degrees; below, haze and hills take as much), and the time over
 # which it does: a cloud before the sun is not one before all of the sky.
 CLOUDS_SINE, CLOUDS_S = 0.17, 3600.0
+# Light that clouds of full cover take, and the power of the cover with which that falls (Kasten and Czeplak 1980).
+FULL_COVER, COVER_POWER = 0.75, 3.4
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,16 @@ def clouds(site: Site, utc_s: np.ndarray, global_w_m2: np.ndarray) -> np.ndarray
     measured, clear = (_within_the_hour(utc_s, light) for light in (global_w_m2, clear_sky(site, utc_s)))
     share = 1.0 - measured[high] / clear[high]
     return np.interp(utc_s, utc_s[high], share.clip(0.0, 1.0))
+
+
+def light_taken(cover: np.ndarray) -> np.ndarray:
+    """Share of the clear sky's light that clouds of this cover take, of any shape (Kasten and Czeplak 1980)."""
+    return FULL_COVER * cover**COVER_POWER
+
+
+def cover_of(taken: np.ndarray) -> np.ndarray:
+    """The cover that takes this share of the clear sky's light, of any shape; inverse of ``light_taken``."""
+    return (taken / FULL_COVER) ** (1.0 / COVER_POWER)
 
 
 def _within_the_hour(utc_s: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ import torch
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
 from heatsplat.datamodules.assemble import on_clock, weather_of
 from heatsplat.datamodules.side_files import finite, read_table, shortened
-from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import Site, clear_sky, clouds, light_taken, split_irradiance, sun_directions
 from heatsplat.datamodules.timestamps import zone_of
 
 log = logging.getLogger(__name__)
@@ -36,8 +36,6 @@ SUN_STEP_S = 600.0
 PYRANOMETER_OFFSET = -5.0
 # Numbers from here on are seconds since 1970, below it seconds on the clock of the frames.
 FIRST_EPOCH_S = 1e8
-# Light that clouds of full cover take, and the power of the cover with which that falls (Kasten and Czeplak 1980).
-KASTEN_CZEPLAK, KASTEN_CZEPLAK_POWER = 0.75, 3.4
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 
@@ -152,7 +150,7 @@ def make_weather(
             notes["irradiance_offset"] = f"{int(below.sum())} values between {PYRANOMETER_OFFSET:g} and 0 W/m² set to 0"
             columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
     if COVER in columns:
-        columns["clouds"] = KASTEN_CZEPLAK * columns.pop(COVER) ** KASTEN_CZEPLAK_POWER
+        columns["clouds"] = light_taken(columns.pop(COVER))
         notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
     missing = [name for name in WEATHER_COLUMNS if name not in columns]
     if missing:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, ThermalRange, Weather
-from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
+from heatsplat.datamodules.sun import Site, clear_sky, clouds, cover_of, light_taken, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
     Forcing,
     History,
@@ -219,7 +219,7 @@ def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) 
 
 def cloud_cover(name: str, times_s: np.ndarray) -> np.ndarray:
     """Share of the sky [T] that clouds of a sky in ``SKIES`` take, by night too."""
-    return ((1.0 - _under(name, times_s)[3]) / 0.75) ** (1.0 / 3.4)
+    return cover_of(1.0 - _under(name, times_s)[3])
 
 
 def clouds_of_light(utc_s: np.ndarray, irradiance_w_m2: np.ndarray) -> Tensor | None:
@@ -268,7 +268,7 @@ def _series(sky: Sky, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     )
     wind = np.clip(wind_m_s, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
     cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
-    return air, wind, humidity, 1.0 - 0.75 * cover**3.4
+    return air, wind, humidity, 1.0 - light_taken(cover)
 
 
 def _vapour_hpa(celsius: np.ndarray) -> np.ndarray:
