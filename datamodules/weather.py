@@ -308,7 +308,7 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
         else:
             wanted[found[0]] = (position, found[1])
     if not wanted:
-        raise SceneError(f"{path} has none of the columns {', '.join(WEATHER_COLUMNS)}; it has {', '.join(header)}")
+        raise SceneError(f"{path} has none of the columns {', '.join(QUANTITIES)}; it has {', '.join(header)}")
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
     for number, cells in table.rows:
