@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from heatsplat.kernels import heat_balance as kernels
 from heatsplat.physics import marching
 from heatsplat.physics.energy_balance import Climate, Core, Surface
 from heatsplat.physics.marching import CHANGE, UNITS, Course, Kept, learned, march, parameters, with_parameters
@@ -62,6 +63,12 @@ def test_what_is_found_of_one_depends_neither_on_the_others_nor_on_other_moments
     torch.testing.assert_close(
         march(climate, surface, MOMENTS, sensitive=False)[..., 0], whole[..., 0], atol=1e-5, rtol=0
     )
+
+
+def test_moments_a_few_samples_apart_need_no_kernel_of_their_own(climate, surface):
+    alone, of_samples = march(climate, surface, MOMENTS[::2].contiguous()), list(kernels.march.compiled.signatures)
+    assert torch.equal(march(climate, surface, MOMENTS[::2]), alone)
+    assert kernels.march.compiled.signatures == of_samples
 
 
 def test_between_two_marches_temperatures_are_right_to_first_order(climate, surface):

@@ -104,7 +104,7 @@ def march(
             climate.rows.numpy(),
             climate.drivers.reference_k,
             0.0 if climate.drivers.room is None else 1.0 / climate.drivers.room,
-            moments.numpy(),
+            moments.contiguous().numpy(),  # a kernel is compiled for each layout
             here.numpy(),
         )
     if here is not table:
