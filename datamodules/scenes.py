@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import (
+    RAIN,
     WEATHER_COLUMNS,
     WEATHER_DERIVED,
     Camera,
@@ -210,7 +211,7 @@ def _weather(records: Sequence[Weather | None], delays: Sequence[float]) -> Weat
     up = records[0].up
     if any(float(record.up @ up) < 0.999 for record in records):
         raise SceneError("scenes to be joined must agree on what is up (weather.up); turn their worlds first")
-    series = (*WEATHER_COLUMNS, *WEATHER_DERIVED)
+    series = (*WEATHER_COLUMNS, *WEATHER_DERIVED, RAIN)
     known = [name for name in series if all(getattr(record, name) is not None for record in records)]
     return Weather(
         torch.cat([record.times_s + delay for record, delay in zip(records, delays, strict=True)]),

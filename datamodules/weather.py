@@ -1,9 +1,9 @@
 """Weather records: tables of air, wind, humidity, sunlight and pressure over time, checked, and with the sun added.
 
-A table has a column of times and any of the six quantities, each with its unit at the end of its name: ``air_c``,
+A table has a column of times and any of the seven quantities, each with its unit at the end of its name: ``air_c``,
 ``air_k``, ``air_f``; ``wind_m_s``, ``wind_km_h``, ``wind_kn``; ``humidity_percent``; ``irradiance_w_m2``;
-``pressure_hpa``, ``pressure_pa``; ``cloud_cover_percent``, ``cloud_cover_oktas``. Names as people write them are
-understood ("Air temperature [°C]", "GHI (W/m²)").
+``pressure_hpa``, ``pressure_pa``; ``cloud_cover_percent``, ``cloud_cover_oktas``; ``rain_mm_h``, or ``rain_mm`` since the
+sample before. Names as people write them are understood ("Air temperature [°C]", "GHI (W/m²)").
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
+from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
 from heatsplat.datamodules.assemble import on_clock, weather_of
 from heatsplat.datamodules.side_files import finite, read_table, shortened
 from heatsplat.datamodules.sun import Site, clear_sky, clouds, light_taken, split_irradiance, sun_directions
@@ -49,6 +49,8 @@ class Quantity:
     high: float
 
 
+FALLEN = "rain_mm"  # since the sample before, of which RAIN follows
+RAIN_NAMES = ("rain", "precipitation", "precip", "rainfall", "total_precipitation")
 COVER = "cloud_cover"  # share of the sky that clouds take, of which light that they take follows (Weather.clouds)
 QUANTITIES: dict[str, Quantity] = {
     "air_c": Quantity(
@@ -87,6 +89,8 @@ QUANTITIES: dict[str, Quantity] = {
         0.0,
         1.0,
     ),
+    RAIN: Quantity(RAIN_NAMES, {"mm_h": (1.0, 0.0), "in_h": (25.4, 0.0), "kg_m2_s": (3600.0, 0.0)}, 0.0, 500.0),
+    FALLEN: Quantity(RAIN_NAMES, {"mm": (1.0, 0.0), "in": (25.4, 0.0)}, 0.0, 500.0),
 }  # fmt: skip
 TIME_NAMES = ("time", "utc", "time_utc", "timestamp", "timestamp_utc", "datetime", "datetime_utc", "date", "date_time",
               "time_s", "epoch_s", "unix_s", "seconds")  # fmt: skip
@@ -140,6 +144,10 @@ def make_weather(
         _check_range(name, values, times_s, source)
     times_s, columns, notes = _in_order(np.asarray(times_s, dtype=np.float64), columns, notes)
     columns = {name: values for name, values in columns.items() if np.isfinite(values).sum() >= 2}
+    for name in (RAIN, FALLEN):  # which many records leave out where none fell
+        if name in columns and (gaps := int(np.isnan(columns[name]).sum())):
+            columns[name] = np.nan_to_num(columns[name])
+            notes["dry"] = f"{gaps} samples without {name} are taken for dry"
     if len(times_s) < 2 or not columns:
         raise SceneError(f"{source} holds no weather: two or more samples of at least one column are needed")
     times_s, columns = _common_span(times_s, columns, notes)
@@ -152,6 +160,12 @@ def make_weather(
     if COVER in columns:
         columns["clouds"] = light_taken(columns.pop(COVER))
         notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
+    if FALLEN in columns:
+        if RAIN in columns:
+            raise SceneError(f"{source} tells rain twice, as {RAIN} and as {FALLEN}; keep one")
+        hours = np.diff(times_s) / 3600.0
+        columns[RAIN] = columns.pop(FALLEN) / np.concatenate([hours[:1], hours])
+        notes["rain"] = "of what fell since the sample before"
     missing = [name for name in WEATHER_COLUMNS if name not in columns]
     if missing:
         notes["missing"] = ", ".join(missing)
@@ -447,7 +461,7 @@ def _with_sun(
     return fine, columns, {"direct_w_m2": direct, "diffuse_w_m2": diffuse, "sun": sun}
 
 
-def write_weather(path: Path, weather: Weather, names: Sequence[str] = WEATHER_COLUMNS) -> None:
+def write_weather(path: Path, weather: Weather, names: Sequence[str] = (*WEATHER_COLUMNS, RAIN)) -> None:
     """Writes a record as a table that ``read_weather`` reads: ISO times in UTC where it knows them, else seconds."""
     zero = weather.notes.get("utc_at_zero_s")
     there = [name for name in names if getattr(weather, name) is not None]

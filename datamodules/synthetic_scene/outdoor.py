@@ -240,7 +240,8 @@ def _under(name: str, times_s: np.ndarray) -> tuple[np.ndarray, ...]:
 def _within(weather: Weather, part_s: tuple[float, float]) -> Weather:
     """The samples of a record between two times in seconds, and one more on either side."""
     kept = (weather.times_s >= part_s[0] - SAMPLE_S) & (weather.times_s <= part_s[1] + SAMPLE_S)
-    series = {name: value[kept] for name, value in vars(weather).items() if name not in ("up", "notes")}
+    told = {name: value for name, value in vars(weather).items() if name not in ("up", "notes") and value is not None}
+    series = {name: value[kept] for name, value in told.items()}
     return replace(weather, **series)
 
 

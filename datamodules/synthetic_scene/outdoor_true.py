@@ -3,8 +3,8 @@
 What differs from ``outdoor``, all of it unknown to the methods: objects cast shadows on each other and hide the sky; light of
 the sky is brighter about the sun, and the ground reflects; clouds warm the sky's long waves, and what is not sky is as warm as
 the meadow; bodies have several layers, with rooms, a cabin or the deep ground behind them; rain falls, dew forms, grass
-transpires; and the camera sees the sky and its neighbours mirrored in what does not emit. A method is told the same weather
-table as in ``outdoor``, which has no rain and no clouds in it.
+transpires; and the camera sees the sky and its neighbours mirrored in what does not emit. A method is told a weather table as
+in ``outdoor``, and with it how much rain fell.
 """
 
 from __future__ import annotations
@@ -167,20 +167,31 @@ class OutdoorTrueScene(OutdoorScene):
 
 
 def true_weather(name: str, duration_s: float) -> Weather:
-    """The weather of ``outdoor`` over any number of days, darker while it rains."""
+    """The weather of ``outdoor`` over any number of days, with rain, and darker while it falls."""
     weather = outdoor_weather(name, 0.0, duration_s)
     times = weather.times_s.numpy()
     irradiance = weather.irradiance_w_m2.numpy() * (1.0 - 0.6 * _raining(times))
     direct, diffuse = split_irradiance(SITE, START_UTC_S + times, irradiance)
     light = {"irradiance_w_m2": irradiance, "direct_w_m2": direct, "diffuse_w_m2": diffuse}
     clouds = clouds_of_light(START_UTC_S + times, irradiance)
-    return replace(weather, clouds=clouds, **{key: torch.from_numpy(series) for key, series in light.items()})
+    rain = torch.from_numpy(rain_mm_h(times))
+    return replace(
+        weather, clouds=clouds, rain_mm_h=rain, **{key: torch.from_numpy(series) for key, series in light.items()}
+    )
 
 
 def _raining(times_s: np.ndarray) -> np.ndarray:
     """1 during showers, 0 without, [T]."""
     hours = times_s / 3600.0
     return np.max([(hours >= start) & (hours <= end) for start, end, _ in SHOWERS], axis=0).astype(np.float64)
+
+
+def rain_mm_h(times_s: np.ndarray) -> np.ndarray:
+    """Rain of the SHOWERS, [T]."""
+    rain = np.zeros(len(times_s))
+    for start, end, millimetres in SHOWERS:
+        rain[(times_s >= 3600.0 * start) & (times_s <= 3600.0 * end)] = millimetres
+    return rain
 
 
 def sky_of(name: str, weather: Weather) -> layered_heat.Sky:
@@ -196,15 +207,12 @@ def sky_of(name: str, weather: Weather) -> layered_heat.Sky:
     moist = 46.5 * hpa / air_k
     clear = 1.0 - (1.0 + moist) * np.exp(-np.sqrt(1.2 + 3.0 * moist))
     cover = np.maximum(cloud_cover(name, times), _raining(times))
-    rain = np.zeros(len(times))
-    for start, end, millimetres in SHOWERS:
-        rain[(times >= 3600.0 * start) & (times <= 3600.0 * end)] = millimetres / 3600.0
     return layered_heat.Sky(
         times,
         air_k,
         weather.wind_m_s.numpy(),
         vapour,
-        rain,
+        rain_mm_h(times) / 3600.0,
         (cover + (1 - cover) * clear) * STEFAN_BOLTZMANN * air_k**4,
     )
 

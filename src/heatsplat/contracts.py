@@ -150,6 +150,7 @@ class Environment:
 
 WEATHER_COLUMNS = ("air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "pressure_hpa")
 WEATHER_DERIVED = ("direct_w_m2", "diffuse_w_m2", "clouds", "sun")  # series that follow from these and the place
+RAIN = "rain_mm_h"  # a series that some records have, and that belongs to no moment: water stays
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,7 @@ class Weather:
         diffuse_w_m2: irradiance by the sky alone on a horizontal surface (diffuse horizontal).
         clouds: share of the clear sky's light that clouds take over an hour, 0 to 1; by night from cover that was recorded, or
             linear between dusk and dawn.
+        rain_mm_h: rain, 0 or more; 1 mm is 1 kg of water a square metre.
         sun: [T, 3] direction towards the sun, below the horizon too.
         up: [3] direction away from the ground.
         notes: what the reader found, left out and assumed, for the report.
@@ -184,6 +186,7 @@ class Weather:
     direct_w_m2: Tensor | None = None
     diffuse_w_m2: Tensor | None = None
     clouds: Tensor | None = None
+    rain_mm_h: Tensor | None = None
     sun: Tensor | None = None
     up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     notes: dict[str, Any] = field(default_factory=dict)
@@ -192,7 +195,7 @@ class Weather:
         count = len(self.times_s)
         if self.times_s.dtype != torch.float64 or count < 2 or not bool((self.times_s.diff() > 0).all()):
             raise SceneError("weather needs two or more samples at strictly increasing times, as float64 seconds")
-        for name in (*WEATHER_COLUMNS, *WEATHER_DERIVED):
+        for name in (*WEATHER_COLUMNS, *WEATHER_DERIVED, RAIN):
             series = getattr(self, name)
             if series is not None and (len(series) != count or not bool(series.isfinite().all())):
                 raise SceneError(f"weather.{name} must hold {count} finite samples, as many as weather.times_s")

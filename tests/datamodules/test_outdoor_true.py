@@ -93,7 +93,7 @@ def test_by_night_the_sky_is_as_cloudy_as_the_clouds_that_take_light_by_day():
     assert 0.7 < share[night].min() < 0.85
 
 
-def test_the_scene_trains_on_the_first_days_and_tells_no_clouds_and_no_rain():
+def test_the_scene_trains_on_the_first_days_and_tells_of_clouds_and_rain_what_a_station_would():
     scene = Synthetic(scene="outdoor_true", size="tiny").scene
     zero = scene.weather.notes["utc_at_zero_s"]
     days = [{(zero + t) // DAY_S for t in views.times_s} for views in (scene.train, scene.test)]
@@ -104,6 +104,8 @@ def test_the_scene_trains_on_the_first_days_and_tells_no_clouds_and_no_rain():
     known = scene.true_attributes(scene.points)
     assert ((known["absorptivity"] > 0.3) & (known["absorptivity"] < 1.0)).all()
     assert "cast shadows" in scene.notes["heat"]
+    fell = float((scene.weather.rain_mm_h[1:] * scene.weather.times_s.diff()).sum()) / 3600.0
+    assert fell == pytest.approx(1.0 * 2.0 + 0.7 * 3.0, abs=0.9)  # the showers of two days, on samples of ten minutes
 
 
 def test_a_longer_record_holds_out_its_last_day():

@@ -276,6 +276,27 @@ def test_a_record_tells_clouds_by_its_cover_or_by_its_light(table):
         read_weather(table("utc,cloud_cover_percent", *day("120")))
 
 
+def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
+    by_rate = read_weather(table("utc,rain_mm_h", *day("2.5")))
+    assert (by_rate.rain_mm_h == 2.5).all()
+    inches = read_weather(table("utc,rainfall (in/h),air_c", *day("0.1,15")))
+    assert torch.allclose(inches.rain_mm_h, torch.tensor(2.54).double())
+    halves = [f"2024-07-11T06:{minute:02d}:00Z,{mm}" for minute, mm in ((0, 0), (10, 0.5), (30, 2), (40, ""))]
+    fallen = read_weather(table("utc,Precipitation [mm]", *halves))
+    assert torch.allclose(fallen.rain_mm_h, torch.tensor([0.0, 3.0, 6.0, 0.0]).double())
+    assert (
+        fallen.notes["dry"] == "1 samples without rain_mm are taken for dry"
+        and "since the sample" in fallen.notes["rain"]
+    )
+    assert read_weather(table("utc,air_c", *day("15"))).rain_mm_h is None
+    with pytest.raises(SceneError, match="tells rain twice, as rain_mm_h and as rain_mm; keep one"):
+        read_weather(table("utc,rain_mm_h,precipitation_mm", *day("1,1")))
+    with pytest.raises(SceneError, match="column 'rain' has no unit; name it one of rain_mm_h"):
+        read_weather(table("utc,rain", *day("1")))
+    with pytest.raises(SceneError, match="rain_mm_h is -1"):
+        read_weather(table("utc,rain_mm_h", *day("-1")))
+
+
 def day(cells: str) -> list[str]:
     """A line for every hour of daylight."""
     return [f"2024-07-11T{hour:02d}:00:00Z,{cells}" for hour in range(6, 18)]
@@ -328,13 +349,13 @@ def test_seconds_without_a_date_have_no_sun():
 
 
 def test_a_written_record_is_read_back(tmp_path):
-    times, columns = hourly(air_c=15.0, wind_m_s=2.0, irradiance_w_m2=0.0)
+    times, columns = hourly(air_c=15.0, wind_m_s=2.0, irradiance_w_m2=0.0, rain_mm_h=0.5)
     columns["irradiance_w_m2"] = 0.8 * clear_sky(SITE, times)
     weather = make_weather(times, columns, site=SITE)
     write_weather(tmp_path / "weather.csv", weather)
     again = read_weather(tmp_path / "weather.csv", site=SITE)
     assert torch.equal(again.times_s, weather.times_s)
-    for name in ("air_c", "wind_m_s", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2", "sun"):
+    for name in ("air_c", "wind_m_s", "irradiance_w_m2", "rain_mm_h", "direct_w_m2", "diffuse_w_m2", "sun"):
         assert torch.allclose(getattr(again, name), getattr(weather, name), atol=1e-6)
 
 

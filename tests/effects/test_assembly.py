@@ -235,6 +235,16 @@ def test_leaving_an_effect_out_leaves_out_what_stands_on_it():
     full = verdicts("relaxation", "harmonic_source", "agc")
     assert names_on(assembly.without(full, "relaxation")) == {"agc"}
     assert names_on(assembly.without(full, "harmonic_source")) == {"relaxation", "agc"}
+    yard = verdicts("relaxation", "solar", "radiation", "convection", "shadows", "sky_view", "albedo")
+    assert names_on(assembly.without(yard, "relaxation")) == set()
+    for name in names_on(yard):  # what is measured of each effect's cost
+        build(assembly.assemble(assembly.without(yard, name), config("method=auto")["effects"])["thermal"])
+
+
+def test_what_stands_on_others_brings_all_of_them_or_goes_with_them():
+    shaded = verdicts("shadows")
+    assert names_on(assembly.reconcile(shaded)) == {"shadows", "solar", "relaxation"}
+    assert names_on(assembly.reconcile(verdicts("shadows", "solar", "agc"), {"relaxation": "off"})) == {"agc"}
 
 
 def test_the_log_tells_verdict_statistic_price_and_reason():

@@ -9,6 +9,7 @@ import torch
 
 from heatsplat.physics import marching
 from heatsplat.physics.energy_balance import Climate, Core, Surface, power_excess
+from heatsplat.physics.wetness import wet_share, wetted
 from tests.physics.weather_reference import drivers, solved
 
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
@@ -56,6 +57,33 @@ def test_corrected_physics_is_exact_to_a_millikelvin_from_sheet_metal_to_wet_gro
     linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
     assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
     assert linear[3] < 1.0
+
+
+def rained_on() -> Climate:
+    """The record with two showers, of which surfaces find another air and find it sooner."""
+    given = drivers()
+    showers = torch.zeros_like(given.times_s)
+    showers[30:34], showers[150:170] = 2.0, 0.5
+    air_k, humidity = given.reference_k + given.air, torch.full_like(given.air, 60.0)
+    air_k, times = wetted(air_k, humidity, wet_share(given.times_s, showers, air_k, humidity, None, 0.3))
+    assert times.max() > 2.5 and (times == 1).any()
+    return Climate(replace(given, air=air_k - given.reference_k, wetted=times))
+
+
+def test_wet_surfaces_are_those_of_a_stiff_solver_and_so_are_their_derivatives():
+    climate, surface, dry = rained_on(), bodies(wind=True), Climate(drivers())
+    truth = solved(climate.drivers, surface, MOMENTS)
+    found = course(climate.stepped_temperature, surface)
+    assert (found - truth).abs().max() < 1e-3
+    assert (found - course(dry.stepped_temperature, surface)).abs().max() > 3.0
+    at = 20_000.0  # between the shower and the sun that dries
+    for name in OWN:
+        leaf = getattr(surface, name).clone().requires_grad_()
+        climate.stepped_temperature(surface._replace(**{name: leaf}), at).sum().backward()
+        up, down = (
+            climate.stepped_temperature(surface._replace(**{name: leaf.detach() + step}), at) for step in (1e-4, -1e-4)
+        )
+        assert ((up - down) / 2e-4 - leaf.grad).abs().max() < 0.05 * leaf.grad.abs().max(), name
 
 
 def test_both_agree_where_nothing_is_nonlinear():

@@ -70,6 +70,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     if surface.core is not None:
         mu, kappa = surface.core.log_rate.exp().numpy(), surface.core.coupling.numpy()
     anomaly = np.zeros_like(air) if given.wind_anomaly is None else given.wind_anomaly.numpy()
+    wetted = np.ones_like(air) if given.wetted is None else given.wetted.numpy()
     calm = np.trapezoid(anomaly, times) / (times[-1] - times[0])
     mean = None if about is None else about.numpy()
 
@@ -91,7 +92,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             x, y = state[:count], state[count:]
             a, b, f = now(air, t), now(anomaly, t), now(forcing, t) + kappa * (y - x) - leak * x
             if mean is None:
-                taken = f + (1 - share) * (1 + wind * b) * (a - x) - share * radiated(x)
+                taken = f + (1 - share) * (1 + wind * b) * now(wetted, t) * (a - x) - share * radiated(x)
             else:
                 steep = (1 + mean / reference) ** 3
                 convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
@@ -100,7 +101,12 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
 
         def jacobian(t, state, now=now):
             gusts, about_x = (now(anomaly, t), state[:count]) if mean is None else (calm, mean)
-            own = (1 - share) * (1 + wind * gusts) + share * (1 + about_x / reference) ** 3 + kappa + leak
+            own = (
+                (1 - share) * (1 + wind * gusts) * now(wetted, t)
+                + share * (1 + about_x / reference) ** 3
+                + kappa
+                + leak
+            )
             return np.block([[np.diag(-rate * own), np.diag(rate * kappa)], [np.diag(mu), np.diag(-mu)]])
 
         step = (end - begin) / 4

@@ -170,6 +170,19 @@ def test_clouds_close_the_sky_as_far_as_the_record_says(solution):
         ready(scene(nights), clouds=True)
 
 
+def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_trace_of_it():
+    record = weather()
+    shower = ((record.times_s >= 12 * HOUR) & (record.times_s <= 13 * HOUR)).double()
+    model, splats = ready(scene(replace(record, rain_mm_h=2.0 * shower)), rain=0.3)
+    dry, _ = ready(scene(replace(record, rain_mm_h=0.0 * shower)), rain=0.3)
+    assert dry.climate.drivers.wetted is None and dry.effects()["convection"]["rain"].startswith("0.0 h wet")
+    colder = [dry.temperature(splats, t * HOUR) - model.temperature(splats, t * HOUR) for t in (11, 13, 29)]
+    assert torch.equal(colder[0], torch.zeros(6)) and (colder[1] > 2.0).all() and (colder[2].abs() < 0.2).all()
+    assert splats_of(model).state_dict().keys() == splats_of(dry).state_dict().keys()  # nothing of it is learned
+    with pytest.raises(SceneError, match="the weather tells no rain, which rain=0.3 needs: add rain_mm_h and humidity"):
+        ready(scene(record), rain=0.3)
+
+
 def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():
     model, splats = ready(scene(weather(sun=None, direct_w_m2=None, diffuse_w_m2=None)))
     assert model.effects()["solar"]["left_out"] == "the direction of the sun, which the weather lacks"
@@ -289,6 +302,9 @@ def test_a_night_only_record_works_without_sun():
         ({"albedo": 1.0}, r"albedo must lie in \(0, 1\), or be null"),
         ({"shadows": True, "sun": False}, "give sun=true, normals=seen"),
         ({"clouds": True, "sky": None}, "clouds are of the sky: give sky=auto"),
+        ({"rain": 0.0}, "rain must be above 0 mm, or null for surfaces that stay dry, got 0.0"),
+        ({"rain": 0.3, "solution": "linear"}, "give solution=corrected and indoor_c=null, or rain=null"),
+        ({"rain": 0.3, "inner": True, "indoor_c": 20.0}, "mean losses of walls leave it out"),
         ({"share_prior": -1.0}, "share_prior must not be negative, got -1.0"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],

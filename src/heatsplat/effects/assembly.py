@@ -119,19 +119,27 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
                 turn(other, False, f"{name} was asked for, and the two exclude each other")
         elif others:
             turn(name, False, _effect(others[0]).displaces[name])
-    for name in _on(found):
+    barred, waiting = {name for name, choice in given.items() if choice == "off"}, _on(found)
+    while waiting:
+        name = waiting.pop(0)
         ground = _effect(name).stands_on
-        if ground is not None and not found[ground].on:
-            if given.get(ground) == "off" and given.get(name) != "on":
-                turn(name, False, f"it stands on {ground}, which is off")
-            else:
-                turn(ground, True, f"{name} stands on it")
+        if ground is None or found[ground].on:
+            continue
+        if ground in barred and given.get(name) != "on":
+            turn(name, False, f"it stands on {ground}, which is off")
+            barred.add(name)
+        else:
+            turn(ground, True, f"{name} stands on it")
+            waiting.append(ground)
     return found
 
 
 def dependents(name: str) -> frozenset[str]:
-    """The effect and those that stand on it."""
-    return frozenset({name, *(effect.name for effect in CATALOGUE if effect.stands_on == name)})
+    """The effect, those that stand on it, and those that stand on these."""
+    found = {name}
+    while more := {effect.name for effect in CATALOGUE if effect.stands_on in found} - found:
+        found |= more
+    return frozenset(found)
 
 
 def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:

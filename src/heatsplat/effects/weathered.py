@@ -19,7 +19,8 @@ from heatsplat.effects.observations import Tracks
 from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
 from heatsplat.physics.responses import semi_infinite_weights
 from heatsplat.physics.sky import emissivity_towards, optical_depth, sky_temperature_k
-from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
+from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
+from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
 
 if TYPE_CHECKING:
     from heatsplat.effects.inspection import Inspection
@@ -36,6 +37,8 @@ NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
 CLOUDS = "clouds"  # clouds of the record warm the sky
+RAIN = "rain"  # rain of the record wets surfaces
+CONVECTS = 0.6  # of the exchange, which alone water hastens
 ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
 # What the scene's own geometry does, which is asked for beside all of these: shadows, light that comes back from the ground, sky
 # that is mirrored; and hidden sky, which shows where beams and diffuse light are taken in one measure (ONE_LIGHT).
@@ -99,6 +102,14 @@ def around(inspected: Inspection, name: str) -> Evidence:
     # What balances miss is taken for these, which have numbers of their own: up to 0.5 dB where none of them is there.
     evidence = weighed(gain, found, least_db=MUCH_DB, nothing_db=MIN_DB)
     return replace(evidence, settings={"clouds": weathered.clouded}) if name == MIRRORED else evidence
+
+
+def rain_on(inspected: Inspection) -> dict[str, float | None]:
+    """What the state of a scene is told of rain: of how many mm surfaces keep, None for none. Only a balance that is solved as it
+    stands knows it."""
+    weathered, obs = inspected.weathered, inspected.obs
+    wet = weathered is not None and obs.tracks is not None and weather_record.bent(obs) and weathered.rained_on
+    return {"rain": FILM_MM if wet else None}
 
 
 def weighed(
@@ -166,6 +177,20 @@ class Weathered:
             return False
         gain = compared(self.squares((*self.parts, CLOUDS)), self._whole, self.weights)
         return gain.sigmas > SIGMAS and gain.db > MIN_DB
+
+    @cached_property
+    def rained_on(self) -> bool:
+        """Whether surfaces that the record's rain wets explain observations better that were left out than dry ones do."""
+        if self._wet is None:
+            return False
+        gain = compared(self.squares((*self.parts, RAIN), True), self.squares(self.parts, True), self.weights)
+        return gain.sigmas > PART_SIGMAS and gain.db > MIN_DB
+
+    @cached_property
+    def _wet(self) -> Tensor | None:
+        """Share [T] of surfaces that rain has left wet; None where none falls, or nobody knows."""
+        wet = rained_on(self.weather, FILM_MM)
+        return wet if wet is not None and bool((wet > 0).any()) else None
 
     def gain(self, name: str) -> HeldOut:
         """What one of the parts gains beside the others."""
@@ -328,7 +353,8 @@ class Weathered:
         """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
         courses = self._endless if ENDLESS in parts else self._courses
         light = next((name for name in (SHADOWS, SKY_VIEW, ONE_LIGHT) if name in parts), None)
-        courses = (courses if light is None else self._lit(light))[winds, number]
+        courses = self._rained if RAIN in parts else courses if light is None else self._lit(light)
+        courses = courses[winds, number]
         names = ["start"]
         names += ["beam"] if "solar" in parts else []
         names += ["diffuse"] if "solar" in parts and ONE_LIGHT not in parts else []
@@ -385,6 +411,24 @@ class Weathered:
                 for number in range(len(RATES_PER_S))
             }
         return self._variants[light]
+
+    @cached_property
+    def _rained(self) -> dict[tuple[float, int], dict[str, Tensor]]:
+        """``_courses``, for the wind that there is, of surfaces that rain wets."""
+        drivers, wind = self._drivers
+        exchange, weather = (1.0 + self.wind * wind) / (1.0 + self.wind), self.weather
+        found_k, times = wetted(kelvin(weather.air_c), weather.humidity_percent, self._wet)
+        hastened = 1.0 + CONVECTS * (times - 1.0)
+        air = weather.air_c + CONVECTS * times * (celsius(found_k) - weather.air_c) / hastened
+        drivers = torch.cat([air[:, None], drivers[:, 1:]], 1), exchange * hastened
+        near, start = self._answers(drivers, math.inf, RATES_PER_S)
+        deep, _ = self._answers(drivers, math.inf, [DEEPER * rate for rate in RATES_PER_S])
+        return {
+            (self.wind, number): self._courses[self.wind, number]
+            | _named(near[number], start[number])
+            | {"deep air": deep[number, :, 0] - near[number, :, 0], "deep light": deep[number, :, 3]}
+            for number in range(len(RATES_PER_S))
+        }
 
     @cached_property
     def _variants(self) -> dict[str, dict[tuple[float, int], dict[str, Tensor]]]:
@@ -455,11 +499,12 @@ class Weathered:
 
         Args:
             drivers: as ``_drivers``.
+            winds: of WINDS; infinite where the second of ``drivers`` is the exchange itself.
             rates_per_s: R rates at the mean exchange.
         """
         drivers, wind = drivers
         times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
-        exchange = (1.0 + winds * wind) / (1.0 + winds)
+        exchange = wind if winds == math.inf else (1.0 + winds * wind) / (1.0 + winds)
         # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
         driven = torch.cat([exchange[:, None] * drivers[:, :1], drivers[:, 1:]], 1)
         driven = torch.cat(

@@ -24,7 +24,7 @@ STEP = 0.35  # of y that one substep covers, if they suffice
 FORGOTTEN = 1e-20  # share of the start that counts as none
 
 # Rows of the drivers of ``march``; those of effects that are off are not read.
-AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z, GROUND = range(9)
+AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z, GROUND, WETTED = range(10)
 START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 
 
@@ -42,6 +42,7 @@ class Balance:
         grounded: with light that the ground reflects.
         heated: with heat f from within, constant or from a room.
         cored: with a core behind the surface.
+        wetted: with water on it, which hastens its exchange with the air.
         sensitive: derivatives come with values.
     """
 
@@ -53,7 +54,13 @@ class Balance:
     grounded: bool
     heated: bool
     cored: bool
+    wetted: bool
     sensitive: bool
+
+    @property
+    def changing(self) -> bool:
+        """Whether the exchange with the air goes with time."""
+        return self.windy or self.wetted
 
     @property
     def share_column(self) -> int:
@@ -90,6 +97,7 @@ radiates, sunny = constant("radiates"), constant("sunny")
 windy, oriented, sensitive = constant("windy"), constant("oriented"), constant("sensitive")
 shaded, grounded = constant("shaded"), constant("grounded")
 heated, cored = constant("heated"), constant("cored")
+wetted, changing = constant("wetted"), constant("changing")
 share_column, sun_column = constant("share_column"), constant("sun_column")
 wind_column, inner_column = constant("wind_column"), constant("inner_column")
 core_column, normal_column = constant("core_column"), constant("normal_column")
@@ -207,11 +215,11 @@ def weights_of_lanes(y):
 
 
 @inline
-def _bent(balance, second, third, wind_d, air_d, x_d, p, steep, w_d):
-    """What a substep adds for products of wind and air, of wind and x, and for T⁴, by changes over the substep."""
+def _bent(balance, second, third, c_d, air_d, x_d, p, steep, w_d):
+    """What a substep adds for products of exchange and air, of exchange and x, and for T⁴, by changes over the substep."""
     rest, bent = x_d * 0.0, 2.0 * third
-    if windy(balance):
-        rest = wind_d * (air_d * (bent - second) - x_d * (bent - 0.5 * second))
+    if changing(balance):
+        rest = c_d * (air_d * (bent - second) - x_d * (bent - 0.5 * second))
     if radiates(balance):
         rest = rest + bent * p * (steep * x_d - w_d)
     return rest
@@ -341,6 +349,10 @@ def _march_group(
                 ending * (drivers[WIND_ANOMALY, k + 1] - drivers[WIND_ANOMALY, k]),
             )
             fastest = fastest + v * max(wind_1, wind_1 + wind_d)
+        wet_1, wet_d = 1.0, 0.0
+        if wetted(balance):
+            wet_1, wet_d = drivers[WETTED, k], ending * (drivers[WETTED, k + 1] - drivers[WETTED, k])
+            fastest = fastest * max(wet_1, wet_1 + wet_d)
         if radiates(balance):
             _, steep = power(x, inverse)
             fastest = (1.0 - p) * fastest + p * steep
@@ -377,6 +389,10 @@ def _march_group(
             if windy(balance):
                 wind, wind_2 = wind_1 + passed * wind_d, wind_1 + later * wind_d
                 c, c_2 = 1.0 + v * wind, 1.0 + v * wind_2
+            wet, wet_2 = one, one
+            if wetted(balance):
+                wet, wet_2 = wet_1 + passed * wet_d, wet_1 + later * wet_d
+                c, c_2 = c * wet, c_2 * wet_2
             if radiates(balance):
                 c, c_2 = (1.0 - p) * c, (1.0 - p) * c_2
             slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
@@ -398,8 +414,8 @@ def _march_group(
                 new = new + rh * phi[2] * follows
                 new_y = y + rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
             w_2 = w
-            if windy(balance) or radiates(balance):
-                # What is not linear in time or in x: the products of wind and air, and of wind and x, and T⁴.
+            if changing(balance) or radiates(balance):
+                # What is not linear in time or in x: the products of exchange and air, and of exchange and x, and T⁴.
                 linear, w_2 = new, w
                 if radiates(balance):
                     w_2, _ = power(new, inverse)
@@ -442,6 +458,8 @@ def _march_group(
                     calm, calm_2 = air - x, air_2 - new
                     if windy(balance):
                         calm, calm_2 = calm * (1.0 + v * wind), calm_2 * (1.0 + v * wind_2)
+                    if wetted(balance):
+                        calm, calm_2 = calm * wet, calm_2 * wet_2
                     d_share = _carried(
                         balance, going, d_share, decay, before, sky - w - calm, after, sky_2 - w_2 - calm_2
                     )
@@ -451,6 +469,8 @@ def _march_group(
                     gust, gust_2 = wind * (air - x), wind_2 * (air_2 - new)
                     if radiates(balance):
                         gust, gust_2 = (1.0 - p) * gust, (1.0 - p) * gust_2
+                    if wetted(balance):
+                        gust, gust_2 = gust * wet, gust_2 * wet_2
                     d_wind = _carried(balance, going, d_wind, decay, before, gust, after, gust_2)
                 if heated(balance):
                     lets_out = inner * indoors >= 0.0
@@ -498,7 +518,8 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
     """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
     dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x)) + f - max(f i, 0) x + κ (y - x)] and dy/dt = μ (x - y), with w from
-    ``power``, c = (1 - p) (1 + v wind_anomaly), G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky + (1 - a) around.
+    ``power``, c = (1 - p) (1 + v wind_anomaly) wetted, G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky +
+    (1 - a) around.
     Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal
     substeps, as many as the surface is fast. Lanes are Gaussians; what is found of one depends neither on the others nor on
     the other moments.
@@ -513,7 +534,7 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
         slots: [T] int64 direction of the beam at each sample.
         rows: [n] int64 rows of ``found`` that they fill.
         times: [T] float64 samples.
-        drivers: [9, T] float64.
+        drivers: [10, T] float64.
         reference: R in kelvin.
         indoors: i in 1/K, of 1 over the temperature of the room behind, above the reference; 0 where f is constant.
         moments: [F] float64, increasing, within the samples from ``first`` on.

@@ -163,6 +163,8 @@ class Drivers:
         ground: light that comes back from level ground, or None where it is black.
         ways: [D, 3] directions of the sun for which shadows are known, or None.
         room: ρ of the air behind walls, not 0, or None: heat from within is constant.
+        wetted: how many times as fast wet surfaces exchange heat with the air, which ``air`` then is as they find it
+            (heatsplat.physics.wetness), or None: all is dry. Only the full balance knows it.
     """
 
     times_s: Tensor
@@ -177,6 +179,7 @@ class Drivers:
     ground: Tensor | None = None
     ways: Tensor | None = None
     room: float | None = None
+    wetted: Tensor | None = None
 
 
 def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
@@ -213,6 +216,7 @@ class Climate:
         rows += [zero if drivers.wind_anomaly is None else drivers.wind_anomaly]
         rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
         rows.append(zero if drivers.ground is None else drivers.ground)
+        rows.append(zero if drivers.wetted is None else drivers.wetted)
         self.rows = torch.stack(rows).contiguous()
         self.slots = torch.zeros(len(zero), dtype=torch.int64)
         if drivers.ways is not None:

@@ -91,7 +91,7 @@ def march(
     if len(own):
         has = [value is not None for value in (surface.share, surface.sun, surface.wind, surface.normals)]
         has += [surface.exposure.sun is not None, climate.drivers.ground is not None]
-        has += [surface.inner is not None, surface.core is not None]
+        has += [surface.inner is not None, surface.core is not None, climate.drivers.wetted is not None]
         seen = given.new_empty(len(given), 0) if surface.exposure.sun is None else surface.exposure.sun.to(given)
         kernels.march(
             kernels.Balance(*has, sensitive),

@@ -20,6 +20,7 @@ from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
+from heatsplat.physics.wetness import rained_on, wetted
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
@@ -34,7 +35,7 @@ from heatsplat.thermal.base import (
 )
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.weather_drive import NO_CLOUDS
+from heatsplat.thermal.weather_drive import NO_CLOUDS, NO_RAIN
 
 log = logging.getLogger(__name__)
 
@@ -102,6 +103,8 @@ class EnergyBalance(ThermalModel):
         sky: law of the sky's temperature ("brutsaert", "berdahl_martin", "brunt", "swinbank"; "auto" is the first with
             humidity and the last without), or None: nothing radiates.
         clouds: whether the clouds of the record warm the sky (``Weather.clouds``); laws are of clear skies.
+        rain: millimetres of the record's rain that stay on surfaces until they have evaporated (heatsplat.physics.wetness),
+            with the full balance; None: rain leaves surfaces dry.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
@@ -141,6 +144,7 @@ class EnergyBalance(ThermalModel):
         nodes: int = 1,
         sky: str | None = "auto",
         clouds: bool = False,
+        rain: float | None = None,
         wind: bool = True,
         sun: bool = True,
         semi_infinite: bool = False,
@@ -181,6 +185,13 @@ class EnergyBalance(ThermalModel):
             raise ValueError(
                 "semi_infinite works only with the linearised balance: give solution=linear or semi_infinite=false"
             )
+        if rain is not None and not rain > 0:
+            raise ValueError(f"rain must be above 0 mm, or null for surfaces that stay dry, got {rain}")
+        if rain is not None and (solution != "corrected" or indoor_c is not None):
+            raise ValueError(
+                "rain works only with the full balance, and mean losses of walls leave it out: give solution=corrected and "
+                "indoor_c=null, or rain=null"
+            )
         if nodes == 2 and semi_infinite:
             raise ValueError("semi_infinite and nodes=2 exclude each other: give nodes=1 or semi_infinite=false")
         if convection is not None:
@@ -204,6 +215,7 @@ class EnergyBalance(ThermalModel):
         self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
         self.shadows, self.sky_view, self.albedo, self.share_prior = shadows, sky_view, albedo, share_prior
         self._sky, self._clouds, self._wind, self._sun, self.nodes = sky, clouds, wind, sun, nodes
+        self._rain = rain
         self.exchange, self._convection = exchange, convection
         self.convection_error, self._convects = convection_error, 1.0
         self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
@@ -504,6 +516,14 @@ class EnergyBalance(ThermalModel):
             raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
+        if self._rain is not None:
+            wet = rained_on(weather, self._rain)
+            if wet is None:
+                raise SceneError(f"the weather {NO_RAIN.format(self._rain)}")
+            if bool((wet > 0).any()):
+                air_k, parts["wetted"] = wetted(air_k, weather.humidity_percent, wet)
+            hours = float(driver_means(weather.times_s, wet)) * float(weather.times_s[-1] - weather.times_s[0]) / 3600.0
+            effects["convection"]["rain"] = f"{hours:.1f} h wet, with up to {self._rain:g} mm of water"
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
         return drivers, effects
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, rain_on
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -24,7 +24,7 @@ def evidence(inspected: Inspection) -> Evidence:
     # A balance that is solved about its mean alone has bodies with a core.
     weathered = inspected.weathered
     nodes = 1 if bent or weathered is None else weathered.nodes
-    settings = {"solution": "corrected" if bent else "linear", "nodes": nodes}
+    settings = {"solution": "corrected" if bent else "linear", "nodes": nodes} | rain_on(inspected)
     return replace(found, settings=settings | {"clouds": weathered is not None and weathered.clouded})
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, PART_SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, PART_SIGMAS, judged, rain_on
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -13,7 +15,8 @@ def evidence(inspected: Inspection) -> Evidence:
     weather = inspected.scene.weather
     if weather.irradiance_w_m2 is None or float(weather.irradiance_w_m2.max()) <= 0:
         return Evidence(None, NO_SUN)
-    return judged(inspected.weathered, "solar", inspected.obs.why or NO_BALANCE)
+    found = judged(inspected.weathered, "solar", inspected.obs.why or NO_BALANCE)
+    return replace(found, settings=rain_on(inspected))
 
 
 EFFECT = Effect(
