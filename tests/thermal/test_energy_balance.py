@@ -170,7 +170,7 @@ def test_clouds_close_the_sky_as_far_as_the_record_says(solution):
         ready(scene(nights), clouds=True)
 
 
-def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_trace_of_it():
+def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_trace_of_it(caplog):
     record = weather()
     shower = ((record.times_s >= 12 * HOUR) & (record.times_s <= 13 * HOUR)).double()
     model, splats = ready(scene(replace(record, rain_mm_h=2.0 * shower)), rain=0.3)
@@ -179,8 +179,9 @@ def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_tra
     colder = [dry.temperature(splats, t * HOUR) - model.temperature(splats, t * HOUR) for t in (11, 13, 29)]
     assert torch.equal(colder[0], torch.zeros(6)) and (colder[1] > 2.0).all() and (colder[2].abs() < 0.2).all()
     assert splats_of(model).state_dict().keys() == splats_of(dry).state_dict().keys()  # nothing of it is learned
-    with pytest.raises(SceneError, match="the weather tells no rain, which rain=0.3 needs: add rain_mm_h and humidity"):
-        ready(scene(record), rain=0.3)
+    untold, _ = ready(scene(record), rain=0.3)
+    assert untold.climate.drivers.wetted is None and "rain_mm_h" in untold.effects()["convection"]["left_out_rain"]
+    assert "surfaces stay dry" in caplog.text
 
 
 def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():

@@ -35,7 +35,7 @@ from heatsplat.thermal.base import (
 )
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.weather_drive import NO_CLOUDS, NO_RAIN
+from heatsplat.thermal.weather_drive import NO_CLOUDS
 
 log = logging.getLogger(__name__)
 
@@ -517,15 +517,27 @@ class EnergyBalance(ThermalModel):
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         if self._rain is not None:
-            wet = rained_on(weather, self._rain)
-            if wet is None:
-                raise SceneError(f"the weather {NO_RAIN.format(self._rain)}")
-            if bool((wet > 0).any()):
-                air_k, parts["wetted"] = wetted(air_k, weather.humidity_percent, wet)
-            hours = float(driver_means(weather.times_s, wet)) * float(weather.times_s[-1] - weather.times_s[0]) / 3600.0
-            effects["convection"]["rain"] = f"{hours:.1f} h wet, with up to {self._rain:g} mm of water"
+            air_k = self._rained_on(weather, air_k, parts, effects)
         drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
         return drivers, effects
+
+    def _rained_on(self, weather: Weather, air_k: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> Tensor:
+        """Temperature of the air that surfaces find; adds to the drivers how much sooner wet ones do, and tells the effect.
+
+        Another weather, such as a forecast, often has no column of rain.
+        """
+        wet = rained_on(weather, self._rain)
+        if wet is None:
+            effects["convection"]["left_out_rain"] = (
+                "rain, of which the weather has no rain_mm_h, or no humidity_percent"
+            )
+            log.warning("the weather has no rain_mm_h with humidity_percent: surfaces stay dry")
+            return air_k
+        hours = float(driver_means(weather.times_s, wet)) * float(weather.times_s[-1] - weather.times_s[0]) / 3600.0
+        effects["convection"]["rain"] = f"{hours:.1f} h wet, with up to {self._rain:g} mm of water"
+        if bool((wet > 0).any()):
+            air_k, parts["wetted"] = wetted(air_k, weather.humidity_percent, wet)
+        return air_k
 
     def _room(self) -> float | None:
         """Temperature behind walls above the reference."""

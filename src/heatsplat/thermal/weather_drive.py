@@ -15,7 +15,6 @@ NO_CLOUDS = (
     "tells no clouds, which clouds=true needs: add cloud_cover_percent, or irradiance with latitude and longitude, or give "
     "clouds=false for a clear sky"
 )
-NO_RAIN = "tells no rain, which rain={:g} needs: add rain_mm_h and humidity_percent, or give rain=null"
 
 
 def columns_at(weather: Weather, time_s: float) -> Tensor:
