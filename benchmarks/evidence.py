@@ -99,8 +99,9 @@ walls by balances of bodies with one rate, with a core, and of infinite depth.
 
 **Undecided effects.** An effect **cannot be told** if it fails these tests, if another effect would take its place, or if the
 record has too few frames. Its reason says what would be needed. It is then simulated only if the joint fit selected it as the
-best available explanation of the images. The run's report lists the gain in dB and the cost in ms of each effect;
-`effects.least_db_per_ms` sets a minimum ratio.
+best available explanation of the images; gains of single images (AGC) not even then under recorded weather. On four such
+scenes without AGC, the error on another day is 0.28 to 0.74 of what it is with them (0.71 to 2.46 instead of 1.1 to 3.5 °C).
+The run's report lists the gain in dB and the cost in ms of each effect; `effects.least_db_per_ms` sets a minimum ratio.
 
 ## Selections
 

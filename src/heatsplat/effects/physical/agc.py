@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from torch import Tensor
 
@@ -16,13 +17,20 @@ from heatsplat.effects.physical.frame_offset import NOT_COMMON, common_to_all, i
 
 
 def evidence(inspected: Inspection) -> Evidence:
-    """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent."""
+    """Whether each image has a gain of its own; beside a bent curve it only makes up for how that one is bent.
+
+    Contrast outdoors swings with the sun, and gains that follow it take up what balances of heat leave out: while it cannot be
+    told whether they are there, images of another day are foreseen better without (docs/effects.md).
+    """
     if outdone(inspected, "agc", {"frame_offset", "tone"}):
         found = "what looks like gains of single images is a bent curve along which they shift"
         doubts = inspected.certainty.doubts
         doubt = doubts.get("agc") or doubts.get("tone")
         return Evidence(None, f"{found}, if it is: {doubt}", told=False) if doubt else Evidence(0.0, found)
-    return gained(inspected, "agc", "gains of single images change values by")
+    found = gained(inspected, "agc", "gains of single images change values by")
+    if found.told or inspected.weathered is None:
+        return found
+    return replace(found, reason=f"{found.reason}; left out beside recorded weather", gain_db=None)
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
