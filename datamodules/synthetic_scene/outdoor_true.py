@@ -1,10 +1,10 @@
 """The yard of ``outdoor`` as no model here assumes it: cast shadows, layers, clouds, rain, reflected sky, a heated house.
 
-What differs from ``outdoor``, all of it unknown to the methods: objects cast shadows on each other and hide the sky; light of
-the sky is brighter about the sun, and the ground reflects; clouds warm the sky's long waves, and what is not sky is as warm as
-the meadow; bodies have several layers, with rooms, a cabin or the deep ground behind them; rain falls, dew forms, grass
-transpires; and the camera sees the sky and its neighbours mirrored in what does not emit. A method is told a weather table as
-in ``outdoor``, and with it how much rain fell.
+What differs from ``outdoor``, all but the rain unknown to the methods: objects cast shadows on each other and hide the sky;
+light of the sky is brighter about the sun, and the ground reflects; clouds warm the sky's long waves, and what is not sky is as
+warm as the meadow; bodies have several layers, with rooms, a cabin or the deep ground behind them; rain falls, dew forms,
+grass transpires; and the camera sees the sky and its neighbours mirrored in what does not emit. A method is told a weather
+table as in ``outdoor``, and with it how much rain fell.
 """
 
 from __future__ import annotations
@@ -182,8 +182,7 @@ def true_weather(name: str, duration_s: float) -> Weather:
 
 def _raining(times_s: np.ndarray) -> np.ndarray:
     """1 during showers, 0 without, [T]."""
-    hours = times_s / 3600.0
-    return np.max([(hours >= start) & (hours <= end) for start, end, _ in SHOWERS], axis=0).astype(np.float64)
+    return (rain_mm_h(times_s) > 0).astype(np.float64)
 
 
 def rain_mm_h(times_s: np.ndarray) -> np.ndarray:

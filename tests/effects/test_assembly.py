@@ -245,6 +245,8 @@ def test_what_stands_on_others_brings_all_of_them_or_goes_with_them():
     shaded = verdicts("shadows")
     assert names_on(assembly.reconcile(shaded)) == {"shadows", "solar", "relaxation"}
     assert names_on(assembly.reconcile(verdicts("shadows", "solar", "agc"), {"relaxation": "off"})) == {"agc"}
+    with pytest.raises(SceneError, match="effects.relaxation=off is not possible: solar stands on it"):
+        assembly.reconcile(verdicts("shadows", "solar"), {"relaxation": "off", "shadows": "on"})
 
 
 def test_the_log_tells_verdict_statistic_price_and_reason():

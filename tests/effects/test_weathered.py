@@ -108,10 +108,10 @@ def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof():
     def showers(hours):
         return 2.0 * (((hours > 3) & (hours < 4)) | ((hours > 11) & (hours < 13))).double()
 
-    assert recorded(rain=showers).rained_on
-    assert not recorded(rain=showers, without="rain").rained_on
-    assert not recorded(rain=lambda hours: 0.0 * hours).rained_on
-    assert not recorded().rained_on
+    assert recorded(rain=showers).rained
+    assert not recorded(rain=showers, without="rain").rained
+    assert not recorded(rain=lambda hours: 0.0 * hours).rained
+    assert not recorded().rained
 
 
 def test_a_body_with_a_core_has_two_nodes():

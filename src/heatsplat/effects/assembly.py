@@ -119,17 +119,19 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
                 turn(other, False, f"{name} was asked for, and the two exclude each other")
         elif others:
             turn(name, False, _effect(others[0]).displaces[name])
-    barred, waiting = {name for name, choice in given.items() if choice == "off"}, _on(found)
+    barred, wanted = ({name for name, choice in given.items() if choice == said} for said in ("off", "on"))
+    waiting = _on(found)
     while waiting:
         name = waiting.pop(0)
         ground = _effect(name).stands_on
         if ground is None or found[ground].on:
             continue
-        if ground in barred and given.get(name) != "on":
+        if ground in barred and name not in wanted:
             turn(name, False, f"it stands on {ground}, which is off")
             barred.add(name)
         else:
             turn(ground, True, f"{name} stands on it")
+            wanted |= {ground} if name in wanted else set()
             waiting.append(ground)
     return found
 

@@ -108,7 +108,7 @@ def rain_on(inspected: Inspection) -> dict[str, float | None]:
     """What the state of a scene is told of rain: of how many mm surfaces keep, None for none. Only a balance that is solved as it
     stands knows it."""
     weathered, obs = inspected.weathered, inspected.obs
-    wet = weathered is not None and obs.tracks is not None and weather_record.bent(obs) and weathered.rained_on
+    wet = weathered is not None and obs.tracks is not None and weather_record.bent(obs) and weathered.rained
     return {"rain": FILM_MM if wet else None}
 
 
@@ -179,7 +179,7 @@ class Weathered:
         return gain.sigmas > SIGMAS and gain.db > MIN_DB
 
     @cached_property
-    def rained_on(self) -> bool:
+    def rained(self) -> bool:
         """Whether surfaces that the record's rain wets explain observations better that were left out than dry ones do."""
         if self._wet is None:
             return False
@@ -353,7 +353,7 @@ class Weathered:
         """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
         courses = self._endless if ENDLESS in parts else self._courses
         light = next((name for name in (SHADOWS, SKY_VIEW, ONE_LIGHT) if name in parts), None)
-        courses = self._rained if RAIN in parts else courses if light is None else self._lit(light)
+        courses = self._wet_courses if RAIN in parts else courses if light is None else self._lit(light)
         courses = courses[winds, number]
         names = ["start"]
         names += ["beam"] if "solar" in parts else []
@@ -373,8 +373,8 @@ class Weathered:
         """Answers to air, light and sky at the frames' times by wind and rate, each [F] or [P, F]."""
         courses = {}
         for winds in WINDS:
-            near, start = self._answers(self._drivers, winds, RATES_PER_S)
-            deep, _ = self._answers(self._drivers, winds, [DEEPER * rate for rate in RATES_PER_S])
+            near, start = self._answers(self._drivers[0], self._exchange(winds), RATES_PER_S)
+            deep, _ = self._answers(self._drivers[0], self._exchange(winds), [DEEPER * rate for rate in RATES_PER_S])
             for number in range(len(RATES_PER_S)):
                 cores = {"deep air": deep[number, :, 0] - near[number, :, 0], "deep light": deep[number, :, 3]}
                 courses[winds, number] = _named(near[number], start[number]) | cores
@@ -405,7 +405,7 @@ class Weathered:
                 # Of an even sky a level surface takes all, a wall a half.
                 beams = beams + self._drivers[0][:, 2:3] * facing.mean(1) / (weather.up @ ways.T).mean()
             drivers = torch.cat([self._drivers[0][:, :BEAMS], beams], 1)
-            near, _ = self._answers((drivers, self._drivers[1]), self.wind, RATES_PER_S)
+            near, _ = self._answers(drivers, self._exchange(self.wind), RATES_PER_S)
             self._variants[light] = {
                 (self.wind, number): self._courses[self.wind, number] | {"beam": near[number, :, BEAMS:].T}
                 for number in range(len(RATES_PER_S))
@@ -413,16 +413,15 @@ class Weathered:
         return self._variants[light]
 
     @cached_property
-    def _rained(self) -> dict[tuple[float, int], dict[str, Tensor]]:
+    def _wet_courses(self) -> dict[tuple[float, int], dict[str, Tensor]]:
         """``_courses``, for the wind that there is, of surfaces that rain wets."""
-        drivers, wind = self._drivers
-        exchange, weather = (1.0 + self.wind * wind) / (1.0 + self.wind), self.weather
+        weather = self.weather
         found_k, times = wetted(kelvin(weather.air_c), weather.humidity_percent, self._wet)
         hastened = 1.0 + CONVECTS * (times - 1.0)
         air = weather.air_c + CONVECTS * times * (celsius(found_k) - weather.air_c) / hastened
-        drivers = torch.cat([air[:, None], drivers[:, 1:]], 1), exchange * hastened
-        near, start = self._answers(drivers, math.inf, RATES_PER_S)
-        deep, _ = self._answers(drivers, math.inf, [DEEPER * rate for rate in RATES_PER_S])
+        drivers, exchange = torch.cat([air[:, None], self._drivers[0][:, 1:]], 1), self._exchange(self.wind) * hastened
+        near, start = self._answers(drivers, exchange, RATES_PER_S)
+        deep, _ = self._answers(drivers, exchange, [DEEPER * rate for rate in RATES_PER_S])
         return {
             (self.wind, number): self._courses[self.wind, number]
             | _named(near[number], start[number])
@@ -453,7 +452,7 @@ class Weathered:
         rates = [RATES_PER_S[-1] * 2.0**place for place in range(-OCTAVES, len(RATES_PER_S) + OCTAVES)]
         courses = {}
         for winds in WINDS:
-            near, start = self._answers(self._drivers, winds, rates)
+            near, start = self._answers(self._drivers[0], self._exchange(winds), rates)
             for number, rate in enumerate(RATES_PER_S):
                 distances = torch.tensor([math.log(other / rate) for other in rates], dtype=torch.float64)
                 counts = semi_infinite_weights(distances, octave)
@@ -492,19 +491,19 @@ class Weathered:
         law = "swinbank" if humidity is None else "brutsaert"
         return sky_temperature_k(kelvin(self.weather.air_c), humidity, law, clouds)
 
-    def _answers(
-        self, drivers: tuple[Tensor, Tensor], winds: float, rates_per_s: Sequence[float]
-    ) -> tuple[Tensor, Tensor]:
+    def _exchange(self, winds: float) -> Tensor:
+        """Exchange [T] with the air over that at mean wind, to which wind adds so much (WINDS)."""
+        return (1.0 + winds * self._drivers[1]) / (1.0 + winds)
+
+    def _answers(self, drivers: Tensor, exchange: Tensor, rates_per_s: Sequence[float]) -> tuple[Tensor, Tensor]:
         """u' = rate · gain · driver - rate · exchange · u at the frames' times [R, F, d], from rest; and the decay [R, F] from 1.
 
         Args:
-            drivers: as ``_drivers``.
-            winds: of WINDS; infinite where the second of ``drivers`` is the exchange itself.
+            drivers: [T, d] as those of ``_drivers``.
+            exchange: [T] as ``_exchange``.
             rates_per_s: R rates at the mean exchange.
         """
-        drivers, wind = drivers
         times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
-        exchange = wind if winds == math.inf else (1.0 + winds * wind) / (1.0 + winds)
         # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
         driven = torch.cat([exchange[:, None] * drivers[:, :1], drivers[:, 1:]], 1)
         driven = torch.cat(

@@ -31,6 +31,9 @@ looks at the same tables, nothing is stepped.
 A body without an end (massive wall, ground) takes the heat in by its effusivity b = √(k ρ c), and a = (H / b)² in 1/s stands
 in the place of r: it follows the same drivers, through the table of ``responses.SemiInfiniteTable``.
 
+Rain that has wetted a surface multiplies its exchange with the air, (1 - p)(1 + v b), and sets it off against an air as cold as
+the wet bulb (heatsplat.physics.wetness).
+
 A constant heat q from within (a heated room behind a wall) adds f = q / H, in kelvin, to the drivers. Where the temperature ρ
 of that room is known (above the reference), heat comes of it by a constant conductance instead, f (1 - x/ρ) with f what it
 is at x = 0: a light wall lets out a tenth more by night than in the mean of the day. Heat that goes the other way (ground)

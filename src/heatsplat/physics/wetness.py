@@ -32,13 +32,13 @@ BISECTIONS, COLDEST_K = 40, 60.0  # below the air, from which the wet bulb is so
 
 
 def vapour_kg_m3(air_k: Tensor, humidity_percent: Tensor | float = 100.0) -> Tensor:
-    """Density of water vapour in air."""
+    """Density of water vapour in air of a relative humidity, of any shape; of saturated air by default."""
     hpa = vapour_pressure_hpa(air_k, torch.as_tensor(humidity_percent, dtype=air_k.dtype))
     return 100.0 * hpa / (VAPOUR_J_KG_K * air_k)
 
 
 def wet_bulb_k(air_k: Tensor, humidity_percent: Tensor) -> Tensor:
-    """Temperature of a surface that is wet all over and exchanges heat with the air alone."""
+    """Temperature of a surface that is wet all over and exchanges heat with the air alone, of any shape (Lewis 1922)."""
     vapour, high = vapour_kg_m3(air_k, humidity_percent), air_k
     low = air_k - COLDEST_K
     for _ in range(BISECTIONS):
@@ -89,7 +89,8 @@ def rained_on(weather: Weather, film_mm: float) -> Tensor | None:
 
 
 def wetted(air_k: Tensor, humidity_percent: Tensor, wet: Tensor) -> tuple[Tensor, Tensor]:
-    """Temperature of the air that a surface finds of which a share is wet, and how many times as fast it exchanges heat."""
+    """Temperature T_eq of the air that a surface finds of which a share ``wet`` in [0, 1] is wet, and how many times as fast it
+    exchanges heat, 1 + w s; of any shape."""
     gain = LATENT_J_KG / AIR_J_M3_K
     bulb = wet_bulb_k(air_k, humidity_percent)
     lacks = gain * (vapour_kg_m3(air_k) - vapour_kg_m3(air_k, humidity_percent))

@@ -104,7 +104,7 @@ class EnergyBalance(ThermalModel):
             humidity and the last without), or None: nothing radiates.
         clouds: whether the clouds of the record warm the sky (``Weather.clouds``); laws are of clear skies.
         rain: millimetres of the record's rain that stay on surfaces until they have evaporated (heatsplat.physics.wetness),
-            with the full balance; None: rain leaves surfaces dry.
+            with the full balance; None: rain leaves surfaces dry, as does a weather without rain_mm_h.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
