@@ -121,10 +121,11 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64; where the depth is not positive they lie
-        behind the camera and the pixel means nothing."""
-        local = points.to(self.viewmat) @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        return (local @ self.K.T)[:, :2] / local[:, 2:].clamp_min(1e-12), local[:, 2]
+        """Pixel coordinates [n, 2] and depths [n] of world points [n, 3], float64, on the device of the points; where the
+        depth is not positive they lie behind the camera and the pixel means nothing."""
+        viewmat, K = self.viewmat.to(points.device), self.K.to(points.device)
+        local = points.to(viewmat) @ viewmat[:3, :3].T + viewmat[:3, 3]
+        return (local @ K.T)[:, :2] / local[:, 2:].clamp_min(1e-12), local[:, 2]
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera on a grid of ``width`` x ``height`` pixels; intrinsics scale by the actual pixel counts."""
