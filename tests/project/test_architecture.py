@@ -84,6 +84,7 @@ DOORS = {
     "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io", "preparation"},
     "numba": {"kernels"},
     "gsplat": {"renderers"},
+    "triton": {"kernels/gpu"},
 }
 
 

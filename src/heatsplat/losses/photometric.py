@@ -1,7 +1,7 @@
 """The photometric loss of 3D Gaussian splatting: (1 - w) L1 + w (1 - SSIM).
 
 The functions ``l1`` and ``ssim_map`` are plain torch and unreduced, so that callers mask and average as they need; they
-are also the oracle of the fused kernel that ``Photometric`` uses on the CPU.
+are also the oracle of the fused kernels that ``Photometric`` uses on the CPU and on CUDA.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from heatsplat.kernels import gpu
 from heatsplat.kernels import ssim as kernel
 from heatsplat.losses.compose import LossInputs
 
@@ -100,9 +101,9 @@ class Photometric:
             )
         if mask is not None and mask.shape != target.shape[:2]:
             raise ValueError(f"mask must be {list(target.shape[:2])} like the images, got {list(mask.shape)}")
-        on_cpu = prediction.device.type == "cpu" and prediction.dtype == target.dtype == torch.float32
-        if on_cpu and self.dssim_weight > 0.0:
-            difference, dissimilarity = _Fused.apply(prediction, target, mask, self.l1_weight, self.dssim_weight)
+        fused = _kernels_for(prediction, target)
+        if fused is not None and self.dssim_weight > 0.0:
+            difference, dissimilarity = fused.apply(prediction, target, mask, self.l1_weight, self.dssim_weight)
             return {"l1": difference, "dssim": dissimilarity}
         if mask is not None:
             prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))
@@ -122,6 +123,15 @@ def _mean(image: Tensor, mask: Tensor | None) -> Tensor:
 def _padded(image: Tensor, value: float) -> Tensor:
     """An image [H, W, C] with a border of half a window, [1, C, H + 10, W + 10]."""
     return functional.pad(image.permute(2, 0, 1)[None], (WINDOW // 2,) * 4, value=value)
+
+
+def _kernels_for(prediction: Tensor, target: Tensor) -> type[torch.autograd.Function] | None:
+    """The fused form of both terms for these images, or None."""
+    if prediction.dtype != torch.float32 or target.dtype != torch.float32:
+        return None
+    if prediction.device.type == "cpu":
+        return _Fused
+    return _FusedOnCuda if prediction.is_cuda and gpu.available() else None
 
 
 _TAPS = window().numpy()
@@ -171,3 +181,86 @@ def _coverage(mask: Tensor, channels: int) -> tuple[Tensor, Tensor]:
 def _everywhere(height: int, width: int, channels: int) -> tuple[Tensor, Tensor]:
     """``_coverage`` of an image without a mask; the same at every step."""
     return _coverage(torch.ones(height, width, dtype=torch.bool), channels)
+
+
+class _FusedOnCuda(torch.autograd.Function):
+    """As ``_Fused``, in four launches of its own and a few to sum."""
+
+    @staticmethod
+    def forward(ctx, prediction, target, mask, *weights):
+        from heatsplat.kernels.gpu import ssim as on_cuda  # here, for Triton is not everywhere
+
+        prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
+        height, width, channels = prediction.shape
+        line, device = width * channels, prediction.device
+        shift = target.mean() if mask is None else _mean(target, mask).mean()
+        if mask is None:
+            taps, valid, outside = _everywhere_on(device, height, width, channels)
+            weights = _numbers(device, *(weight / max(prediction.numel(), 1) for weight in weights))
+        else:
+            taps, valid, outside = _coverage_on(mask, channels)
+            weights = _numbers(device, *weights) / (mask.sum() * channels).clamp(min=1)
+        blocks = -(-line // on_cuda.BLOCK)
+        moments, slopes = prediction.new_empty(5, height, line), prediction.new_empty(3, height, line)
+        sums = prediction.new_empty(2, height * blocks)
+        block, numbers = on_cuda.BLOCK, height * line
+        on_cuda.moments_of_rows[height, blocks](
+            prediction, target, valid, shift, taps, moments, line, numbers, CHANNELS=channels, BLOCK=block
+        )
+        on_cuda.similarity[height, blocks](
+            prediction,
+            target,
+            valid,
+            outside,
+            shift,
+            taps,
+            moments,
+            slopes,
+            sums,
+            line,
+            height,
+            numbers,
+            blocks,
+            BLOCK=block,
+        )
+        ctx.save_for_backward(prediction, target, valid, shift, taps, moments, slopes, weights)
+        return (weights * sums.sum(1)).unbind()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_difference, v_dissimilarity):
+        from heatsplat.kernels.gpu import ssim as on_cuda
+
+        prediction, target, valid, shift, taps, moments, slopes, weights = ctx.saved_tensors
+        height, width, channels = prediction.shape
+        line = width * channels
+        blocks, numbers = -(-line // on_cuda.BLOCK), height * line
+        block = on_cuda.BLOCK
+        blurred, v_prediction = moments[:3], torch.empty_like(prediction)  # nobody reads the moments any more
+        on_cuda.slopes_of_rows[height, blocks](slopes, taps, blurred, line, numbers, CHANNELS=channels, BLOCK=block)
+        on_cuda.gradient[height, blocks](
+            prediction, target, valid, shift, taps, blurred, weights, v_difference, v_dissimilarity, v_prediction, line,
+            height, numbers, BLOCK=block,
+        )  # fmt: skip
+        return v_prediction, None, None, None, None
+
+
+def _coverage_on(mask: Tensor, channels: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The taps of the window, and ``_coverage`` on the device of the mask."""
+    taps = window(device=mask.device)
+    row = taps.expand(1, 1, 1, WINDOW)
+    beyond = _padded((~mask[..., None]).float(), 1.0)
+    outside = functional.conv2d(functional.conv2d(beyond, row), row.transpose(2, 3))[0, 0]
+    return taps, *(
+        plane.repeat_interleave(channels).contiguous() for plane in (mask.float().view(-1), outside.view(-1))
+    )
+
+
+@lru_cache(maxsize=4)
+def _everywhere_on(device: torch.device, height: int, width: int, channels: int) -> tuple[Tensor, Tensor, Tensor]:
+    return _coverage_on(torch.ones(height, width, dtype=torch.bool, device=device), channels)
+
+
+@lru_cache(maxsize=16)
+def _numbers(device: torch.device, *numbers: float) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float32, device=device)

@@ -1,6 +1,7 @@
 """Temperatures of the Gaussians in view: the closed form of relaxation.py for rows of per-Gaussian tensors.
 
-On a CPU it runs in a fused kernel (heatsplat.kernels.relaxation), elsewhere in plain torch.
+On a CPU it runs in a fused kernel (heatsplat.kernels.relaxation), as it does in float32 on CUDA (heatsplat.kernels.gpu),
+elsewhere in plain torch.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from heatsplat.kernels import gpu
 from heatsplat.kernels import relaxation as kernels
 from heatsplat.kernels.simd import LANES
 from heatsplat.physics.relaxation import BACKWARD_TIME_CONSTANTS, harmonic_response, relax
@@ -71,14 +73,22 @@ def visible_temperature(
         return _VisibleTemperature.apply(
             time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places, log_bounds
         )
+    if rate.is_cuda and rate.dtype == torch.float32 and gpu.available():
+        on_cpu = omega.cpu()
+        if _no_omega_vanishes(on_cpu):
+            return _VisibleTemperatureOnCuda.apply(
+                time, ambient, initial, rate, on_cpu, gains, inverse_capacity, ids, places, log_bounds
+            )
     rate = rate if log_bounds is None else rate.clamp(*log_bounds).exp()
     return _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
 
 
 def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
-    """Whether the kernel can be used: on a CPU, and no ω of (almost) zero."""
-    if rate.device.type != "cpu" or rate.dtype not in NUMPY_TYPES:
-        return False
+    """Whether the CPU's kernel can be used: on a CPU, and no ω of (almost) zero."""
+    return rate.device.type == "cpu" and rate.dtype in NUMPY_TYPES and _no_omega_vanishes(omega)
+
+
+def _no_omega_vanishes(omega: Tensor) -> bool:
     return omega.numel() == 0 or np.abs(omega.numpy()).min() >= SMALLEST_OMEGA
 
 
@@ -256,4 +266,54 @@ class _VisibleTemperature(torch.autograd.Function):
                 v_gains = unwritten.written(gains.shape)
         v_ambient = v_ambient.sum() if wanted[1] else None
         v_scale = v_scale if wanted[6] else None
+        return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None, None
+
+
+class _VisibleTemperatureOnCuda(torch.autograd.Function):
+    """The same in two launches and a table of frequencies that is made on the CPU. Gradients have all rows here too."""
+
+    @staticmethod
+    def forward(ctx, time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places, log_bounds) -> Tensor:
+        from heatsplat.kernels.gpu import relaxation as on_cuda  # here, for Triton is not everywhere
+
+        count = rate.shape[0]
+        ids = torch.arange(count, device=rate.device) if ids is None else ids
+        seconds, frequencies = time.item(), 0 if gains is None else gains.shape[2]
+        table = np.empty((kernels.TABLE_ROWS, max(frequencies, 1)), np.float32)
+        kernels.fill_table(omega.numpy()[:frequencies], seconds, table)
+        table = torch.from_numpy(table).to(rate.device, non_blocking=True)
+        values, sloping = rate.new_empty(len(ids)), any(ctx.needs_input_grad)
+        slopes = rate.new_empty(on_cuda.SLOPES, len(ids) if sloping else 0)
+        low, high = (0.0, 0.0) if log_bounds is None else log_bounds
+        initial, rate, ids = initial.contiguous(), rate.contiguous(), ids.contiguous()
+        gains, scale, places = (None if x is None else x.contiguous() for x in (gains, inverse_capacity, places))
+        has = {"HEATED": frequencies > 0, "PLACED": places is not None, "SCALED": scale is not None}
+        size = {"BLOCK": on_cuda.BLOCK, "WIDTH": max(16, 1 << (frequencies - 1).bit_length())}
+        if len(ids) > 0:
+            on_cuda.forward[on_cuda.programs(len(ids))](
+                rate, initial, ambient, gains, places, scale, ids, table, values, slopes, len(ids), frequencies,
+                table.shape[1], seconds, BACKWARD_TIME_CONSTANTS / -seconds if seconds < 0 else math.inf, low, high,
+                BOUNDED=log_bounds is not None, SLOPING=sloping, **has, **size,
+            )  # fmt: skip
+        ctx.save_for_backward(rate, initial, gains, scale, places, ids, table, slopes)
+        ctx.seconds, ctx.options = seconds, has | size
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_values: Tensor):
+        from heatsplat.kernels.gpu import relaxation as on_cuda
+
+        rate, initial, gains, scale, places, ids, table, slopes = ctx.saved_tensors
+        grid = on_cuda.programs(len(ids))
+        v_ambient = rate.new_empty(grid)
+        v_rate, v_initial, v_scale, v_gains = (
+            None if x is None else torch.zeros_like(x) for x in (rate, initial, scale, gains)
+        )
+        if len(ids) > 0:
+            on_cuda.backward[grid](
+                slopes, v_values.contiguous(), places, scale, ids, table, v_rate, v_initial, v_ambient, v_scale, v_gains,
+                len(ids), 0 if gains is None else gains.shape[2], table.shape[1], ctx.seconds, **ctx.options,
+            )  # fmt: skip
+        v_ambient = v_ambient.sum() if ctx.needs_input_grad[1] else None
         return None, v_ambient, v_initial, v_rate, None, v_gains, v_scale, None, None, None

@@ -51,13 +51,14 @@ def render(inputs: RenderInputs) -> RenderOutput:
 
     radii, means2d, depths, conics, compensations = _project(kernels, inputs)
     ids = (radii[0] > 0).all(dim=1).nonzero().squeeze(1)
-    means2d = means2d[0]
+    # Squeezed and unbound rather than indexed, whose gradient is a tensor of zeros and a copy into it.
+    means2d, depths = means2d.squeeze(0), depths.squeeze(0)
     if means2d.requires_grad:
         means2d.retain_grad()
 
     features, channels = _features_and_channels(inputs, ids)
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
-    _, pairs, order = kernels.intersect(means2d[None], radii, depths, TILE, columns, rows)
+    _, pairs, order = kernels.intersect(means2d[None], radii, depths[None], TILE, columns, rows)
     starts = kernels.offsets(pairs, 1, columns, rows)
 
     parts: list[Tensor] = []  # gsplat leaves the absolute gradients of each call on the centres that it was given
@@ -79,26 +80,30 @@ def render(inputs: RenderInputs) -> RenderOutput:
                 backgrounds=None if ground is None else ground[None],
                 absgrad=inputs.absgrad,
             )
-            images.append(image[0])
-            alphas.append(alpha[0, ..., 0])
-        return torch.cat(images, dim=2), alphas[0]
+            images.append(image.squeeze(0))
+            alphas.append(alpha.squeeze(-1).squeeze(0))
+        return images[0] if len(images) == 1 else torch.cat(images, dim=2), alphas[0]
 
     images, alphas, depth = [], [], None
-    for m, (values, behind) in enumerate(_in_groups(features, inputs.background, channels)):
-        opacities = inputs.opacities[m] * compensations[0] if inputs.antialiased else inputs.opacities[m]
+    modalities = zip(inputs.opacities.unbind(), _in_groups(features, inputs.background, channels), strict=True)
+    for m, (opacities, (values, behind)) in enumerate(modalities):
+        if inputs.antialiased:
+            opacities = opacities * compensations.squeeze(0)
         with_depth = inputs.depth and m == 0
         if with_depth:  # one more channel of the first modality, with nothing behind it
-            values = torch.cat([values, depths[0, :, None]], dim=1)
+            values = torch.cat([values, depths[:, None]], dim=1)
             behind = None if behind is None else torch.cat([behind, behind.new_zeros(1)])
         image, alpha = composite(values, opacities, behind)
         if with_depth:
-            image, depth = image[..., :-1], image[..., -1]
+            image, depth = image.split([image.shape[2] - 1, 1], dim=2)
+            depth = depth.squeeze(2)
         images.append(image)
         alphas.append(alpha)
     if inputs.absgrad and means2d.requires_grad:
         _gather_absgrad(means2d, parts)
     meta = {"means2d": means2d, "radii": radii[0], "visible_ids": ids}
-    return RenderOutput(torch.cat(images, dim=2), torch.stack(alphas), depth, meta)
+    image = images[0] if len(images) == 1 else torch.cat(images, dim=2)
+    return RenderOutput(image, torch.stack(alphas), depth, meta)
 
 
 def _project(kernels: Kernels, inputs: RenderInputs) -> tuple[Tensor, ...]:
