@@ -82,6 +82,15 @@ def still_scene(scene: dict[str, Any]) -> SceneData:
     )
 
 
+@torch.no_grad()
+def at_home(module: Any, scene: dict[str, Any]) -> None:
+    """Gives the Gaussians of a module the places and shapes of those of ``scenes.build``."""
+    module.splats["means"].copy_(scene["means"])
+    module.splats["log_scales"].copy_(scene["scales"].log())
+    module.splats["quats"].copy_(scene["quats"])
+    module.splats["opacity_logits"].copy_(scene["opacities"].reshape(-1, len(scene["means"])).T.logit())
+
+
 class StepClock:
     """Seconds of the parts of each step: of the functions it stands before, while it is entered.
 
@@ -175,11 +184,7 @@ def time_steps(overrides: Sequence[str], scene: dict[str, Any], steps: int, outp
     config = compose([*STILL, f"max_steps={steps + WARM_UP + 1}", *overrides])
     module, views = build_module(config, output_dir), still_scene(scene)
     module.attach(views)
-    with torch.no_grad():
-        module.splats["means"].copy_(scene["means"])
-        module.splats["log_scales"].copy_(scene["scales"].log())
-        module.splats["quats"].copy_(scene["quats"])
-        module.splats["opacity_logits"].copy_(scene["opacities"].reshape(-1, len(scene["means"])).T.logit())
+    at_home(module, scene)
     trainer = build_trainer(config["trainer"], config, output_dir)
     with StepClock(module) as clock:
         trainer.fit(module, train_dataloaders=DataLoader(views.train, batch_size=None, num_workers=0))

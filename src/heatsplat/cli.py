@@ -285,11 +285,13 @@ def check_first(ckpt: str) -> None:
 @_job
 def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     """Measures the test views of a checkpoint. Returns the test PSNR."""
+    from heatsplat.runs.device import device_of
     from heatsplat.runs.run import build_trainer, load
 
     prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
-    trainer = build_trainer(trained.config["trainer"] | {"accelerator": config["accelerator"]}, config, output_dir)
+    device = device_of(config["accelerator"], trained.config["renderer"])
+    trainer = build_trainer(trained.config["trainer"] | {"accelerator": device}, config, output_dir)
     trainer.test(trained.module, datamodule=trained.data, verbose=False)
     return trained.module.results.test.get("psnr")
 

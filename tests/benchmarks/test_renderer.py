@@ -8,10 +8,11 @@ import torch
 from omegaconf import OmegaConf
 from running import compose_run
 
-from benchmarks.renderer import fused, peers
+from benchmarks.renderer import fused, on_cuda, peers
 from benchmarks.renderer.floors import Machine, Work
 from benchmarks.renderer.scenes import Case, build
 from heatsplat import cli
+from heatsplat.contracts import SceneError
 from heatsplat.kernels.scheduling import thread_count, use_threads
 from heatsplat.renderers import rasterization
 
@@ -62,6 +63,16 @@ def test_pairs_of_what_is_fused_run():
     for pair in (fused.adam_pair, fused.group_pair, fused.maps_pair):
         times = {name: timed()[0] for name, timed in pair(case).items()}
         assert len(times) == 2 and min(times.values()) > 0
+
+
+def test_the_study_of_cuda_times_steps_and_refuses_a_machine_without(tmp_path, monkeypatch):
+    tables = on_cuda.run(tmp_path, [(300, 32, 24)], 2, {"etgs": ["method=etgs", "preset=fast"]}, device="cpu")
+    (row,) = tables["steps"]
+    assert row["method"] == "etgs" and row["ms"] > 0 and row["plain torch ms"] > 0 and tables["renderer"] == []
+    assert "etgs" in (tmp_path / "cuda.md").read_text()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SceneError, match="study=cuda times steps on CUDA.*study=steps is for the CPU"):
+        on_cuda.run(tmp_path, [(300, 32, 24)], 2, {})
 
 
 @pytest.mark.slow

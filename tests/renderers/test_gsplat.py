@@ -113,7 +113,10 @@ def stand_ins(monkeypatch):
     module = ModuleType("gsplat")
     for function in (fully_fused_projection, isect_tiles, isect_offset_encode, rasterize_to_pixels):
         setattr(module, function.__name__, function)
-    monkeypatch.setitem(sys.modules, "gsplat", module)
+    compiled = ModuleType("gsplat.cuda._backend")
+    compiled._C = object()
+    for part in (module, ModuleType("gsplat.cuda"), compiled):
+        monkeypatch.setitem(sys.modules, part.__name__, part)
     monkeypatch.setattr(backend, "check", lambda inputs: None)
 
 
@@ -253,6 +256,13 @@ def test_missing_gsplat_says_how_to_get_it(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without_gsplat)
     tensors, K = scene((1,))
     with pytest.raises(ImportError, match=r"No module named 'gsplat'.*pip install -e '\.\[gsplat\]'"):
+        rasterization(**tensors, Ks=K, width=WIDTH, height=HEIGHT, backend="gsplat")
+
+
+def test_gsplat_without_compiled_kernels_says_what_is_missing(stand_ins, monkeypatch):
+    monkeypatch.setattr(sys.modules["gsplat.cuda._backend"], "_C", None)
+    tensors, K = scene((1,))
+    with pytest.raises(ImportError, match="no CUDA toolkit to compile them with.*nvcc.*docs.gsplat.studio/whl"):
         rasterization(**tensors, Ks=K, width=WIDTH, height=HEIGHT, backend="gsplat")
 
 

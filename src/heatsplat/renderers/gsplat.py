@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Iterator
+from functools import lru_cache
+from importlib import import_module
 from typing import NamedTuple
 
 import torch
@@ -19,6 +21,10 @@ from heatsplat.renderers import reference
 from heatsplat.renderers.base import RenderInputs
 
 TILE = 16  # the tile size that gsplat's kernels are tuned and tested for
+TOOLKIT = (
+    "Install the toolkit of PyTorch's CUDA version, with nvcc, or a wheel of gsplat for this PyTorch from "
+    "https://docs.gsplat.studio/whl; or choose renderer=cpu"
+)
 CHANNELS = 32  # composited in one go; gsplat's kernels slow down beyond, as they keep a pixel's channels in registers
 
 
@@ -148,19 +154,33 @@ def _in_groups(
 
 
 def load() -> Kernels:
-    """gsplat's kernels.
+    """gsplat's kernels, which gsplat compiles on first use where it was not installed with them (some minutes, once).
 
     Raises:
         ImportError: gsplat, or something that it needs, is missing.
     """
+    remedy = "Install it with: pip install -e '.[gsplat]', or choose renderer=cpu"
     try:
         from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
     except ImportError as error:
-        raise ImportError(
-            f"the CUDA renderer needs gsplat ({error}). Install it with: pip install -e '.[gsplat]', or choose "
-            "renderer=cpu"
-        ) from error
+        raise ImportError(f"the CUDA renderer needs gsplat ({error}). {remedy}") from error
+    try:
+        compiled = import_module("gsplat.cuda._backend")._C
+    except Exception as error:  # of compilers, of whichever kind
+        raise ImportError(f"gsplat could not compile its kernels: {error}. {TOOLKIT}") from error
+    if compiled is None:
+        raise ImportError(f"gsplat has no compiled kernels, and finds no CUDA toolkit to compile them with. {TOOLKIT}")
     return Kernels(fully_fused_projection, isect_tiles, isect_offset_encode, rasterize_to_pixels)
+
+
+@lru_cache(maxsize=1)
+def why_not() -> str | None:
+    """Why gsplat cannot render here, or None where it can."""
+    try:
+        load()
+    except ImportError as error:
+        return str(error)
+    return None
 
 
 def check(inputs: RenderInputs) -> None:

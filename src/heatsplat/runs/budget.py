@@ -23,7 +23,8 @@ from scipy.spatial import cKDTree
 from heatsplat.composition import build, choices_of, compose, keys_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
-from heatsplat.runs.stepping import Stepper, device_of
+from heatsplat.runs.device import device_of
+from heatsplat.runs.stepping import Stepper
 from heatsplat.runs.verdicts import filled
 from heatsplat.training.rng import generator_for
 
@@ -377,7 +378,7 @@ def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
     points = open_points(read_points(Path(config["budget_curves"] or CURVES_FILE)), config["name"], overrides)
     log.info("measuring what a step costs here")
     module, seconds = filled(config)["module"], config["budget"]
-    device = device_of(config["trainer"]["accelerator"])
+    device = device_of(config["trainer"]["accelerator"], config["renderer"])
     pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
     cap_max = config["density"].get("cap_max")
     made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(overrides))

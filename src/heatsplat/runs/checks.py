@@ -6,13 +6,11 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import torch
-
 from heatsplat.composition import keys_of
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
-from heatsplat.renderers import gsplat
 from heatsplat.runs.budget import seconds_of
+from heatsplat.runs.device import device_of
 
 RATES = (
     "means",
@@ -78,12 +76,4 @@ def _rates_in(settings: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any
 
 
 def _check_machine(config: Mapping[str, Any]) -> None:
-    accelerator, cuda = config["trainer"]["accelerator"], torch.cuda.is_available()
-    if accelerator in ("cuda", "gpu") and not cuda:
-        raise SceneError(
-            f"trainer.accelerator={accelerator}: PyTorch sees no CUDA device here; leave it out for the CPU"
-        )
-    if config["renderer"].get("backend") == "gsplat":
-        gsplat.load()
-        if not cuda or accelerator == "cpu":
-            raise SceneError("renderer=gsplat renders on CUDA only; leave it out for the CPU")
+    device_of(config["trainer"]["accelerator"], config["renderer"])

@@ -25,6 +25,7 @@ from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import checked
+from heatsplat.runs.device import device_of
 from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import locked
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
@@ -103,7 +104,8 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
     config = filled(config)
     config = completed(config, composed)
     module = build_module(config, output_dir)
-    return Run(config, module, data, build_trainer(config["trainer"], config, output_dir))
+    device = device_of(config["trainer"]["accelerator"], config["renderer"])
+    return Run(config, module, data, build_trainer(config["trainer"] | {"accelerator": device}, config, output_dir))
 
 
 def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:

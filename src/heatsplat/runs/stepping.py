@@ -39,8 +39,3 @@ class Stepper:
         if self.module.device.type == "cuda":
             torch.cuda.synchronize()
         return time.perf_counter() - start
-
-
-def device_of(accelerator: str) -> str:
-    """Where a run with this ``trainer.accelerator`` trains: "cpu" or "cuda"."""
-    return "cpu" if accelerator == "cpu" or not torch.cuda.is_available() else "cuda"

@@ -12,8 +12,8 @@ from heatsplat.composition import build
 from heatsplat.contracts import SceneData
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
+from heatsplat.runs.device import device_of
 from heatsplat.runs.prices import prices
-from heatsplat.runs.stepping import device_of
 
 log = logging.getLogger("heatsplat")
 
@@ -37,7 +37,11 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
         log.info("measuring what each of %d effects costs", len(on))
         costs = prices(
-            maker(verdicts), leaving, scene, config["max_steps"], device_of(config["trainer"]["accelerator"])
+            maker(verdicts),
+            leaving,
+            scene,
+            config["max_steps"],
+            device_of(config["trainer"]["accelerator"], config["renderer"]),
         )
         verdicts = assembly.affordable(verdicts, costs, config["effects"]["least_db_per_ms"])
     found = assembly.verdicts_as_dicts(verdicts, costs)
