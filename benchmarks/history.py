@@ -10,7 +10,6 @@ import json
 import logging
 import math
 import os
-import platform
 import statistics
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import write_atomically
+from heatsplat.io.results import processor, write_atomically
 from heatsplat.io.tables import markdown_table
 
 log = logging.getLogger("heatsplat")
@@ -59,18 +58,6 @@ def ratios(tables: Mapping[str, Sequence[Row]]) -> dict[str, tuple[float, str]]:
     return found
 
 
-def machine() -> str:
-    """Processor and number of cores, by which lines are told apart."""
-    name = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = (
-            line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")
-        )
-        name = next(lines, name)
-    return f"{name}, {os.cpu_count()} cores"
-
-
 def commit() -> tuple[str, str, bool]:
     """The commit of this checkout, when it was made (ISO 8601), and whether files differ from it; empty without git."""
 
@@ -92,7 +79,7 @@ def add_line(path: Path, tables: Mapping[str, Sequence[Row]]) -> Row:
         "commit": number,
         "made": made,
         "changed": changed,
-        "machine": machine(),
+        "machine": processor(),
         "load": os.getloadavg()[0],
         "ratios": {name: [round(ratio, 4), way] for name, (ratio, way) in ratios(tables).items()},
     }

@@ -33,7 +33,7 @@ def test_a_line_takes_the_place_of_the_earlier_one_of_its_commit_and_machine(tmp
         ("a", "2026-01-01", "x"),
     ):
         monkeypatch.setattr(history, "commit", lambda number=number, made=made: (number, made, False))
-        monkeypatch.setattr(history, "machine", lambda where=where: where)
+        monkeypatch.setattr(history, "processor", lambda where=where: where)
         history.add_line(path, TABLES)
     lines = history.run(tmp_path / "out", str(path))
     assert [(line["commit"], line["machine"]) for line in lines] == [("a", "y"), ("a", "x"), ("b", "x")]
@@ -51,4 +51,4 @@ def test_what_is_no_line_is_named(tmp_path):
 
 def test_this_checkout_and_machine_have_names():
     number, made, _ = history.commit()
-    assert (len(number), made[:2]) in ((12, "20"), (0, "")) and "cores" in history.machine()
+    assert (len(number), made[:2]) in ((12, "20"), (0, "")) and "cores" in history.processor()

@@ -81,6 +81,7 @@ def test_every_number_is_there_or_explained(run):
             assert (value is None) == (f"{section}.{name}" in content["reasons"]), name
     assert "https://download.pytorch.org/models/alexnet" in content["reasons"]["test.lpips"]
     assert content["run"]["method"] == "etgs" and content["run"]["steps"] == 24
+    assert "cores" in content["run"]["machine"] and content["run"]["threads"] == torch.get_num_threads()
     assert content["effects"] == {"newton_cooling": {"on": True, "ambient": "learned"}}
     assert content["data"]["timestamps"] == "from file names"
     assert content["data"]["views"] == {"train": 6, "val": 3, "test": 4}

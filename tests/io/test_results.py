@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import subprocess
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 import heatsplat
-from heatsplat.io.results import COST, TEST, RunResults, collect_versions, write_atomically
+from heatsplat.io.results import COST, TEST, RunResults, collect_versions, processor, write_atomically
 
 
 def filled():
@@ -115,3 +116,8 @@ def test_versions_name_the_commit():
     head = subprocess.run(["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     assert found["git_commit"] == (head.stdout.strip() if head.returncode == 0 else None)
     assert isinstance(found["git_dirty"], bool) == (head.returncode == 0)
+
+
+def test_the_processor_has_a_name_and_cores():
+    name, _, cores = processor().rpartition(", ")
+    assert name and cores == f"{os.cpu_count()} cores"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
+import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -25,7 +26,7 @@ from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, write_atomically
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, processor, write_atomically
 from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.viewer.page import FILE as VIEWER_FILE
@@ -122,7 +123,14 @@ def describe_run(trainer: pl.Trainer, module: pl.LightningModule) -> dict[str, A
         "multiply_adds_per_gaussian": module.thermal.cost,
         "parameters": sum(parameter.numel() for parameter in module.parameters()),
         "device": str(module.device),
+        "machine": _machine(module.device),
+        "threads": torch.get_num_threads(),
     }
+
+
+def _machine(device: torch.device) -> str:
+    """What the seconds of a run are seconds of."""
+    return f"{torch.cuda.get_device_name(device)}; {processor()}" if device.type == "cuda" else processor()
 
 
 def describe_data(scene: SceneData, modality: str) -> dict[str, Any]:
@@ -389,6 +397,7 @@ def show(results: RunResults, folder: Path, picture: Path | None, console: Conso
     for score, cost in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", "")):
         table.add_row(*score, *cost)
     console.print(table)
+    console.print(f"machine: {run.get('machine')}; threads: {run.get('threads')}", soft_wrap=True)
     page = folder / PAGE_FILE
     console.print(f"report:  {page if page.exists() else folder / REPORT_FILE}", soft_wrap=True)
     if picture is not None:

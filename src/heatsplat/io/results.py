@@ -177,6 +177,16 @@ def collect_versions() -> dict[str, Any]:
     return found
 
 
+def processor() -> str:
+    """Name of this machine's processor and its number of cores, such as "AMD EPYC 7R13, 2 cores"."""
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")  # Linux, where ``platform`` knows the architecture only
+    if cpuinfo.exists():
+        lines = cpuinfo.read_text().splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    return f"{name}, {os.cpu_count()} cores"
+
+
 def _git(folder: Path, *arguments: str) -> str | None:
     """Output of a git command in ``folder``, or None where git or the repository is not there."""
     try:
