@@ -290,7 +290,8 @@ def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
 
     prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
-    device = device_of(config["accelerator"], trained.config["renderer"])
+    own = "auto" if "backend" in trained.config["renderer"] else None  # not the backend of the machine that trained it
+    device = device_of(config["accelerator"], {"backend": own})
     trainer = build_trainer(trained.config["trainer"] | {"accelerator": device}, config, output_dir)
     trainer.test(trained.module, datamodule=trained.data, verbose=False)
     return trained.module.results.test.get("psnr")

@@ -48,7 +48,8 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
         predict_all=predict_all,
         modality="thermal",
         sensor=SimpleNamespace(parts={}),
-        renderer=SimpleNamespace(backend="gsplat"),
+        renderer=SimpleNamespace(backend="auto"),
+        render=lambda frame: None,
     )
     stored = {CHECKPOINT_KEY: {"config": {"module": {}, "data": {}}}}
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)

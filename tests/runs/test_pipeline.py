@@ -46,6 +46,19 @@ def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
         heatsplat.train(config | {"seed": 7}, folder)
 
 
+def test_a_checkpoint_of_a_gpu_is_looked_at_where_there_is_none(trained, tmp_path):
+    folder, _, _ = trained
+    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")
+    expected = heatsplat.load(folder / "checkpoints" / "last.ckpt")
+    config = stored["heatsplat"]["config"]
+    for settings in (config["renderer"], config["module"]["renderer"]):
+        settings["backend"] = "gsplat"
+    torch.save(stored, tmp_path / "gpu.ckpt")
+    scene = heatsplat.load(tmp_path / "gpu.ckpt")
+    frame = scene.scene.test.frames[0]
+    assert torch.equal(scene.render(frame, unseen="keep"), expected.render(frame, unseen="keep"))
+
+
 @pytest.mark.parametrize("changed", ["data.downscale=2", "data.scene=cooling"])
 def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed, tmp_path):
     folder, _, _ = trained

@@ -250,8 +250,9 @@ def load(
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint):
         restore(module, scene_data, loaded)
-        if module.renderer.backend != "gsplat":  # which the processor has not
-            _try_render(module, scene_data.scene.train.frames[0])
+        if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
+            module.renderer.backend = "auto"
+        _try_render(module, scene_data.scene.train.frames[0])
     return Trained(config, module, scene_data, loaded)
 
 
