@@ -12,7 +12,9 @@ import importlib.machinery
 import io
 import logging
 import multiprocessing
+import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -265,7 +267,12 @@ def first_failure(mutation: Mutation) -> str | None:
     if "-k" in words:
         words[-1] = words[-1].replace("-", " ")
     recorder = _Recorder()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    with contextlib.ExitStack() as stack:
+        for stream in (contextlib.redirect_stdout, contextlib.redirect_stderr):
+            stack.enter_context(stream(io.StringIO()))
+        if mutation.module.startswith("kernels."):
+            # Compiled code is kept by the file that it is of, which does not change: neither may take the other's.
+            os.environ["NUMBA_CACHE_DIR"] = stack.enter_context(tempfile.TemporaryDirectory())
         options = ["-x", "-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", "-c", str(ROOT / "pyproject.toml")]
         code = pytest.main([*(str(ROOT / w) if w.startswith("tests/") else w for w in words), *options], [recorder])
     if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
