@@ -208,21 +208,9 @@ class _FusedOnCuda(torch.autograd.Function):
             prediction, target, valid, shift, taps, moments, line, numbers, CHANNELS=channels, BLOCK=block
         )
         on_cuda.similarity[height, blocks](
-            prediction,
-            target,
-            valid,
-            outside,
-            shift,
-            taps,
-            moments,
-            slopes,
-            sums,
-            line,
-            height,
-            numbers,
-            blocks,
+            prediction, target, valid, outside, shift, taps, moments, slopes, sums, line, height, numbers, blocks,
             BLOCK=block,
-        )
+        )  # fmt: skip
         ctx.save_for_backward(prediction, target, valid, shift, taps, moments, slopes, weights)
         return (weights * sums.sum(1)).unbind()
 
@@ -247,11 +235,11 @@ class _FusedOnCuda(torch.autograd.Function):
 
 def _coverage_on(mask: Tensor, channels: int) -> tuple[Tensor, Tensor, Tensor]:
     """The taps of the window, and ``_coverage`` on the device of the mask."""
-    taps = window(device=mask.device)
+    taps = window(torch.float64, mask.device)  # in which no library rounds factors to ten bits, as it may in float32
     row = taps.expand(1, 1, 1, WINDOW)
-    beyond = _padded((~mask[..., None]).float(), 1.0)
-    outside = functional.conv2d(functional.conv2d(beyond, row), row.transpose(2, 3))[0, 0]
-    return taps, *(
+    beyond = _padded((~mask[..., None]).double(), 1.0)
+    outside = functional.conv2d(functional.conv2d(beyond, row), row.transpose(2, 3))[0, 0].float()
+    return taps.float(), *(
         plane.repeat_interleave(channels).contiguous() for plane in (mask.float().view(-1), outside.view(-1))
     )
 

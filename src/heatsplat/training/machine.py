@@ -45,6 +45,9 @@ def prepare_machine(threads: int | None) -> None:
     # Kernels first: starting their threads sets OpenMP's number, which is torch's too, to all cores.
     use_threads(threads)
     torch.set_num_threads(threads)
+    torch.backends.cudnn.allow_tf32 = (
+        False  # or windows of SSIM have ten bits on CUDA, and variances of flat images none
+    )
     for pattern in NOISE:
         warnings.filterwarnings("ignore", message=pattern)
     for name in ("pytorch_lightning", "pytorch_lightning.utilities.rank_zero", "lightning_fabric.utilities.rank_zero"):
