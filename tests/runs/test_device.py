@@ -70,6 +70,8 @@ def test_a_device_that_is_left_alone_is_told_once_with_the_reason(machine, caplo
         ("auto", "gsplat", True, False, ImportError, "needs gsplat"),
         ("cpu", "gsplat", True, True, SceneError, "renderer=gsplat renders on CUDA only"),
         ("auto", "gsplat", False, True, SceneError, "renderer=gsplat renders on CUDA only"),
+        ("cdua", "auto", True, True, SceneError, "cdua"),
+        ("mps", "auto", False, False, SceneError, "mps"),
     ],
 )
 def test_what_cannot_be_had_is_refused(machine, accelerator, backend, cuda, has_gsplat, error, message):

@@ -21,11 +21,11 @@ from heatsplat.renderers import reference
 from heatsplat.renderers.base import RenderInputs
 
 TILE = 16  # the tile size that gsplat's kernels are tuned and tested for
+CHANNELS = 32  # composited in one go; gsplat's kernels slow down beyond, as they keep a pixel's channels in registers
 TOOLKIT = (
     "Install the toolkit of PyTorch's CUDA version, with nvcc, or a wheel of gsplat for this PyTorch from "
     "https://docs.gsplat.studio/whl; or choose renderer=cpu"
 )
-CHANNELS = 32  # composited in one go; gsplat's kernels slow down beyond, as they keep a pixel's channels in registers
 
 
 class Kernels(NamedTuple):
@@ -157,7 +157,7 @@ def load() -> Kernels:
     """gsplat's kernels, which gsplat compiles on first use where it was not installed with them (some minutes, once).
 
     Raises:
-        ImportError: gsplat, or something that it needs, is missing.
+        ImportError: gsplat, something that it needs, or the means to compile its kernels is missing.
     """
     remedy = "Install it with: pip install -e '.[gsplat]', or choose renderer=cpu"
     try:

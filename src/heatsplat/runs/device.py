@@ -9,8 +9,10 @@ from typing import Any
 
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.renderers import gsplat
+
+ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
 
 log = logging.getLogger("heatsplat")
 
@@ -22,13 +24,14 @@ def device_of(accelerator: str, renderer: Mapping[str, Any]) -> str:
     and where there is a device, a warning says why it is left alone.
 
     Args:
-        accelerator: what was asked for, as ``trainer.accelerator``: "auto", "cpu", "gpu" or "cuda".
+        accelerator: what was asked for, one of ACCELERATORS; "gpu" and "cuda" are the same.
         renderer: settings of the renderer; one without a backend is plain torch, on any device.
 
     Raises:
-        SceneError: CUDA was asked for, and PyTorch sees no device, or the renderer cannot use it.
+        SceneError: the accelerator is unknown; or CUDA was asked for, and PyTorch sees no device, or the renderer cannot use it.
         ImportError: CUDA was asked for, and the renderer lacks gsplat or its compiled kernels.
     """
+    check_option("accelerator", accelerator, ACCELERATORS, SceneError)
     backend = renderer.get("backend")
     if accelerator in ("gpu", "cuda"):
         if not torch.cuda.is_available():

@@ -22,6 +22,28 @@ def _shifted(image, valid, at, inside, shift):
 
 
 @triton.jit
+def _down(plane, taps, row, column, inside, line, height):
+    """A plane [H, W·C] blurred along columns, at this program's places."""
+    found = tl.zeros(column.shape, tl.float32)
+    for d in tl.static_range(2 * HALF + 1):
+        near = row + d - HALF
+        here = inside & (near >= 0) & (near < height)
+        found += tl.load(taps + d) * tl.load(plane + near * line + column, mask=here, other=0.0)
+    return found
+
+
+@triton.jit
+def _along(plane, taps, row, column, inside, line, CHANNELS: tl.constexpr):
+    """A plane [H, W·C] blurred along rows, at this program's places."""
+    found = tl.zeros(column.shape, tl.float32)
+    for d in tl.static_range(2 * HALF + 1):
+        near = column + (d - HALF) * CHANNELS
+        here = inside & (near >= 0) & (near < line)
+        found += tl.load(taps + d) * tl.load(plane + row * line + near, mask=here, other=0.0)
+    return found
+
+
+@triton.jit
 def moments_of_rows(x, y, valid, shift, taps, moments, line, pixels, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
     """``moments`` [5, H, W·C]: x, y, x², y² and xy blurred along rows, of images without their ``shift`` [1]."""
     row, column = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
@@ -57,20 +79,11 @@ def similarity(
     """``sums`` [2, programs] of |x - y| and of 1 - SSIM, and ``slopes`` [3, H, W·C] of SSIM by the moments x, x² and xy."""
     row, column = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside, away = column < line, tl.load(shift)
-    x_mean = tl.zeros([BLOCK], tl.float32)
-    y_mean = tl.zeros([BLOCK], tl.float32)
-    xx = tl.zeros([BLOCK], tl.float32)
-    yy = tl.zeros([BLOCK], tl.float32)
-    xy = tl.zeros([BLOCK], tl.float32)
-    for d in tl.static_range(2 * HALF + 1):
-        near = row + d - HALF
-        here = inside & (near >= 0) & (near < height)
-        tap, at = tl.load(taps + d), moments + near * line + column
-        x_mean += tap * tl.load(at, mask=here, other=0.0)
-        y_mean += tap * tl.load(at + pixels, mask=here, other=0.0)
-        xx += tap * tl.load(at + 2 * pixels, mask=here, other=0.0)
-        yy += tap * tl.load(at + 3 * pixels, mask=here, other=0.0)
-        xy += tap * tl.load(at + 4 * pixels, mask=here, other=0.0)
+    x_mean = _down(moments, taps, row, column, inside, line, height)
+    y_mean = _down(moments + pixels, taps, row, column, inside, line, height)
+    xx = _down(moments + 2 * pixels, taps, row, column, inside, line, height)
+    yy = _down(moments + 3 * pixels, taps, row, column, inside, line, height)
+    xy = _down(moments + 4 * pixels, taps, row, column, inside, line, height)
     place = row * line + column
     missing = tl.load(outside + place, mask=inside, other=0.0)
     counts = tl.load(valid + place, mask=inside, other=0.0)
@@ -101,20 +114,10 @@ def slopes_of_rows(slopes, taps, blurred, line, pixels, CHANNELS: tl.constexpr, 
     """The slopes [3, H, W·C] blurred along rows."""
     row, column = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside = column < line
-    first = tl.zeros([BLOCK], tl.float32)
-    second = tl.zeros([BLOCK], tl.float32)
-    third = tl.zeros([BLOCK], tl.float32)
-    for d in tl.static_range(2 * HALF + 1):
-        near = column + (d - HALF) * CHANNELS
-        here = inside & (near >= 0) & (near < line)
-        tap, at = tl.load(taps + d), slopes + row * line + near
-        first += tap * tl.load(at, mask=here, other=0.0)
-        second += tap * tl.load(at + pixels, mask=here, other=0.0)
-        third += tap * tl.load(at + 2 * pixels, mask=here, other=0.0)
-    at = blurred + row * line + column
-    tl.store(at, first, mask=inside)
-    tl.store(at + pixels, second, mask=inside)
-    tl.store(at + 2 * pixels, third, mask=inside)
+    at = row * line + column
+    for k in tl.static_range(3):
+        found = _along(slopes + k * pixels, taps, row, column, inside, line, CHANNELS)
+        tl.store(blurred + k * pixels + at, found, mask=inside)
 
 
 @triton.jit
@@ -125,16 +128,9 @@ def gradient(
     """``v_x`` [H, W·C] of weights[0] Σ|x - y| and weights[1] Σ (1 - SSIM), whose own gradients are the two ``v_``."""
     row, column = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     inside, away = column < line, tl.load(shift)
-    first = tl.zeros([BLOCK], tl.float32)
-    second = tl.zeros([BLOCK], tl.float32)
-    third = tl.zeros([BLOCK], tl.float32)
-    for d in tl.static_range(2 * HALF + 1):
-        near = row + d - HALF
-        here = inside & (near >= 0) & (near < height)
-        tap, at = tl.load(taps + d), blurred + near * line + column
-        first += tap * tl.load(at, mask=here, other=0.0)
-        second += tap * tl.load(at + pixels, mask=here, other=0.0)
-        third += tap * tl.load(at + 2 * pixels, mask=here, other=0.0)
+    first = _down(blurred, taps, row, column, inside, line, height)
+    second = _down(blurred + pixels, taps, row, column, inside, line, height)
+    third = _down(blurred + 2 * pixels, taps, row, column, inside, line, height)
     place = row * line + column
     counts = tl.load(valid + place, mask=inside, other=0.0) > 0
     a, b = tl.load(x + place, mask=inside, other=0.0), tl.load(y + place, mask=inside, other=0.0)
