@@ -14,7 +14,7 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.splats import NOTHING
 
 NEAREST = 0.02  # of the span of a field, where rays begin
-CHUNK = 8192  # rays at a time, where no gradient keeps what they went through
+CHUNK = 1024  # rays at a time, where no gradient keeps what they went through: it stays in the cache
 
 
 class VolumeRenderer(Renderer):
