@@ -125,7 +125,9 @@ OFF = {  # what a balance is without, and the same said by numbers to the balanc
 }
 
 
-@pytest.mark.parametrize("name", OFF)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "normals" else pytest.mark.slow) for name in OFF]
+)
 def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_has_no_column_of_it(name, monkeypatch):
     gone, zeroed = OFF[name]
     if name == "normals":  # the beam, which a surface without a normal does not see, is then in the light

@@ -10,9 +10,11 @@ FOLDER = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
 STEPS = "steps = 1500"
 SETTING = '"threads=1"'  # beside which the files of a run are left out that no notebook looks at
 
+each_notebook = pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_a_notebook_runs_and_shows_pictures(path):
+
+def shortened(path: Path):
+    """A notebook that trains for twenty steps."""
     notebook = nbformat.read(path, as_version=4)
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
     assert STEPS in first.source
@@ -20,12 +22,39 @@ def test_a_notebook_runs_and_shows_pictures(path):
     run = next(cell for cell in notebook.cells if SETTING in cell.source)
     unseen = ("callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES)
     run.source = run.source.replace(SETTING, ", ".join([SETTING, *map(repr, unseen)]))
+    return notebook
+
+
+@each_notebook
+def test_the_cells_of_a_notebook_run_and_draw(path, monkeypatch, tmp_path):
+    """In this process, which has the libraries: a kernel of Jupyter's takes ten seconds to load them."""
+    from IPython.core.interactiveshell import InteractiveShell
+    from matplotlib import pyplot
+    from traitlets.config import Config
+
+    monkeypatch.chdir(FOLDER)
+    pyplot.close("all")
+    shell = InteractiveShell(ipython_dir=str(tmp_path), config=Config(HistoryManager={"enabled": False}))
+    try:
+        for cell in shortened(path).cells:
+            if cell.cell_type == "code":
+                shell.run_cell(cell.source).raise_error()
+        drawn = [pyplot.figure(number) for number in pyplot.get_fignums()]
+        assert any(axes.has_data() for figure in drawn for axes in figure.axes)
+    finally:
+        pyplot.close("all")
+
+
+@pytest.mark.slow
+@each_notebook
+def test_a_notebook_runs_in_jupyter_and_shows_pictures(path):
+    notebook = shortened(path)
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(FOLDER)}}).execute()
     shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in data for data in shown)
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: path.stem)
+@each_notebook
 def test_a_notebook_is_small_and_linked_from_the_readme(path):
     assert path.stat().st_size < 200_000
     assert f"docs/notebooks/{path.name}" in (FOLDER.parents[1] / "README.md").read_text(encoding="utf-8")
