@@ -45,7 +45,45 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
     pictures = read_page(then / "leaderboard.html", board(root, **asked))["scenes"][0]["pictures"]
     assert all(set(shown[which]) == {"3dgs", "etgs", "theirs"} for shown in pictures for which in ("renders", "errors"))
 
+
+def numbers_of_all(entry):
+    """What a table says of an entry but for its seconds, which are scaled."""
+    parts = [entry.mean("mae_c", part) for part in sorted(entry.parts)]
+    return [entry.mean("mae_c"), entry.deviation("mae_c"), entry.mean("psnr"), entry.cost("gaussians"), *parts]
+
+
+def test_seeds_of_a_page_and_of_later_runs_add_up(tmp_path):
+    """Mean and spread are those of all runs in one folder; runs of a seed that the page has too do not count."""
+    root, whole = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "whole"
+    first, then = tmp_path / "first", tmp_path / "then"
+    offs = {0: 1.0, 1: 1.4, 2: 2.0, 3: 2.3}
+    for seed, off in offs.items():
+        folders = [whole, first if seed < 2 else then]
+        for folder in folders:
+            run_of(folder, "3dgs", "cooling", seed, off, seconds=8.0 + seed)
+    run_of(then, "3dgs", "cooling", 1, 9.0, seconds=8.0)
+    asked = {"tracks": ["steps"], "note": "", "seeds": list(offs)}
+    write_leaderboard(first, board(root, **asked))
+    write_leaderboard(then, board(root, **asked, earlier=str(first / "leaderboard.html")))
+    later = tmp_path / "none"
+    later.mkdir()
+    (wanted,) = (one for one in standings(whole, board(root, **asked)).entries if one.seeds)
+    for folder, page in ((then, first), (later, then)):
+        found = standings(folder, board(root, **asked, earlier=str(page / "leaderboard.html")))
+        (entry,) = (one for one in found.entries if one.seeds)
+        assert sorted(entry.all_numbers) == [0, 1, 2, 3] and entry.seeds == 4
+        assert numbers_of_all(entry) == pytest.approx(numbers_of_all(wanted), rel=1e-6)
+    rows = (then / "leaderboard.csv").read_text()
+    assert rows.count("3dgs,cooling,steps") == 3  # a page, and the runs of two seeds
+
+
+def test_a_page_that_is_none_is_refused(tmp_path):
+    root, first = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "first"
+    run_of(first, "3dgs", "cooling", 0, 1.0, seconds=8.0)
+    asked = {"tracks": ["steps"], "note": ""}
+    write_leaderboard(first, board(root, **asked))
+    page = first / "leaderboard.html"
     for text, message in (("<html>", "no page of a leaderboard"), (page.read_text().replace("tiny", "demo"), "sizes")):
         (tmp_path / "other.html").write_text(text)
         with pytest.raises(SceneError, match=message):
-            standings(then, board(root, **asked, earlier=str(tmp_path / "other.html")))
+            standings(first, board(root, **asked, earlier=str(tmp_path / "other.html")))

@@ -28,7 +28,7 @@ def test_a_difference_within_the_spread_is_a_tie():
 def entry_of(*values: float) -> Entry:
     """An entry whose seeds have these errors."""
     scores = [SceneScore([{"name": "near_00003", "part": "near", "mae_c": value}]) for value in values]
-    return Entry("a", "b", "steps", scores)
+    return Entry("a", "b", "steps", list(range(len(scores))), scores)
 
 
 def test_one_seed_spreads_as_the_others_do():

@@ -39,7 +39,7 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
 
 
 def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[str, Any]) -> dict[str, float]:
-    """Lets what a page tells stand where a board's folders have fewer seeds; track -> the factor that makes their seconds its.
+    """Adds the seeds of a page that a board's folders lack; track -> the factor that makes their seconds its.
 
     Machines differ. Where runs of the reference in a track are in the folders and on the page, the seconds of all the folders'
     runs in it are multiplied by what the reference took there over what it took here (geometric mean over scenes). Without such
@@ -60,8 +60,8 @@ def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[s
             for entry in own:
                 entry.scale_seconds(factors[track])
     for key, one in told.items():
-        if key in places and one["seeds"] > places[key].seeds:
-            places[key].take(one)
+        if key in places:
+            places[key].join(one)
     return factors
 
 
@@ -73,6 +73,11 @@ def told_by(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 def place_of(one: Mapping[str, Any]) -> tuple[str, str, str]:
     """Method, scene and track of an entry of a page."""
     return one["method"], one["scene"], one["track"]
+
+
+def numbers_of(one: Mapping[str, Any]) -> list[int]:
+    """Seeds of an entry of a page; pages that do not tell them have the first ones."""
+    return one.get("numbers", list(range(one["seeds"])))
 
 
 def handed_in(one: Mapping[str, Any]) -> bool:
@@ -88,7 +93,7 @@ def pictures_of(content: Mapping[str, Any] | None, scene: str, view: str) -> Map
 
 def sentence(factors: Mapping[str, float]) -> str:
     """What was taken from a page, and by how much the seconds of later runs were scaled, for the table."""
-    text = "Results of an earlier page fill in where later runs have fewer seeds."
+    text = "Seeds that later runs lack are those of an earlier page."
     scaled = " and ".join(f"{factor:.2f} (equal {track})" for track, factor in factors.items())
     if scaled:
         text += f" Seconds of later runs are multiplied by {scaled}, which equalises the times of the reference."

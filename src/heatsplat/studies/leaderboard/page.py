@@ -81,6 +81,7 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
         "scores": {name: entry.mean(name) for name in board.protocol["scores"]},
         "spread": entry.deviation(first),
         "seeds": entry.seeds,
+        "numbers": sorted(entry.all_numbers),
         "parts": {part: entry.mean(first, part) for part in entry.parts},
         "rank": entry.rank,
         "cost": {name: entry.cost(name) for name in ("seconds", "memory_mb", "gaussians", "steps")},
@@ -92,7 +93,7 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
 def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]]:
     """Views of a scene with the truth and every method's render and error, of the first track and the first seed.
 
-    Methods whose folders are gone keep the pictures of an earlier page, and errors of all its limit of colours.
+    Methods whose first seed an earlier page tells keep its pictures, and errors of all its limit of colours.
     """
     own = [entry for entry in found.entries if entry.scene == scene and entry.track == board.tracks[0] and entry.seeds]
     truth = board.root / TRUTH / scene
@@ -104,12 +105,13 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
         name = names[len(names) // 2]
         exact = read_temperature(truth / f"{name}.tiff")
         low, high = (float(value) for value in np.nanpercentile(exact, (0.1, 99.9)))
-        renders = {entry.method: image for entry in own if (image := _render(entry, name)) is not None}
-        errors = {method: image - exact for method, image in renders.items()}
         earlier = pictures_of(found.page, scene, name) or {"renders": {}, "errors": {}}
+        kept = [entry.method for entry in own if entry.told is not None and entry.method in earlier["renders"]]
+        others = [entry for entry in own if entry.method not in kept]
+        renders = {entry.method: image for entry in others if (image := _render(entry, name)) is not None}
+        errors = {method: image - exact for method, image in renders.items()}
         limit = float(np.nanpercentile(np.abs(np.stack(list(errors.values()))), 98)) if errors else 1.0
         limit = earlier.get("limit", limit)
-        kept = [entry.method for entry in own if entry.method not in renders and entry.method in earlier["renders"]]
         shown.append(
             {
                 "view": name,

@@ -149,12 +149,12 @@ def _short(entry: Entry) -> str:
 
 
 def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object]]:
-    """A row per run in full precision, or for all seeds of an earlier page; one without scores for what has none."""
+    """A row per run in full precision, and one for all seeds of an earlier page; one without scores for what has none."""
     rows: list[Mapping[str, object]] = []
     for entry in entries:
         about = {"method": entry.method, "scene": entry.scene, "track": entry.track}
         if entry.told is not None:
-            rows.append({**about, **entry.told["scores"], **entry.told["cost"], "seeds": entry.seeds})
+            rows.append({**about, **entry.told["scores"], **entry.told["cost"], "seeds": entry.told["seeds"]})
         elif not entry.scores:
             rows.append({**about, "reason": entry.reason})
         for score, cost, folder in zip(entry.scores, entry.costs, entry.folders, strict=True):

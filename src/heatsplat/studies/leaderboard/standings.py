@@ -16,7 +16,15 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, write_atomically
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.leaderboard.earlier import add_earlier, handed_in, place_of, read_page, sentence, told_by
+from heatsplat.studies.leaderboard.earlier import (
+    add_earlier,
+    handed_in,
+    numbers_of,
+    place_of,
+    read_page,
+    sentence,
+    told_by,
+)
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene, score_submission
@@ -33,11 +41,12 @@ class Entry:
 
     Args:
         method, scene, track: what it is.
-        scores: a score for each seed that has results.
+        numbers: seeds of the runs that have results.
+        scores: a score for each of them.
         costs: seconds, memory_mb, gaussians and steps of each, where known.
         folders: where each lies.
         commands: what each was run with.
-        told: what an earlier page says, which stands in place of runs; None where runs speak.
+        told: what an earlier page says of other seeds, which counts beside the runs; None without.
         reason: why there are none.
         rank: best and worst rank that the seeds allow, in its scene and track; None without results.
     """
@@ -45,6 +54,7 @@ class Entry:
     method: str
     scene: str
     track: str
+    numbers: list[int] = field(default_factory=list)
     scores: list[SceneScore] = field(default_factory=list)
     costs: list[dict[str, float]] = field(default_factory=list)
     folders: list[Path] = field(default_factory=list)
@@ -59,25 +69,44 @@ class Entry:
         return self.method, self.scene, self.track
 
     @property
+    def all_numbers(self) -> list[int]:
+        """Seeds of all results, those of an earlier page first."""
+        return [*numbers_of(self.told), *self.numbers] if self.told is not None else list(self.numbers)
+
+    @property
     def seeds(self) -> int:
         """How many seeds have results."""
-        return len(self.scores) if self.told is None else int(self.told["seeds"])
+        return len(self.all_numbers)
 
     @property
     def parts(self) -> list[str]:
         """What views are held out by; empty without results."""
-        if self.told is not None:
-            return list(self.told["parts"])
-        return list(dict.fromkeys(part for score in self.scores for part in score.parts))
+        told = self.told["parts"] if self.told is not None else ()
+        return list(dict.fromkeys((*told, *(part for score in self.scores for part in score.parts))))
 
     @property
     def command(self) -> str:
         """What the first seed was run with."""
         return str(self.told["command"]) if self.told is not None else " ".join(self.commands[0])
 
-    def take(self, told: Mapping[str, Any]) -> None:
-        """Lets what an earlier page says stand in place of the runs."""
-        self.told, self.scores, self.costs, self.folders, self.commands = told, [], [], [], []
+    def add(self, number: int, score: SceneScore, cost: dict[str, float], folder: Path, command: list[str]) -> None:
+        """Adds the results of a seed."""
+        self.numbers.append(number)
+        self.scores.append(score)
+        self.costs.append(cost)
+        self.folders.append(folder)
+        self.commands.append(command)
+
+    def join(self, told: Mapping[str, Any]) -> None:
+        """Adds what an earlier page says, unless there are runs of all its seeds; runs of some of them then do not count."""
+        known = set(numbers_of(told))
+        if known <= set(self.numbers):
+            return
+        self.told = told
+        others = [k for k, number in enumerate(self.numbers) if number not in known]
+        for name in ("numbers", "scores", "costs", "folders", "commands"):
+            each = getattr(self, name)
+            setattr(self, name, [each[k] for k in others])
 
     def scale_seconds(self, factor: float) -> None:
         """Makes the seconds of the runs those of another machine."""
@@ -87,30 +116,37 @@ class Entry:
         ]
 
     def values(self, score: str, part: str | None = None) -> list[float]:
-        """A score of each seed; all views, or those of a part."""
+        """A score of each run; all views, or those of a part."""
         found = (one.mean(score, part) for one in self.scores)
         return [value for value in found if value is not None and math.isfinite(value)]
 
     def mean(self, score: str, part: str | None = None) -> float | None:
         """Mean over the seeds; of a part, earlier pages have the score that ranks alone."""
+        told = None
         if self.told is not None:
-            return self.told["scores"].get(score) if part is None else self.told["parts"].get(part)
-        values = self.values(score, part)
-        return statistics.fmean(values) if values else None
+            told = self.told["scores"].get(score) if part is None else self.told["parts"].get(part)
+        return self._mean(self.values(score, part), told)
 
     def deviation(self, score: str) -> float | None:
         """Standard deviation over the seeds of the score that ranks; None for one seed."""
-        if self.told is not None:
-            return self.told["spread"]
         values = self.values(score)
-        return statistics.stdev(values) if len(values) > 1 else None
+        if self.told is None:
+            return statistics.stdev(values) if len(values) > 1 else None
+        count, mean = int(self.told["seeds"]), self.mean(score)
+        if count + len(values) < 2:
+            return None
+        squares = (count - 1) * (self.told["spread"] or 0.0) ** 2 + count * (self.told["scores"][score] - mean) ** 2
+        return math.sqrt((squares + sum((value - mean) ** 2 for value in values)) / (count + len(values) - 1))
 
     def cost(self, name: str) -> float | None:
         """Mean of a cost over the seeds that tell it."""
-        if self.told is not None:
-            return self.told["cost"].get(name)
         values = [cost[name] for cost in self.costs if cost.get(name) is not None]
-        return statistics.fmean(values) if values else None
+        return self._mean(values, self.told["cost"].get(name) if self.told is not None else None)
+
+    def _mean(self, values: Sequence[float], told: float | None) -> float | None:
+        """Mean of a number of each run and of that which an earlier page tells of its seeds."""
+        every = [*values, *([told] * int(self.told["seeds"]) if told is not None else ())]
+        return statistics.fmean(every) if every else None
 
 
 @dataclass(frozen=True)
@@ -119,7 +155,7 @@ class Standings:
 
     Args:
         entries: in the order of its scenes and methods, submissions last; ranked within scene and track.
-        page: contents of the earlier page that stands where no run does; None without one.
+        page: contents of the earlier page whose results count beside the runs; None without one.
         note: what was taken from them.
     """
 
@@ -142,10 +178,7 @@ def standings(folder: Path, board: Board) -> Standings:
         for scene, score in scored.items():
             key = (told["method"], scene, told.get("track", board.tracks[0]))
             entry = places.setdefault(key, Entry(*key))
-            entry.scores.append(score)
-            entry.costs.append(dict(score.cost))
-            entry.folders.append(submission)
-            entry.commands.append([str(told.get("code", "a submission"))])
+            entry.add(entry.seeds, score, dict(score.cost), submission, [str(told.get("code", "a submission"))])
     page, note = None, ""
     if board.earlier is not None:
         page = read_page(board.earlier, board)
@@ -182,7 +215,8 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
     overrides = overrides_of(folder)
     key = (overrides.get("method", ""), overrides.get("data.scene", ""), overrides.get("leaderboard.track", ""))
     entry = places.get(key)
-    if entry is None or int(overrides.get("seed", 0)) not in board.seeds:
+    seed = int(overrides.get("seed", 0))
+    if entry is None or seed not in board.seeds:
         return
     if not (folder / METRICS_FILE).exists():
         entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
@@ -199,10 +233,8 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
         "memory_mb": cost.get("peak_memory_mb"),
         "gaussians": cost.get("gaussians"),
     }
-    entry.scores.append(score)
-    entry.costs.append({**told, "steps": results["run"].get("steps")})
-    entry.folders.append(folder)
-    entry.commands.append([f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name)])
+    command = [f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name)]
+    entry.add(seed, score, {**told, "steps": results["run"].get("steps")}, folder, command)
 
 
 def _of_the_board(name: str) -> bool:
