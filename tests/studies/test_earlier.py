@@ -6,7 +6,7 @@ import pytest
 from boards import board, hand_in, protocol_folder, run_of
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.leaderboard.earlier import read_page
+from heatsplat.studies.leaderboard.earlier import MARK, read_page
 from heatsplat.studies.leaderboard.report import write_leaderboard
 from heatsplat.studies.leaderboard.standings import standings
 
@@ -83,7 +83,13 @@ def test_a_page_that_is_none_is_refused(tmp_path):
     asked = {"tracks": ["steps"], "note": ""}
     write_leaderboard(first, board(root, **asked))
     page = first / "leaderboard.html"
-    for text, message in (("<html>", "no page of a leaderboard"), (page.read_text().replace("tiny", "demo"), "sizes")):
+    whole = page.read_text()
+    cut = whole[: whole.index(MARK) + 300]
+    for text, message in (
+        ("<html>", "no page of a leaderboard"),
+        (whole.replace("tiny", "demo"), "sizes"),
+        (cut, "other.html is damaged"),
+    ):
         (tmp_path / "other.html").write_text(text)
         with pytest.raises(SceneError, match=message):
             standings(first, board(root, **asked, earlier=str(tmp_path / "other.html")))

@@ -22,7 +22,7 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
     """The contents of a page that a leaderboard wrote.
 
     Raises:
-        SceneError: there is no such page, or it has scenes of another size, another score or another reference.
+        SceneError: there is no such page, it is cut off, or it has scenes of another size, another score or another reference.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -30,7 +30,10 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
         raise SceneError(f"leaderboard.earlier: {path} cannot be read ({error.strerror})") from error
     if MARK not in text:
         raise SceneError(f"leaderboard.earlier: {path} is no page of a leaderboard; give a leaderboard.html")
-    content, _ = json.JSONDecoder().raw_decode(text, text.index(MARK) + len(MARK))
+    try:
+        content, _ = json.JSONDecoder().raw_decode(text, text.index(MARK) + len(MARK))
+    except ValueError as error:
+        raise SceneError(f"leaderboard.earlier: {path} is damaged ({error}); take another copy of the page") from error
     wanted = {"sizes": board.sizes, "score": board.protocol["scores"][0], "reference": board.protocol["reference"]}
     for key, value in wanted.items():
         if content[key] != value:
