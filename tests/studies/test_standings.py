@@ -1,12 +1,14 @@
 """Ranks with ties: what the spread of seeds does not tell apart shares its ranks."""
 
 import json
+from pathlib import Path
 
 import pytest
 from boards import board, hand_in, protocol_folder, run_of
 
 from heatsplat.studies.leaderboard.standings import (
     Entry,
+    Result,
     beside_reference,
     ranks,
     spread_of,
@@ -28,7 +30,7 @@ def test_a_difference_within_the_spread_is_a_tie():
 def entry_of(*values: float) -> Entry:
     """An entry whose seeds have these errors."""
     scores = [SceneScore([{"name": "near_00003", "part": "near", "mae_c": value}]) for value in values]
-    return Entry("a", "b", "steps", list(range(len(scores))), scores)
+    return Entry("a", "b", "steps", [Result(seed, score, {}, Path(), "") for seed, score in enumerate(scores)])
 
 
 def test_one_seed_spreads_as_the_others_do():
@@ -68,4 +70,4 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     (sweep / "3dgs_cooling_steps_0" / "submission" / "near_00003.tiff").unlink()
     (sweep / "3dgs_cooling_steps_0" / "score.json").unlink()
     left = next(one for one in standings(sweep, asked).entries if (one.method, one.scene) == ("3dgs", "cooling"))
-    assert len(left.scores) == 1 and "lacks 1 of the 3" in left.reason
+    assert len(left.runs) == 1 and "lacks 1 of the 3" in left.reason

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from heatsplat.kernels import hash_grid as kernel
 
 # π_2 and π_3 of Eq. 4 as int32; products and the exclusive or wrap around as those of uint32 do.
-PRIMES = (1, 2654435761 - 2**32, 805459861)
+PRIMES = (1, kernel.PRIME_Y - 2**32, kernel.PRIME_Z)
 
 
 def sizes(levels: int, coarsest: int, finest: int) -> list[int]:

@@ -19,7 +19,7 @@ BLOCK = 2048  # places per parallel task
 CORNERS = 8
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_PRIME_Y, _PRIME_Z = 2654435761, 805459861  # of geometry.hash_grid.PRIMES
+PRIME_Y, PRIME_Z = 2654435761, 805459861  # π_2 and π_3 (Müller et al. 2022, Eq. 4)
 
 
 @inline
@@ -46,7 +46,7 @@ def _row(corner, x, y, z, count, entries, dense):
     i, j, k = x + (corner & 1), y + (corner >> 1 & 1), z + (corner >> 2)
     if dense:
         return i + (count + 1) * (j + (count + 1) * k)
-    return (i ^ (j * _PRIME_Y) ^ (k * _PRIME_Z)) & (entries - 1)
+    return (i ^ (j * PRIME_Y) ^ (k * PRIME_Z)) & (entries - 1)
 
 
 @inline

@@ -75,7 +75,9 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
     if not entry.seeds:
         return {**about, "reason": entry.reason}
     first = board.protocol["scores"][0]
-    links = [] if folder is None else [os.path.relpath(one / ".hydra" / "config.yaml", folder) for one in entry.folders]
+    links = (
+        [] if folder is None else [os.path.relpath(run.folder / ".hydra" / "config.yaml", folder) for run in entry.runs]
+    )
     return {
         **about,
         "scores": {name: entry.mean(name) for name in board.protocol["scores"]},
@@ -144,7 +146,7 @@ def _picture(values: np.ndarray, low: float, high: float, colormap: str) -> str:
 
 def _render(entry: Entry, name: str) -> np.ndarray | None:
     """The render of a view by the first run of an entry; None where its folder has none any more."""
-    for place in (folder / kind for folder in entry.folders[:1] for kind in (SUBMISSION, entry.scene)):
+    for place in (run.folder / kind for run in entry.runs[:1] for kind in (SUBMISSION, entry.scene)):
         for ending in ENDINGS:
             path = place / f"{name}{ending}"
             if path.is_file():

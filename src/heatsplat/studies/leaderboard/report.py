@@ -155,12 +155,13 @@ def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object
         about = {"method": entry.method, "scene": entry.scene, "track": entry.track}
         if entry.told is not None:
             rows.append({**about, **entry.told["scores"], **entry.told["cost"], "seeds": entry.told["seeds"]})
-        elif not entry.scores:
+        elif not entry.runs:
             rows.append({**about, "reason": entry.reason})
-        for score, cost, folder in zip(entry.scores, entry.costs, entry.folders, strict=True):
+        for run in entry.runs:
+            score = run.score
             values = {name: score.mean(name) for name in board.protocol["scores"]}
             by_part = {
                 f"{name}_{part}": score.mean(name, part) for part in score.parts for name in board.protocol["scores"]
             }
-            rows.append({**about, **values, **by_part, **cost, "folder": os.path.basename(folder)})
+            rows.append({**about, **values, **by_part, **run.cost, "folder": os.path.basename(run.folder)})
     return rows

@@ -8,7 +8,7 @@ import math
 import re
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +35,32 @@ SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
 
 
+@dataclass(frozen=True)
+class Result:
+    """What a run came to.
+
+    Args:
+        seed: of the run.
+        score: of its renders.
+        cost: seconds, memory_mb, gaussians and steps, where known.
+        folder: where it lies.
+        command: what it was run with.
+    """
+
+    seed: int
+    score: SceneScore
+    cost: Mapping[str, float]
+    folder: Path
+    command: str
+
+
 @dataclass
 class Entry:
     """A method on a scene in a track: the runs of its seeds.
 
     Args:
         method, scene, track: what it is.
-        numbers: seeds of the runs that have results.
-        scores: a score for each of them.
-        costs: seconds, memory_mb, gaussians and steps of each, where known.
-        folders: where each lies.
-        commands: what each was run with.
+        runs: those that have results, each of a seed of its own.
         told: what an earlier page says of other seeds, which counts beside the runs; None without.
         reason: why there are none.
         rank: best and worst rank that the seeds allow, in its scene and track; None without results.
@@ -54,11 +69,7 @@ class Entry:
     method: str
     scene: str
     track: str
-    numbers: list[int] = field(default_factory=list)
-    scores: list[SceneScore] = field(default_factory=list)
-    costs: list[dict[str, float]] = field(default_factory=list)
-    folders: list[Path] = field(default_factory=list)
-    commands: list[list[str]] = field(default_factory=list)
+    runs: list[Result] = field(default_factory=list)
     told: Mapping[str, Any] | None = None
     reason: str = "not run yet"
     rank: tuple[int, int] | None = None
@@ -71,7 +82,8 @@ class Entry:
     @property
     def all_numbers(self) -> list[int]:
         """Seeds of all results, those of an earlier page first."""
-        return [*numbers_of(self.told), *self.numbers] if self.told is not None else list(self.numbers)
+        told = numbers_of(self.told) if self.told is not None else ()
+        return [*told, *(run.seed for run in self.runs)]
 
     @property
     def seeds(self) -> int:
@@ -82,42 +94,28 @@ class Entry:
     def parts(self) -> list[str]:
         """What views are held out by; empty without results."""
         told = self.told["parts"] if self.told is not None else ()
-        return list(dict.fromkeys((*told, *(part for score in self.scores for part in score.parts))))
+        return list(dict.fromkeys((*told, *(part for run in self.runs for part in run.score.parts))))
 
     @property
     def command(self) -> str:
         """What the first seed was run with."""
-        return str(self.told["command"]) if self.told is not None else " ".join(self.commands[0])
-
-    def add(self, number: int, score: SceneScore, cost: dict[str, float], folder: Path, command: list[str]) -> None:
-        """Adds the results of a seed."""
-        self.numbers.append(number)
-        self.scores.append(score)
-        self.costs.append(cost)
-        self.folders.append(folder)
-        self.commands.append(command)
+        return str(self.told["command"]) if self.told is not None else self.runs[0].command
 
     def join(self, told: Mapping[str, Any]) -> None:
         """Adds what an earlier page says, unless there are runs of all its seeds; runs of some of them then do not count."""
         known = set(numbers_of(told))
-        if known <= set(self.numbers):
-            return
-        self.told = told
-        others = [k for k, number in enumerate(self.numbers) if number not in known]
-        for name in ("numbers", "scores", "costs", "folders", "commands"):
-            each = getattr(self, name)
-            setattr(self, name, [each[k] for k in others])
+        if not known <= {run.seed for run in self.runs}:
+            self.told, self.runs = told, [run for run in self.runs if run.seed not in known]
 
     def scale_seconds(self, factor: float) -> None:
         """Makes the seconds of the runs those of another machine."""
-        self.costs = [
-            {**cost, "seconds": cost["seconds"] * factor} if cost.get("seconds") is not None else cost
-            for cost in self.costs
-        ]
+        for k, run in enumerate(self.runs):
+            if run.cost.get("seconds") is not None:
+                self.runs[k] = replace(run, cost={**run.cost, "seconds": run.cost["seconds"] * factor})
 
     def values(self, score: str, part: str | None = None) -> list[float]:
         """A score of each run; all views, or those of a part."""
-        found = (one.mean(score, part) for one in self.scores)
+        found = (run.score.mean(score, part) for run in self.runs)
         return [value for value in found if value is not None and math.isfinite(value)]
 
     def mean(self, score: str, part: str | None = None) -> float | None:
@@ -140,7 +138,7 @@ class Entry:
 
     def cost(self, name: str) -> float | None:
         """Mean of a cost over the seeds that tell it."""
-        values = [cost[name] for cost in self.costs if cost.get(name) is not None]
+        values = [run.cost[name] for run in self.runs if run.cost.get(name) is not None]
         return self._mean(values, self.told["cost"].get(name) if self.told is not None else None)
 
     def _mean(self, values: Sequence[float], told: float | None) -> float | None:
@@ -178,7 +176,8 @@ def standings(folder: Path, board: Board) -> Standings:
         for scene, score in scored.items():
             key = (told["method"], scene, told.get("track", board.tracks[0]))
             entry = places.setdefault(key, Entry(*key))
-            entry.add(entry.seeds, score, dict(score.cost), submission, [str(told.get("code", "a submission"))])
+            command = str(told.get("code", "a submission"))
+            entry.runs.append(Result(entry.seeds, score, score.cost, submission, command))
     page, note = None, ""
     if board.earlier is not None:
         page = read_page(board.earlier, board)
@@ -233,8 +232,8 @@ def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: 
         "memory_mb": cost.get("peak_memory_mb"),
         "gaussians": cost.get("gaussians"),
     }
-    command = [f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name)]
-    entry.add(seed, score, {**told, "steps": results["run"].get("steps")}, folder, command)
+    command = " ".join(f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name))
+    entry.runs.append(Result(seed, score, {**told, "steps": results["run"].get("steps")}, folder, command))
 
 
 def _of_the_board(name: str) -> bool:
