@@ -24,6 +24,8 @@ from heatsplat.training.rng import generator_for
 # is right to second order on a smooth surface, but not at an edge.
 _EDGE_K = 0.05
 _FIELD_OF_VIEW_DEG = 48.0
+# Likewise in colour, which alone shows the edges behind glass: a quarter of a step of 8 bits.
+_EDGE_COLOR = 0.25 / 255
 # Colour of a source that is hot enough to be seen in the dark.
 _GLOWING = (0.9, 0.35, 0.15)
 
@@ -267,15 +269,23 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
         return celsius, color, scene.transmits[which] > 0
 
     celsius, color, clear = look(rays)
-    image = celsius.reshape(1, 1, lens.height, lens.width)
-    around = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
-    edges = (((image - around).abs() > _EDGE_K).reshape(-1) | clear).nonzero()[:, 0]  # behind glass, heat has none
+    edges = _stands_out(celsius[:, None], lens) > _EDGE_K
+    if clear.any():
+        edges |= clear & (_stands_out(color, lens) > _EDGE_COLOR)
+    edges = edges.nonzero()[:, 0]
     third = torch.tensor([-1 / 3, 0.0, 1 / 3], dtype=torch.float64)
     within = torch.cartesian_prod(third, third)
     fine_celsius, fine_color, _ = look(pixel_rays(lens, (pixel_centres(lens)[edges, None] + within).reshape(-1, 2)))
     celsius[edges] = fine_celsius.reshape(-1, len(within)).mean(1)
     color[edges] = fine_color.reshape(-1, len(within), 3).mean(1)
     return celsius.reshape(lens.height, lens.width), color.reshape(lens.height, lens.width, 3)
+
+
+def _stands_out(values: Tensor, lens: Lens) -> Tensor:
+    """How far the pixels of ``values`` [H * W, C] differ from the mean of their neighbours, in any channel, [H * W]."""
+    image = values.T.reshape(1, -1, lens.height, lens.width)
+    around = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    return (image - around).abs().amax(1).reshape(-1)
 
 
 def hits(scene: Scene, viewmat: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

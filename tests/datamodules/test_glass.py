@@ -76,6 +76,23 @@ def test_the_tracer_adds_shares_of_every_pane_on_the_way():
     assert torch.allclose(found, expected, atol=1e-6)
 
 
+def test_colour_behind_the_pane_is_averaged_over_the_pixel():
+    """Heat shows no edge there, so that colour has to find its own: a pixel holds what 8 x 8 rays hold, not one."""
+    recording, fine = recorded("glass"), 8
+    scene, viewmat = recording.scene, torch.from_numpy(recording.viewmats[1])
+    y, x = (np.mgrid[: 52 * fine, : 64 * fine] + 0.5) / fine
+    directions = (
+        pixel_rays(recording.lens, torch.from_numpy(np.stack([x, y], axis=-1).reshape(-1, 2))) @ viewmat[:3, :3]
+    )
+    points, which = scene.first_hits(-(viewmat[:3, :3].T @ viewmat[:3, 3])[None], directions)
+    each = scene.visible(points, which, directions).reshape(1, 52 * fine, 64 * fine, 3).movedim(3, 1)
+    exact = torch.nn.functional.avg_pool2d(each, fine)[0].movedim(0, 2).numpy()
+    at_centres = each[0, :, fine // 2 :: fine, fine // 2 :: fine].movedim(0, 2).numpy()
+    pane = recording.shows(1, "pane")
+    error, of_one_ray = (np.abs(image - exact)[pane] for image in (recording.rgb[1] / 255.0, at_centres))
+    assert error.std() < 0.3 * of_one_ray.std() and np.quantile(error, 0.99) < 0.4 * np.quantile(of_one_ray, 0.99)
+
+
 def test_where_nothing_transmits_light_stops_at_the_first_surface():
     scene = Scene(PRESETS["static"])
     points, which, directions = rays_through(scene, 1)
