@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,13 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
 from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.side_files import finite, json_object, read_table
-from heatsplat.datamodules.timestamps import dji_time, stem_of, time_by_pattern, times_from_csv
+from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 WORLD_FILE = "world.json"  # of a prepared folder: metres_per_unit of the sparse model, where GPS has told it
@@ -190,22 +191,21 @@ class Colmap(SceneDataModule):
         if self.time_csv:
             path = folder / Path(self.time_csv).expanduser()
             path = path if path.is_file() else Path(self.time_csv).expanduser().absolute()
-            table = times_from_csv(path, *self.time_csv_columns)
-            missing = [name for name in names if stem_of(name) not in table]
-            if missing:
+            times = _looked_up(times_from_csv(path, *self.time_csv_columns), names, path)
+            if missing := [name for name in names if name not in times]:
                 raise SceneError(
                     f"data.time_csv: {path} has no row for {missing[0]} ({len(missing)} of {len(names)} images); "
                     f"column {self.time_csv_columns[0]} must hold the image names"
                 )
-            return {name: table[stem_of(name)] for name in names}, f"{path.name}, column {self.time_csv_columns[1]}"
+            return times, f"{path.name}, column {self.time_csv_columns[1]}"
         if self.time_regex:
             times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
             return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
         path = folder / FRAMES_FILE  # without times where a frame had none
         if path.is_file() and "time_s" in read_table(path).columns:
-            table = times_from_csv(path, "file", "time_s")
-            if all(stem_of(name) in table for name in names):
-                return {name: table[stem_of(name)] for name in names}, path.name
+            times = _looked_up(times_from_csv(path, "file", "time_s"), names, path)
+            if len(times) == len(names):
+                return times, path.name
         times = {name: dji_time(name) for name in names}
         if all(t is not None for t in times.values()):
             return times, "DJI file names (whole seconds, the camera's clock)"  # type: ignore[return-value]
@@ -259,3 +259,20 @@ def match_model(
 
 def _some(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(names[:most]) + (" ..." if len(names) > most else "")
+
+
+def _looked_up(times: Mapping[str, float], names: Sequence[str], path: Path) -> dict[str, float]:
+    """Seconds of those images that the table in ``path`` names, with folders or without.
+
+    Raises:
+        SceneError: it has different times for an image.
+    """
+    found = {}
+    for name, rows in same_files(names, times).items():
+        if len({times[row] for row in rows}) > 1:
+            raise SceneError(
+                f"{path}: {' and '.join(rows)} have different times and may both be {name}; keep one of them"
+            )
+        if rows:
+            found[name] = times[rows[0]]
+    return found

@@ -13,6 +13,7 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import (
     PSEUDO_COLOUR_LEVELS,
@@ -43,8 +44,8 @@ class Nerfstudio(SceneDataModule):
     Args:
         rgb: True to load the visible images as well.
         random_points: number of points to make up where the scene has none.
-        shared: options of every loader (``SceneDataModule``). The split "names" takes what the JSON lists where it lists
-            all frames, and every 8th frame where neither it nor any name speaks of train or test.
+        shared: options of every loader (``SceneDataModule``). The split "names" takes what the JSON lists, without
+            frames in none of its lists, and every 8th frame where neither it nor any name speaks of train or test.
     """
 
     def __init__(self, *, split: str = "names", rgb: bool = True, random_points: int = 20_000, **shared: Any) -> None:
@@ -64,6 +65,11 @@ class Nerfstudio(SceneDataModule):
         if first.assumed:
             notes["keys_assumed"] = f"image paths stand under {first.assumed}"
         frames, found = self._frames(folder, listed, bounds)
+        if self.split.rule in ("names", "json") and any(f.subset for f in frames):
+            if unlisted := [f.name for f in frames if not f.subset]:
+                found["images_unlisted"] = f"{len(unlisted)} frames are in no list, dropped: {', '.join(unlisted[:5])}"
+                log.warning("scene %s: %s of %s", folder.name, found["images_unlisted"], first.path.name)
+            frames = [f for f in frames if f.subset]
         points, colors, origin = self._points(folder, first, frames)
         notes |= found | origin | {"time_source": "none: the data set has no times"}
         split, says = self._split(frames, first)
@@ -84,7 +90,7 @@ class Nerfstudio(SceneDataModule):
         """The rule, and a note where it is not the one that was asked for."""
         if self.split.rule != "names":
             return self.split, {}
-        if all(f.subset for f in frames):
+        if frames[0].subset:
             return SplitRule("json"), {"split_source": f"train and test lists in {transforms.path.name}"}
         words = (*TRAIN_WORDS, *TEST_WORDS)
         if any(word in PurePosixPath(f.name).stem.lower() for f in frames for word in words):
@@ -115,9 +121,12 @@ class Nerfstudio(SceneDataModule):
             )
             if not photos:
                 entries = [(*entry[:3], entry[4], None) for entry in entries]
-        subset_of = _listed_subsets([*listed])
+        subsets = _listed_subsets([*listed], entries)
+        mains = [entry[4] if photos else entry[3] for entry in entries]
+        plain_names = [PurePosixPath(main).name for main in mains if main is not None]
+        with_folders = len(listed) > 1 or len(set(plain_names)) < len(plain_names)
         frames, missing, visible = [], [], 0
-        for transforms, subset, frame, file, rgb_file in entries:
+        for (transforms, subset, frame, file, rgb_file), in_list in zip(entries, subsets, strict=True):
             main = rgb_file if photos else file
             if main is None:
                 missing.append(str(frame["file_path"]))
@@ -125,7 +134,7 @@ class Nerfstudio(SceneDataModule):
             rgb_file = rgb_file if self.rgb or photos else None
             visible += rgb_file is not None
             read = partial(read_image, folder / main)
-            name = PurePosixPath(main).name if len(listed) == 1 else main
+            name = main if with_folders else PurePosixPath(main).name
             frames.append(
                 RawFrame(
                     name=name,
@@ -134,7 +143,7 @@ class Nerfstudio(SceneDataModule):
                     read=None if photos else read,
                     read_rgb=partial(read_image, folder / rgb_file) if rgb_file else None,
                     read_mask=self.mask_reader(masks, name),
-                    subset=subset or subset_of.get(stem_of(main)),
+                    subset=subset or in_list,
                 )
             )
         if not frames:
@@ -205,9 +214,15 @@ def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
     return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
 
 
-def _listed_subsets(files: Sequence[Transforms]) -> dict[str, str]:
-    """Subset by file stem, from the lists that a transforms file may have (train_filenames, ...)."""
-    subsets: dict[str, str] = {}
+def _listed_subsets(files: Sequence[Transforms], entries: Sequence[tuple[Any, ...]]) -> list[str | None]:
+    """Subset of each frame, from the lists that a transforms file may have (train_filenames, ...).
+
+    They name what stands under file_path, or the stored image.
+
+    Raises:
+        SceneError: a list is none, or names no frame, or two subsets name the same.
+    """
+    subset_of: dict[str, str] = {}
     for transforms in files:
         for key, subset in (("train", "train"), ("val", "test"), ("eval", "test"), ("test", "test")):
             listed = transforms.values.get(f"{key}_filenames") or []
@@ -215,7 +230,22 @@ def _listed_subsets(files: Sequence[Transforms]) -> dict[str, str]:
                 raise SceneError(
                     f"{transforms.path}: {key}_filenames is {shortened(listed)}, a list of names is needed"
                 )
-            subsets |= {stem_of(str(name)): subset for name in listed}
+            subset_of |= {str(name): subset for name in listed}
+    paths = [str(frame["file_path"]) for _, _, frame, *_ in entries]
+    stored = [file or visible or path for (*_, file, visible), path in zip(entries, paths, strict=True)]
+    found = [same_files(names, subset_of) for names in (paths, stored)]
+    subsets = []
+    for path, file in zip(paths, stored, strict=True):
+        named = {subset_of[name] for name in found[0][path] or found[1][file]}
+        if len(named) > 1:
+            raise SceneError(
+                f"{files[0].path}: the lists name {path} both for training and for testing; keep one of them"
+            )
+        subsets.append(next(iter(named), None))
+    if subset_of and not any(subsets):
+        raise SceneError(
+            f"{files[0].path}: its lists name none of its frames: {next(iter(subset_of))} is not among {paths[0]}, ..."
+        )
     return subsets
 
 

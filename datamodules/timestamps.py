@@ -92,7 +92,7 @@ def time_by_pattern(name: str, regex: str, form: str | None) -> float:
 
 
 def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, float]:
-    """Seconds by file stem from a table; the time column holds seconds or ISO 8601 date-times.
+    """Seconds by file, named as in the table; the time column holds seconds or ISO 8601 date-times.
 
     Raises:
         SceneError: no such file or column, a cell that is neither, or two times of one file.
@@ -106,7 +106,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     name_at, time_at = table.columns.index(name_column), table.columns.index(time_column)
     times: dict[str, float] = {}
     for number, row in table.rows:
-        cell, stem = row[time_at], stem_of(row[name_at])
+        cell = row[time_at]
         try:
             seconds = _seconds_of(table.pointed(cell))
         except ValueError as error:
@@ -114,7 +114,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
                 f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
                 "such as 2024-08-06T15:35:05.376"
             ) from error
-        if times.setdefault(stem, seconds) != seconds:
+        if times.setdefault(row[name_at], seconds) != seconds:
             raise SceneError(
                 f"{path}, line {number}: {row[name_at]} has another time in a line above; keep one of them"
             )

@@ -92,6 +92,23 @@ QUANTITIES: dict[str, Quantity] = {
     RAIN: Quantity(RAIN_NAMES, {"mm_h": (1.0, 0.0), "in_h": (25.4, 0.0), "kg_m2_s": (3600.0, 0.0)}, 0.0, 500.0),
     FALLEN: Quantity(RAIN_NAMES, {"mm": (1.0, 0.0), "in": (25.4, 0.0)}, 0.0, 500.0),
 }  # fmt: skip
+# Units as programs write them, by what they are above.
+SPELLINGS = {
+    spelling: unit
+    for unit, spellings in {
+        "c": ("degc", "deg_c", "degrees_c", "celsius", "deg_celsius", "degrees_celsius"),
+        "f": ("degf", "deg_f", "degrees_f", "fahrenheit"),
+        "k": ("kelvin", "degk"),
+        "m_s": ("ms", "mps", "m_sec", "meters_per_second", "metres_per_second"),
+        "km_h": ("kph", "km_hr"),
+        "kn": ("kt", "kts", "knot", "knots"),
+        "w_m2": ("wm2", "w_per_m2", "watts_m2"),
+        "kw_m2": ("kwm2",),
+        "mbar": ("mb", "millibar"),
+        "mm_h": ("mm_hr", "mmh"),
+    }.items()
+    for spelling in spellings
+}
 TIME_NAMES = ("time", "utc", "time_utc", "timestamp", "timestamp_utc", "datetime", "datetime_utc", "date", "date_time",
               "time_s", "epoch_s", "unix_s", "seconds")  # fmt: skip
 
@@ -274,20 +291,38 @@ def _plain(name: str) -> str:
         .replace("°", "")
         .replace("m-2", "m2")
         .replace("s-1", "s")
+        .replace("^", "")
     )
     return re.sub(r"[^a-z0-9]+", "_", text).strip("_")
 
 
-def _quantity(plain: str) -> tuple[str, tuple[float, float]] | None:
-    """Which column of the weather a name means, and its unit; None for something else. Raises ValueError without unit."""
+def _quantity(header: str) -> tuple[str, tuple[float, float]] | None:
+    """Which column of the weather a name means, and its unit; None for something else.
+
+    Raises:
+        ValueError: it has no unit, or one in brackets that is none of the quantity's.
+    """
+    plain = _plain(header)
+    named, bracket, _ = header.partition("[") if "[" in header else header.partition("(")
     for name, quantity in QUANTITIES.items():
         for alias in quantity.aliases:
-            if plain == alias:
-                units = ", ".join(f"{alias}_{unit}" for unit in quantity.units)
-                raise ValueError(f"has no unit; name it one of {units}")
-            if plain.startswith(alias + "_") and (unit := plain[len(alias) + 1 :]) in quantity.units:
+            unit = plain[len(alias) + 1 :]
+            unit = SPELLINGS.get(unit, unit)
+            if plain.startswith(alias + "_") and unit in quantity.units:
                 return name, quantity.units[unit]
+    for quantity in QUANTITIES.values():
+        for alias in quantity.aliases:
+            if plain == alias or (bracket and _plain(named) == alias):
+                units = ", ".join(f"{alias}_{unit}" for unit in quantity.units)
+                raise ValueError(f"has {'no unit' if plain == alias else 'an unknown unit'}; name it one of {units}")
     return None
+
+
+def _like(header: str) -> str | None:
+    """The quantity that a column may be meant to be that was not understood: its name begins as that one's does."""
+    plain = _plain(header)
+    begin = {alias: name for name, quantity in QUANTITIES.items() for alias in quantity.aliases}
+    return next((begin[alias] for alias in sorted(begin, key=len) if plain.startswith(alias + "_")), None)
 
 
 def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
@@ -306,11 +341,11 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
         )
     wanted: dict[str, tuple[int, tuple[float, float]]] = {}
     unused = []
-    for position, name in enumerate(plain):
+    for position in range(len(header)):
         if position == time_at:
             continue
         try:
-            found = _quantity(name)
+            found = _quantity(header[position])
         except ValueError as error:
             raise SceneError(f"{path}: column {header[position]!r} {error}") from error
         if found is None:
@@ -323,6 +358,9 @@ def _read_table(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.
             wanted[found[0]] = (position, found[1])
     if not wanted:
         raise SceneError(f"{path} has none of the columns {', '.join(QUANTITIES)}; it has {', '.join(header)}")
+    for name in unused:
+        if (quantity := _like(name)) is not None and quantity not in wanted:
+            log.warning("%s: column %r is not used; if it is %s in another unit, call it that", path, name, quantity)
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
     for number, cells in table.rows:

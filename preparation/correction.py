@@ -191,6 +191,11 @@ def correct_scene(
         check_numbers("correct.refractive_index", index, error=SceneError)
     if index is not None and not index > 1:
         raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
+    own = next((folder for folder in reversed(folders) if folder.is_dir()), None)  # a root may hold several scenes
+    if own is not None and target.resolve() == own.resolve():
+        raise SceneError(
+            f"target={target} is the folder of the scene that is to be corrected, whose images would be lost: give another one"
+        )
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
     doubts = [_doubt(views, depth_of, scene.points), "" if index is None else _unsettled(views, depth_of, scene.points)]

@@ -15,12 +15,13 @@ import numpy as np
 from PIL import Image
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.exif import exif_in
 from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_image, to_grey
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
-from heatsplat.datamodules.timestamps import dji_time, instant, stem_of, zone_of
+from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
@@ -357,10 +358,27 @@ def _exposure(path: Path) -> str:
 
 
 def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
+    """Frames with the photo of the same exposure: of several that may be, one of the same name, in the same folder.
+
+    Cards count from one in every folder: a photo beside a frame of its exposure is no other frame's.
+    """
+    frames = list(frames)
     by_exposure: dict[str, list[Path]] = {}
     for photo in photos:
         by_exposure.setdefault(_exposure(photo), []).append(photo)
-    return [replace(f, rgb=next(iter(by_exposure.get(_exposure(f.path), [])), None)) for f in frames]
+    beside = {(_exposure(frame.path), frame.path.parent) for frame in frames}
+
+    def photo_of(frame: Path) -> Path | None:
+        def unlike(photo: Path) -> tuple[bool, bool]:
+            return photo.stem.lower() != frame.stem.lower(), photo.parent != frame.parent
+
+        exposure = _exposure(frame)
+        free = (
+            p for p in by_exposure.get(exposure, []) if p.parent == frame.parent or (exposure, p.parent) not in beside
+        )
+        return min(free, key=unlike, default=None)
+
+    return [replace(frame, rgb=photo_of(frame.path)) for frame in frames]
 
 
 def _zoned(frame: Frame, zone: str | None) -> Frame:
@@ -393,21 +411,30 @@ def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list
             f"table={reading.table} has none of the columns {', '.join(c for k, c in reading.columns.items() if k != 'name')}; "
             f"it has {', '.join(table.columns)}: say which is which, as in table_columns.time={table.columns[-1]}"
         )
-    rows = {stem_of(cells[at["name"]]): (line, cells) for line, cells in table.rows}
-    matched = sum(frame.path.stem in rows for frame in frames)
+    by_name: dict[str, tuple[int, list[str]]] = {}
+    for line, cells in table.rows:
+        if by_name.setdefault(cells[at["name"]], (line, cells))[1] != cells:
+            raise SceneError(f"table={reading.table}, line {line}: {cells[at['name']]} has another row above; keep one")
+    rows = {}
+    for path, names in same_files([frame.path.as_posix() for frame in frames], by_name).items():
+        if len(names) > 1:
+            raise SceneError(f"table={reading.table}: {' and '.join(names)} may both be {path}; keep one of them")
+        if names:
+            rows[path] = by_name[names[0]]
+    matched = sum(frame.path.as_posix() in rows for frame in frames)
     if not matched:
         raise SceneError(
             f"table={reading.table} has no row for any of the {len(frames)} frames, such as {frames[0].path.name}; "
-            f"its column {reading.columns['name']} begins with {next(iter(rows), 'nothing')}"
+            f"its column {reading.columns['name']} begins with {next(iter(by_name), 'nothing')}"
         )
     notes.append(
         f"{reading.table.name} tells {', '.join(sorted(at.keys() - {'name'}))} of {matched} of {len(frames)} frames"
     )
 
     def of(frame: Frame) -> Frame:
-        if frame.path.stem not in rows:
+        if frame.path.as_posix() not in rows:
             return frame
-        line, cells = rows[frame.path.stem]
+        line, cells = rows[frame.path.as_posix()]
 
         def number(key: str) -> float | None:
             if key not in at or not cells[at[key]]:

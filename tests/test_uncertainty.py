@@ -13,7 +13,7 @@ from weathered import CAMERA
 from heatsplat.composition import build
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
-from heatsplat.uncertainty import Uncertainty, _shares, evidence, redundancy
+from heatsplat.uncertainty import Uncertainty, _pixels, _shares, evidence, redundancy
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
 
@@ -55,6 +55,14 @@ def test_evidence_is_that_of_least_squares(count):
     assert (told >= exact * (1 - 1e-5)).all() and (told <= high * exact).all()
     masked = evidence(module, [replace(seen, mask=torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool))])
     assert (masked.weight == 0).all()
+
+
+def test_what_stands_under_a_mask_says_nothing_of_the_scene():
+    image = torch.rand(CAMERA.height, CAMERA.width, 1, generator=torch.Generator().manual_seed(0))
+    mask = torch.arange(CAMERA.width).expand(CAMERA.height, -1) >= 4
+    filled = image.where(mask[..., None], 9.0)
+    assert torch.equal(_pixels(View(FRAME, filled, mask=mask), "thermal"), image[mask].flatten())
+    assert len(_pixels(View(FRAME, filled), "thermal")) == image.numel()
 
 
 def test_it_needs_training_views():

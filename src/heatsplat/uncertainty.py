@@ -47,6 +47,12 @@ class Evidence:
     misfit: Tensor
 
 
+def _pixels(view: View, modality: str) -> Tensor:
+    """Values of the pixels of a view that its mask leaves, of any shape in a row."""
+    image = view.image(modality)
+    return (image if view.mask is None else image[view.mask]).flatten()
+
+
 def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
     """Σ_p w_ip α_p m_p [N, M] of maps m [H, W, M] over the pixels of a view that count; maps of 1 are weights."""
     with torch.enable_grad():  # what pixels gather from Gaussians, the gradient gives back to them
@@ -138,7 +144,12 @@ class Uncertainty:
         self.module = module
         self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
         self.noise = noise_of_views(scene.train, module.modality)
-        self.prior = float(torch.cat([view.image(module.modality).flatten()[::7] for view in scene.train]).std())
+        known = torch.cat([_pixels(view, module.modality)[::7] for view in scene.train])
+        if not len(known):
+            raise SceneError(
+                f"masks leave no pixel of the training views of scene '{scene.name}', which tell how certain it is"
+            )
+        self.prior = float(known.std(correction=0))
         self.evidence = evidence(module, scene.train)
         self.held_out = scene.val if len(scene.val) else scene.train
         if not len(scene.val):
@@ -209,7 +220,10 @@ class Uncertainty:
             return torch.stack(found, dim=1) if found else torch.zeros(len(now), 0, dtype=torch.float64)
 
         spread = (
-            torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1).cpu().double().var(0)
+            torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1)
+            .cpu()
+            .double()
+            .var(0, correction=min(1, len(module.splats) - 1))  # one alone has no spread
         )
         known, pulled, weights, residuals = 0.0, 0.0, [], []
         for view in sorted(module.scene.train, key=lambda view: view.time_s or 0.0):

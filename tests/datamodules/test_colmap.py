@@ -100,6 +100,20 @@ def test_times_by_pattern_and_by_table(tmp_path):
     assert by_table.notes["time_source"] == "t.csv, column utc"
 
 
+def test_a_table_tells_images_of_one_name_apart_by_their_folders(tmp_path):
+    files = [f"{camera}/{i}.png" for camera in ("left", "right") for i in range(5)]
+    write_colmap(tmp_path, files)
+    (tmp_path / "t.csv").write_text("\n".join(["file,time_s", *(f"{file},{i}" for i, file in enumerate(files))]))
+    scene = loaded(tmp_path, time_csv="t.csv")
+    times = {frame.name: frame.time_s for frame in (*scene.train.frames, *scene.test.frames)}
+    assert [times[file] - times[files[0]] for file in files] == list(range(10))
+    (tmp_path / "t.csv").write_text("\n".join(["file,time_s", "a/0.png,1", "b/0.png,2"]))
+    with pytest.raises(
+        SceneError, match="a/0.png and b/0.png have different times and may both be left/0.png; keep one"
+    ):
+        loaded(tmp_path, time_csv="t.csv")
+
+
 def test_a_table_without_a_frame_names_it(tmp_path):
     write_colmap(tmp_path, names(9))
     (tmp_path / "t.csv").write_text("file,time_s\nframe_000.png,0\n")

@@ -239,7 +239,7 @@ ROWS = [["file", "time_s"], ["a.png", "0,5"], ["b.png", "1,25"], ["", ""]]
 def test_tables_of_excel_are_read(tmp_path, encoding, first):
     path = tmp_path / "t.csv"
     path.write_bytes((first + "\r\n".join(map(";".join, ROWS))).encode(encoding))
-    assert times_from_csv(path, "file", "time_s") == {"a": 0.5, "b": 1.25}
+    assert times_from_csv(path, "file", "time_s") == {"a.png": 0.5, "b.png": 1.25}
     path.write_bytes((first + "time_s;Temperatur;air_°C\r\n0,5;x;20,5\r\n1,5;x;21,5\r\n;;\r\n").encode(encoding))
     weather = read_weather(path)
     assert weather.air_c.tolist() == [20.5, 21.5] and weather.times_s.tolist() == [0.5, 1.5]

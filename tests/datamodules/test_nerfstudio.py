@@ -144,3 +144,40 @@ def test_photos_with_a_sparse_model(tmp_path):
     np.testing.assert_allclose(scene.train[0].rgb * 255, photo(1), atol=1e-4)
     with pytest.raises(SceneError, match="data.images=null is for photos alone"):
         Colmap(images=None)
+
+
+def two_cameras(folder, lists):
+    """Frames 0 to 3 of two cameras, whose files have the same names."""
+    files = [f"thermal/cam{camera}/{i}.png" for camera in (0, 1) for i in range(4)]
+    for i, file in enumerate(files):
+        write_image(folder / file, grey(i))
+    write_frames(folder, [{"file_path": file} for file in files], **lists(files))
+    return loaded(folder)
+
+
+def test_lists_tell_files_of_one_name_apart_by_their_folders(tmp_path):
+    scene = two_cameras(tmp_path / "a", lambda files: {"train_filenames": files[:4], "test_filenames": files[4:]})
+    assert [f.name for f in scene.test.frames] == [f"thermal/cam1/{i}.png" for i in range(4)]
+    assert np.allclose(scene.test[2].thermal[..., 0].numpy() * 255, grey(6), atol=0.5)
+
+
+def test_frames_in_no_list_are_dropped_and_told(tmp_path):
+    scene = two_cameras(tmp_path / "a", lambda files: {"train_filenames": files[1:4], "test_filenames": files[:1]})
+    assert [f.name for f in scene.test.frames] == ["thermal/cam0/0.png"] and len(scene.train) == 3
+    assert scene.notes["images_unlisted"].startswith("4 frames are in no list, dropped: thermal/cam1/0.png")
+    with pytest.raises(
+        SceneError, match="its lists name none of its frames: other.png is not among thermal/cam0/0.png"
+    ):
+        two_cameras(tmp_path / "b", lambda files: {"train_filenames": ["other.png"]})
+    with pytest.raises(SceneError, match="name thermal/cam0/0.png both for training and for testing; keep one of them"):
+        two_cameras(tmp_path / "c", lambda files: {"train_filenames": files, "test_filenames": ["./" + files[0]]})
+
+
+def test_lists_name_frames_by_their_visible_image(tmp_path):
+    frames = [{"file_path": f"rgb/{i}.png", "thermal_file_path": f"thermal/{i}_T.png"} for i in range(6)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], photo(i))
+        write_image(tmp_path / frame["thermal_file_path"], grey(i))
+    visible = [frame["file_path"] for frame in frames]
+    write_frames(tmp_path, frames, train_filenames=visible[:4], test_filenames=visible[4:])
+    assert [f.name for f in loaded(tmp_path).test.frames] == ["4_T.png", "5_T.png"]

@@ -72,9 +72,9 @@ def test_a_pattern_that_fails_names_the_image():
 def test_a_table_gives_seconds_or_dates(tmp_path):
     table = tmp_path / "t.csv"
     table.write_text("file,utc,s\nA_1,2024-08-06T15:35:05.376048,1.5\nA_2.png,2024-08-06T15:35:06.376048,2\n")
-    assert times_from_csv(table, "file", "s") == {"A_1": 1.5, "A_2": 2.0}
+    assert times_from_csv(table, "file", "s") == {"A_1": 1.5, "A_2.png": 2.0}
     dates = times_from_csv(table, "file", "utc")
-    assert dates["A_2"] - dates["A_1"] == pytest.approx(1.0, abs=1e-6)
+    assert dates["A_2.png"] - dates["A_1"] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_table_names_missing_columns_and_bad_cells(tmp_path):

@@ -60,6 +60,13 @@ def test_columns_are_known_by_name_and_unit(table):
         ("solar_kw_m2", "0.5", "irradiance_w_m2", 500.0),
         ("pressure_kpa", "101.3", "pressure_hpa", 1013.0),
         ("wind m s-1", "3", "wind_m_s", 3.0),
+        ("Air temperature [degC]", "12.5", "air_c", 12.5),
+        ("air_temperature_celsius", "12.5", "air_c", 12.5),
+        ("T_air (deg F)", "50", "air_c", 10.0),
+        ("Wind speed [kt]", "10", "wind_m_s", 5.14444),
+        ("GHI (W/m^2)", "7", "irradiance_w_m2", 7.0),
+        ("ghi_Wm-2", "7", "irradiance_w_m2", 7.0),
+        ("Pressure (mb)", "1013", "pressure_hpa", 1013.0),
     ],
 )
 def test_units_become_ours(table, header, value, name, expected):
@@ -146,6 +153,10 @@ def test_a_column_without_values_counts_as_missing(table):
         (
             ["time_s,temperature", "0,1", "1,2"],
             "column 'temperature' has no unit; name it one of temperature_c, temp.*_k",
+        ),
+        (
+            ["time_s,air_c,GHI [MJ/m2]", "0,1,2", "1,2,2"],
+            r"column 'GHI \[MJ/m2\]' has an unknown unit; name it one of ghi_w_m2, ghi_kw_m2",
         ),
         (["time_s,air_c,temp_k", "0,1,2", "1,2,2"], "'air_c' and 'temp_k' are both air_c"),
         (
@@ -295,6 +306,15 @@ def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
         read_weather(table("utc,rain", *day("1")))
     with pytest.raises(SceneError, match="rain_mm_h is -1"):
         read_weather(table("utc,rain_mm_h", *day("-1")))
+
+
+def test_a_column_that_may_be_one_in_another_unit_is_told(table, caplog):
+    """Wind has a direction, too; but a GHI in units that are not known must not become a cloudless sky without a word."""
+    rows = ["time_s,air_c,wind_m_s,wind_direction,ghi_mj_m2", "0,1,2,3,4", "60,1,2,3,4"]
+    weather = read_weather(table(*rows))
+    assert weather.irradiance_w_m2 is None and weather.notes["unused_columns"] == "wind_direction, ghi_mj_m2"
+    assert "column 'ghi_mj_m2' is not used; if it is irradiance_w_m2 in another unit, call it that" in caplog.text
+    assert "wind_direction" not in caplog.text
 
 
 def day(cells: str) -> list[str]:

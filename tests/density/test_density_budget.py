@@ -183,6 +183,18 @@ def test_edge_scores_by_what_training_images_show_and_not_by_errors():
     assert weight.all() and not wrong.any() and edge.dtype == error.dtype
 
 
+def test_pixels_that_are_not_known_have_no_edges_and_make_none():
+    policy = budget(start=0, stop=100, every=10, views=3, score="edge", noise=0.1, remove_at=())
+    target = (torch.arange(40) >= 20).float().expand(30, 40)[..., None].clone()
+    whole = policy.pixel_maps(torch.zeros(30, 40), target, 9)[..., 2]
+    target[:, 30:] = torch.nan
+    target[4:8, 19:22] = torch.nan
+    edge = policy.pixel_maps(torch.zeros(30, 40), target, 9)[..., 2]
+    assert not edge[:, 30:].any() and not edge[4:8, 19:22].any()
+    torch.testing.assert_close(edge[14:, :26], whole[14:, :26])
+    assert not policy.pixel_maps(torch.zeros(30, 40), torch.full((30, 40, 1), torch.nan), 9)[..., 2].any()
+
+
 def test_absgrad_scores_by_the_pull_on_screen_positions():
     policy = budget(start=0, stop=100, every=10, views=2, score="absgrad", remove_at=())
     assert policy.absgrad and policy.maps_at(9) == 0

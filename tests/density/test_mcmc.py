@@ -112,6 +112,11 @@ def test_the_number_grows_by_its_share_to_the_cap_and_never_beyond():
     assert len(cloud) == 130
 
 
+def test_an_endless_cap_is_refused():
+    with pytest.raises(ValueError, match="density.cap_max, which must be finite: set cap_max"):
+        policy(cap_max=float("inf"))
+
+
 def test_places_are_drawn_in_proportion_to_opacity():
     drawn = torch.zeros(2)
     for seed in range(200):

@@ -194,6 +194,16 @@ def test_what_cannot_be_corrected_is_refused_with_the_remedy(tmp_path, change, s
         )  # fmt: skip
 
 
+def test_the_scene_itself_is_no_target(tmp_path):
+    (tmp_path / "a").mkdir()
+    with pytest.raises(SceneError, match="is the folder of the scene that is to be corrected.*give another one"):
+        correct_scene(
+            scene(), lambda frame: DEPTH, [tmp_path, tmp_path / "a"], tmp_path / "a" / ".." / "a", Given(), BandResponse(), None,
+            METRES,
+        )  # fmt: skip
+    assert not list((tmp_path / "a").iterdir())
+
+
 def test_what_a_preparation_did_is_found_again(tmp_path):
     prepare(str(write_flir(tmp_path / "files", 2)), tmp_path / "scene", conditions={}, uncertainty={}, counts={})
     response, done = preparation_of("IR_0000.tiff", [tmp_path / "elsewhere", tmp_path / "scene"])

@@ -77,6 +77,38 @@ def test_photos_belong_to_the_frames_of_their_exposure(tmp_path):
     assert first.time == datetime(2024, 1, 1, 12)
 
 
+def test_cards_count_from_one_in_every_folder(tmp_path):
+    """A camera fills 100_FLIR and then 101_FLIR with files of the same names: tables and photos are told by folder."""
+    files = [f"{card}_FLIR/FLIR000{i}" for card in (100, 101) for i in (0, 1)]
+    for file in files:
+        write_images(tmp_path / "a" / file.split("/")[0], {f"{file.split('/')[1]}.tiff": FLOATS})
+    for file in files[:2]:
+        write_images(tmp_path / "a" / "100_FLIR", {f"{file.split('/')[1]}.jpg": np.zeros((8, 8, 3), np.uint8)})
+    table = tmp_path / "table.csv"
+    rows = [f"{file}.tiff,2024-07-01T10:00:0{i}Z" for i, file in enumerate(files)]
+    table.write_text("\n".join(["file,when", *rows]))
+    reading = Reading(table=table, columns={"name": "file", "time": "when"})
+    frames = read_frames(tmp_path / "a", reading)
+    assert [(f.path.parent.name, f.path.stem, f.time.second) for f in frames] == [
+        (*file.split("/"), i) for i, file in enumerate(files)
+    ]
+    assert [f.rgb is not None for f in frames] == [True, True, False, False]
+    table.write_text("\n".join(["file,when", rows[0], rows[0].replace("00Z", "09Z")]))
+    with pytest.raises(SceneError, match="line 3: 100_FLIR/FLIR0000.tiff has another row above; keep one"):
+        read_frames(tmp_path / "a", reading)
+    table.write_text("\n".join(["file,when", "x/FLIR0000,2024-07-01T10:00:00Z", "y/FLIR0000,2024-07-01T10:00:01Z"]))
+    with pytest.raises(SceneError, match="x/FLIR0000 and y/FLIR0000 may both be .*FLIR0000.tiff; keep one of them"):
+        read_frames(tmp_path / "a", reading)
+
+
+def test_photos_of_other_sides_are_left_to_them(tmp_path):
+    """_W and _S may stand for a modality or for a side of a house: the photo of the very name goes first."""
+    sides = ("N", "S", "W")
+    write_images(tmp_path, {f"facade_{side}.tiff": FLOATS for side in sides})
+    write_images(tmp_path, {f"facade_{side}.jpg": np.zeros((8, 8, 3), np.uint8) for side in sides})
+    assert all(frame.rgb.stem == frame.path.stem for frame in read_frames(tmp_path))
+
+
 def test_constants_of_a_camera_that_are_given_go_before_those_of_its_files(tmp_path):
     own, path = read_frames(write_flir(tmp_path, 1))[0], tmp_path
     p = own.calibration.response

@@ -518,6 +518,20 @@ def test_near_and_far_can_be_chosen(backend):
     assert_close(actual, oracle(scene, near=1.5, far=2.5))
 
 
+def test_what_lies_behind_a_finished_pixel_has_no_gradient(backend):
+    """Fine opaque dots finish all pixels around one of a block; a last dot finishes that one, and no other takes it."""
+    around = [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]
+    dots = [*around, *around, (0, 0), (0, 0)]
+    pixels = 5.5 + torch.tensor(dots, dtype=torch.float64)
+    depths = 1.0 + 0.01 * torch.arange(len(dots), dtype=torch.float64)[:, None]
+    K = facing([], 1.0, size=(16, 16)).K
+    centers = torch.cat([(pixels - K[:2, 2]) / K.diagonal()[:2] * depths, depths], dim=1).tolist()
+    scales = torch.tensor([*(1e-4 * depths[:, 0]), 1.4], dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.7, 1.3])
+    opacities = [*[0.9999] * (len(dots) - 2), 0.5, 0.9999, 0.5]
+    scene = facing([*centers, [0.0, 0.0, 1.4]], scales, opacities, size=(16, 16))
+    assert_close(run(backend, scene), oracle(scene))
+
+
 def test_behind_the_camera(backend):
     scene = facing([[0, 0, -2.0], [0.1, 0, 0.0], [0, 0, 2.0], [0.0, 0.2, -1e-6]], 0.3)
     actual = run(backend, scene)

@@ -1,9 +1,11 @@
 """Histograms that are brought to one and back: exact for a camera that drifts, reversible where an image is flat."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.sensors.histogram_alignment import HistogramAlignment
 
 CAMERA = Camera(torch.eye(4), torch.eye(3), 24, 16)
@@ -44,3 +46,18 @@ def test_no_strength_is_no_change_and_flat_images_stay_reversible():
     assert (shown.diff(dim=0) > 0).all()
     with pytest.raises(ValueError, match="strength"):
         HistogramAlignment(strength=2.0)
+
+
+def test_an_image_that_its_mask_hides_has_the_histogram_of_all():
+    scene, images = drifted()
+    hidden = torch.zeros(16, 24, dtype=torch.bool)
+    views = ViewSet(
+        scene.train.frames, lambda i: View(scene.train.frames[i], images[i], mask=hidden if i == 2 else None)
+    )
+    part = HistogramAlignment()
+    part.prepare(replace(scene, train=views))
+    assert torch.allclose(part(images[0], scene.train.frames[2]), images[0], atol=1e-5)
+    assert not torch.allclose(part(images[0], scene.train.frames[4]), images[0], atol=1e-2)
+    views = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], images[i], mask=hidden))
+    with pytest.raises(SceneError, match="masks leave no pixel of the training images of scene 'flight'"):
+        HistogramAlignment().prepare(replace(scene, train=views))

@@ -44,3 +44,27 @@ def test_gradients_of_the_response_are_those_of_differences():
     with torch.no_grad():
         part.rises.copy_(torch.tensor([0.3, -0.5, 1.0, 0.0]))
     assert gradients_of(part, torch.tensor([-0.2, 0.11, 0.37, 0.62, 0.93, 1.2])[:, None, None])
+
+
+def test_gradients_are_the_same_bits_with_any_number_of_threads():
+    """Sums over 80,000 pixels, which plain torch shares among threads as they come."""
+    generator = torch.Generator().manual_seed(0)
+    image, pull = (torch.rand(256, 320, 1, generator=generator) for _ in range(2))
+    found, threads = [], torch.get_num_threads()
+    try:
+        for count in (1, 2, 4, 4, 4):
+            torch.set_num_threads(count)
+            part, leaf = MonotoneResponse(), image.clone().requires_grad_()
+            (part(leaf, Frame("0.png", 0, CAMERA)) * pull).sum().backward()
+            found.append((part.rises.grad, leaf.grad))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(other, found[0], strict=True))
+
+
+def test_channels_are_bent_one_by_one():
+    part, colours = MonotoneResponse(pieces=3), torch.rand(5, 7, 3, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        part.rises.copy_(torch.tensor([1.0, -1.0, 0.5]))
+    frame = Frame("0.png", 0, CAMERA)
+    assert torch.equal(part(colours, frame), torch.cat([part(colours[..., i : i + 1], frame) for i in range(3)], 2))

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, ViewSet
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import Query, Rate, Seeds
 from heatsplat.thermal.common_source import CommonSource
 
 RANGE, SPAN_S, AMBIENT = ThermalRange(20.0, 70.0), 400.0, (26.0 - 20.0) / 50.0
@@ -121,7 +121,7 @@ def test_only_what_is_asked_for_is_computed_and_every_parameter_learns():
     (every.sum() + model.regularisers(splats)["course_smooth"]).backward()
     assert model.course.grad.abs().max() > 0 and splats["modes"].grad.abs().max() > 0
     assert set(dict(model.named_parameters())) == {"course"} and model.cost == 6
-    assert model.rate_of("course") == (5e-4, 0.1)
+    assert model.rate_of("course") == Rate(5e-4, 0.1)
 
 
 def test_gradients_are_those_of_differences():

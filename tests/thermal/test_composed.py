@@ -133,6 +133,24 @@ def test_without_a_heat_source_there_is_no_tensor_of_one():
     assert "source_gains" not in splats_of(made("relaxation")) and "source_gains" in splats_of(made("harmonic"))
 
 
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_conduction_knows_few_gaussians_and_double_precision(count):
+    model = Conducting(NewtonHarmonic(frequencies=4), flow=5.0)
+    model.prepare(scene())
+    splats = splats_of(model, seeds(count))
+    late = query(SPAN_S)
+    single = model.features(splats, late)
+    double = model.double().features(splats.to(torch.float64), late)
+    assert double.dtype == torch.float64 and torch.allclose(single.double(), double, atol=1e-5)
+
+
+def test_what_is_said_of_effects_is_said_of_nothing_else():
+    full = made("harmonic", PARTS)
+    before = full.state.effects()
+    told = full.effects()
+    assert set(told) > set(before) and full.state.effects() == before
+
+
 def test_conduction_that_is_off_leaves_the_state_alone():
     alone, with_it = NewtonHarmonic(frequencies=4), Conducting(NewtonHarmonic(frequencies=4))
     alone.prepare(scene())
@@ -346,7 +364,7 @@ def test_parameters_learn_at_the_rates_of_their_owners():
         Conducting(NewtonHarmonic(ambient="learned", lr_ambient=0.7)), {"attenuation": Attenuation(lr=0.3)}
     )
     model.prepare(scene())
-    rates = {name: model.rate_of(name)[0] for name, _ in model.named_parameters()}
+    rates = {name: model.rate_of(name).lr for name, _ in model.named_parameters()}
     assert rates == {"state.log_flow": 0.01, "state.state.ambient": 0.7, "parts.attenuation.log_depth": 0.3}
 
 

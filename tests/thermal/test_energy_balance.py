@@ -426,6 +426,16 @@ def test_an_exchange_by_convention_is_not_learned():
         ready(scene(weather(wind_m_s=None)), exchange="iso_6946")
 
 
+def test_a_record_of_still_air_has_the_convection_of_still_air():
+    still = torch.zeros_like(weather().wind_m_s)
+    for exchange, expected in (("iso_6946", 4.0), ([5.0, 2.5], 5.0)):
+        model, splats = ready(scene(weather(wind_m_s=still)), exchange=exchange, emissivity=0.9)
+        told = model.attributes(splats, Query(time_s=13 * HOUR))
+        torch.testing.assert_close(told["convection_w_m2_k"], torch.full((6,), expected), rtol=1e-5, atol=0)
+        assert model.temperature(splats, 13 * HOUR).isfinite().all()
+        assert model.effects()["convection"]["wind"] == "recorded, 0 m/s throughout"
+
+
 def test_convection_that_was_measured_is_what_the_balance_has():
     model, splats = ready(exchange=[5.0, 2.5], emissivity=0.9)
     told, wind = model.attributes(splats, Query(time_s=0.0)), model.mean_wind.item()

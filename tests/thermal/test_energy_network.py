@@ -70,6 +70,13 @@ def test_before_training_all_are_as_warm_as_the_images_and_of_typical_materials(
     assert all(term.isfinite() and term >= 0 for term in penalties(model, splats).values())
 
 
+def test_labels_alone_serve_in_double_precision_too():
+    model, splats = make(features="labels", position_frequencies=0)
+    single = model.features(splats, query())
+    double = model.double().features(splats.to(torch.float64), query())
+    assert double.dtype == torch.float64 and torch.allclose(double.float(), single, atol=1e-5)
+
+
 @pytest.mark.parametrize("options", [{}, {"features": "labels"}, {"features": "none"}, {"attributes": "table"}])
 def test_only_what_is_in_view_is_evaluated_and_it_is_the_same(options):
     model, splats = make(disturb=1.0, **options)

@@ -151,7 +151,7 @@ def test_what_cannot_be_is_refused():
 
 def test_attribute_networks_are_normalised_and_learn_at_their_own_rate():
     model, splats, _ = make(normalised=True, lr_attributes=1.6e-2, lr=1e-3)
-    rates = {name: model.rate_of(name)[0] for name, _ in model.named_parameters()}
+    rates = {name: model.rate_of(name).lr for name, _ in model.named_parameters()}
     fast = {name for name, rate in rates.items() if rate == 1.6e-2}
     assert {name.split(".")[0] for name in fast} == {
         "of_feature",

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
-from heatsplat.thermal.base import Query
+from heatsplat.thermal.base import Query, Rate
 from heatsplat.thermal.relaxing import Relaxing
 
 RANGE = ThermalRange(20.0, 70.0)
@@ -43,7 +43,7 @@ def test_a_measured_ambient_temperature_stays():
 
 def test_an_unknown_one_is_learned_from_where_most_of_the_scene_is():
     model = ready(scene(ambient_c=None))
-    assert model.ambient_is == "learned" and model.rate_of("ambient") == (0.1, 0.5)
+    assert model.ambient_is == "learned" and model.rate_of("ambient") == Rate(0.1, 0.5)
     model.guess_ambient(torch.tensor([0.2, 0.3, 0.9]))
     assert model.ambient.item() == pytest.approx(0.3)
 

@@ -9,7 +9,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRan
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import octaves
-from heatsplat.thermal.base import Query, Seeds
+from heatsplat.thermal.base import Query, Rate, Seeds
 from heatsplat.thermal.static import Static
 from heatsplat.thermal.time_mlp import TimeMlp
 
@@ -125,7 +125,9 @@ def test_values_and_slopes_are_finite_at_any_time_and_feature(time_s, scale):
 def test_rates_needs_and_cost_are_told():
     model, _ = make()
     assert model.needs == {"time"} and model.cost == Static().cost + 16 * 64 + 64 * 64 + 64
-    assert model.rate_of("code.weight") == (1e-3, 1.0) and model.rate_of("of_code.weight") == (2.5e-3, 1.0)
+    assert model.rate_of("code.weight") == Rate(1e-3, paced=True) and model.rate_of("of_code.weight") == Rate(
+        2.5e-3, paced=True
+    )
     assert model.per_gaussian(Seeds(torch.zeros(2, 3), torch.rand(2, 1), torch.Generator()))["feature"].lr == 2.5e-3
 
 

@@ -88,6 +88,8 @@ def test_the_yard_is_lit_as_rays_say():
     exposure.prepare(scene, Renderer("cpu"), normals.discs, ["sun_seen"])
     found = exposure.look(scene.points)
     assert set(found) == {"sun_seen"}
+    exposure.prepare(scene, Renderer("cpu", near=1.0, far=30.0), normals.discs, ["sun_seen"])  # of the run's views
+    assert torch.equal(exposure.look(scene.points)["sun_seen"], found["sun_seen"])
     directions = sun_directions(scene.weather.sun, scene.weather.up)
     some = range(2, len(directions), 9)
     on, which = world.nearest(scene.points.double())

@@ -108,6 +108,15 @@ def test_a_reset_shrinks_all_and_forgets_all_moments():
     assert [step for step in range(60) if not settled[step]] == [*range(19, 24), *range(29, 34), *range(39, 44)]
 
 
+def test_sizes_that_a_stage_holds_still_are_not_reset():
+    splats = Splats(
+        {"means": torch.zeros(2, 3), "log_scales": torch.zeros(2, 3), "quats": torch.ones(2, 4),
+         "opacity_logits": torch.zeros(2, 1)}
+    )  # fmt: skip
+    ShortLists(reset_every=10, reset_start=0, reset_stop=45).shrink(Cloud(splats, None, {}), 19)
+    assert not splats["log_scales"].any()
+
+
 def test_options_out_of_range_are_refused():
     with pytest.raises(ValueError, match="reset_factor lies in"):
         ShortLists(reset_factor=0.0)

@@ -64,6 +64,8 @@ def test_what_is_given_beside_a_preset_wins():
     config = compose(["preset=fast", "max_steps=70", "cap_max=7", "optim.decay=0.5", "density=proximity"])
     assert (config["max_steps"], config["density"]["cap_max"], config["optim"]["decay"]) == (70, 7, 0.5)
     assert config["density"]["stop"] == 35 and density_of(config) == "Proximity"
+    for rule in ("adaptive", "budget", "co_support", "mcmc", "multiview_gate", "proximity"):
+        assert compose(["cap_max=7", f"density={rule}"])["density"]["cap_max"] == 7, rule
     assert compose(["preset=fast", "density=fixed"])["density"] == {"_target_": "heatsplat.density.fixed.Fixed"}
     assert compose(["preset=fast", "debug=fast"])["max_steps"] == 60
 

@@ -55,7 +55,7 @@ def test_both_images_and_the_attributes_are_drawn(finished):
     )
     frame = module.scene.test.frames[0]
     maps = module.attribute_maps(frame)
-    assert list(maps) == ["emissivity", "temperature", "reflectance"]
+    assert list(maps) == ["emissivity", "relative_temperature", "reflectance"]
     for image in maps.values():
         seen = image[image.isfinite()]
         assert image.shape == (52, 64) and len(seen) > 2000 and seen.min() > 0 and seen.max() < 1
@@ -63,7 +63,7 @@ def test_both_images_and_the_attributes_are_drawn(finished):
     assert maps["emissivity"].nanmedian().item() == pytest.approx(0.9, abs=0.02)
     heat = module.predict(frame)[..., 0]
     warm, cold = heat > heat.quantile(0.8), heat < heat.quantile(0.2)
-    assert maps["temperature"][warm].nanmean() > maps["temperature"][cold].nanmean() + 0.05
+    assert maps["relative_temperature"][warm].nanmean() > maps["relative_temperature"][cold].nanmean() + 0.05
 
 
 def test_the_effects_are_told(finished):

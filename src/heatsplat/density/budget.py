@@ -6,8 +6,9 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
-from scipy.ndimage import gaussian_laplace
+from scipy.ndimage import distance_transform_edt, gaussian_laplace
 from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
@@ -249,8 +250,17 @@ class Budget(DensityControl):
 
 
 def _edges(image: Tensor) -> Tensor:
-    """How strong the edges of an image [H, W, C] are in its pixels, [H, W]: |Laplacian| of its blurred mean over channels."""
-    return torch.from_numpy(abs(gaussian_laplace(image.mean(-1).cpu().numpy(), BLUR)))
+    """How strong the edges of an image [H, W, C] are in its pixels, [H, W]: |Laplacian| of its blurred mean over channels.
+
+    Pixels that are NaN have none, and make none: the nearest others stand for them.
+    """
+    grey = image.mean(-1).cpu().numpy()
+    unknown = np.isnan(grey)
+    if unknown.all():
+        return torch.zeros(grey.shape)
+    if unknown.any():
+        grey = grey[tuple(distance_transform_edt(unknown, return_distances=False, return_indices=True))]
+    return torch.from_numpy(np.where(unknown, 0.0, abs(gaussian_laplace(grey, BLUR))))
 
 
 def _outside(weights: Tensor, share: float) -> Tensor:

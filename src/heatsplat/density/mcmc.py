@@ -36,7 +36,7 @@ class MCMC(DensityControl):
         start, stop: first and last step at which Gaussians are relocated and added.
         every: steps between that.
         growth: share of the Gaussians that is added each time.
-        cap_max: never more Gaussians than this.
+        cap_max: never more Gaussians than this, which it grows to: finite.
         dead_opacity: Gaussians up to this opacity are relocated.
         noise: factor on the learning rate of centres. 0: centres do not wander.
 
@@ -60,6 +60,10 @@ class MCMC(DensityControl):
             raise ValueError(
                 f"density.every and cap_max must be at least 1, growth and noise at least 0, got {every}, {cap_max}, "
                 f"{growth}, {noise}"
+            )
+        if not math.isfinite(cap_max):
+            raise ValueError(
+                "density=mcmc grows to density.cap_max, which must be finite: set cap_max, as in cap_max=100000"
             )
         self.start, self.stop, self.every = start, stop, every
         self.growth, self.cap_max, self.dead_opacity, self.noise = growth, cap_max, dead_opacity, noise

@@ -146,7 +146,8 @@ def _unfinished(layout, tile, transmittances):
 def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centres, transmittances, image):
     """Composites instances ``begin`` to ``end`` into the state of a tile; returns the end of those that mattered.
 
-    Masks are reduced to the blocks where a pixel took something, which are those that the backward pass visits.
+    Masks are reduced to the blocks where a pixel took something or was finished by what it could not take, which are those
+    that the backward pass visits.
     """
     for block in range(tile * BLOCKS, (tile + 1) * BLOCKS):
         for modality in range(modalities(layout)):
@@ -171,19 +172,20 @@ def _composite_tile(layout, tile, tiles_x, records, instances, begin, end, centr
                 state = tile * BLOCKS + block
                 u1, u2 = _whitened(records, rank, corner, centres, block)
                 density, reached = _density(records, rank, u1, u2)
-                taken_by_any = 0
+                counts = 0
                 for modality in range(modalities(layout)):
                     alpha, passed = _alpha(layout, modality, records, rank, density, reached)
                     place = state * modalities(layout) + modality
-                    _, weight, after, taken = _take(alpha, passed, load_vector(transmittances, place))
+                    before = load_vector(transmittances, place)
+                    _, weight, after, _ = _take(alpha, passed, before)
                     store_vector(transmittances, place, after)
                     weights[modality] = weight
-                    taken_by_any |= bits(taken & passed)
+                    counts |= bits(passed & (before > 0.0))
                 for channel in range(channels(layout)):
                     place = state * channels(layout) + channel
                     colour = weights[modality_of(layout, channel)] * records[rank, feature_column(layout) + channel]
                     store_vector(image, place, load_vector(image, place) + colour)
-                useful |= np.int64(taken_by_any != 0) << block
+                useful |= np.int64(counts != 0) << block
             instances[instance, 1] = useful
             if useful != 0:
                 last = instance + 1

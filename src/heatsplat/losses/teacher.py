@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import tempfile
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
@@ -23,6 +25,13 @@ log = logging.getLogger(__name__)
 
 INTERPOLATIONS = ("lanczos", "bicubic")
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+PLAIN_MODES = {
+    "1": "L",
+    "LA": "L",
+    "La": "L",
+    "P": "RGB",
+    "PA": "RGB",
+}  # of Pillow: what no number of a pixel says by itself
 WHERE = (
     "Give a file with a network (a state dict of SwinIR such as 002_lightweightSR_DIV2K_s64w8_SwinIR-S_x4.pth from "
     "github.com/JingyunLiang/SwinIR/releases; with trust=true also TorchScript or torch.export's .pt2) or a folder with one "
@@ -157,7 +166,8 @@ class Images(Teacher):
         path = self._file_of(frame)
         with Image.open(path) as stored:
             self._check_size(path, stored.size, frame, factor)
-            pixels = np.asarray(stored)
+            plain = PLAIN_MODES.get(stored.mode)
+            pixels = np.asarray(stored if plain is None else stored.convert(plain))
         full = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 65535 if pixels.dtype.kind == "i" else 1
         values = torch.from_numpy(pixels.astype(np.float32) / full)
         values = values[..., None] if values.ndim == 2 else values[..., :3]
@@ -211,13 +221,17 @@ class Network(Teacher):
             )
         fine = answer[0].permute(1, 2, 0).clamp(0.0, 1.0)
         fine = fine.mean(2, keepdim=True) if channels == 1 else fine
+        fine = fine.half().float()  # as it is kept, so that a later run trains on the same bits
         if not fine.isfinite().all():
             raise SceneError(f"teacher={self.path}: its answer to {frame.name} is not finite")
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            partial = kept.with_suffix(".part.npy")
-            np.save(partial, fine.numpy().astype(np.float16))
-            partial.replace(kept)
+            with tempfile.NamedTemporaryFile(
+                dir=kept.parent, suffix=".part", delete=False
+            ) as partial:  # jobs share the cache
+                np.save(partial, fine.numpy().astype(np.float16))
+            os.chmod(partial.name, 0o644)
+            os.replace(partial.name, kept)
         return fine.to(image.device)
 
     def _kept(self, image: Tensor, factor: int) -> Path | None:

@@ -219,7 +219,7 @@ def uncertainty(
     """
     slopes = sensitivities(signal, response, conditions)
     parts = {name: slopes[name].abs() * value for name, value in standard.items()}
-    return parts | {"combined": torch.stack(list(parts.values())).square().sum(0).sqrt()}
+    return parts | {"combined": torch.stack([torch.zeros_like(signal), *parts.values()]).square().sum(0).sqrt()}
 
 
 def directional_emissivity(normal: Quantity, cosine: Tensor, index: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 from heatsplat.contracts import Camera, RenderOutput, SceneData
 from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
 from heatsplat.splats import ANCHORS, GAUSSIANS
+
+NEAR, FAR = 0.01, 1e10  # visible range of camera z in world units, unless a run sets another
 
 
 class Renderer:
@@ -36,8 +39,8 @@ class Renderer:
         self,
         backend: str = "auto",
         antialiased: bool = False,
-        near: float = 0.01,
-        far: float = 1e10,
+        near: float = NEAR,
+        far: float = FAR,
         background: str | float = "ambient",
         eps2d: float = EPS2D,
     ) -> None:
@@ -50,6 +53,12 @@ class Renderer:
         self.eps2d = eps2d
         self.backend, self.antialiased, self.near, self.far = backend, antialiased, near, far
         self.background = background
+
+    def seeing_far(self) -> Renderer:
+        """The same renderer with no end of sight, for cameras far outside of the scene."""
+        other = copy(self)
+        other.near, other.far = NEAR, FAR
+        return other
 
     def background_of(self, scene: SceneData, modality: str) -> float:
         """Image value behind the splats of a scene, in [0, 1]."""

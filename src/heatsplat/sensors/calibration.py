@@ -46,6 +46,10 @@ class Calibration(SensorPart):
         super().__init__()
         if grid < 2:
             raise ValueError(f"a calibration grid needs 2 nodes along each side or more, got {grid}")
+        if grid == 2 and gain_max > 0 and vignetting_max > 0:
+            raise ValueError(
+                "four nodes lie equally far out and tell no gain from vignetting: give a grid of 3 or more"
+            )
         if min(gain_max, bias_max, vignetting_max) < 0:
             raise ValueError(f"bounds must not be negative, got {gain_max}, {bias_max}, {vignetting_max}")
         self.gain_max, self.bias_max, self.vignetting_max = gain_max, bias_max, vignetting_max

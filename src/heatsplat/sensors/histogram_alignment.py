@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData
+from heatsplat.contracts import Frame, SceneData, SceneError
 from heatsplat.sensors.per_frame import PerFrame
 
 LEAST_RISE = 1e-3  # between neighbouring quantiles, image units: maps stay reversible where an image is flat
@@ -45,9 +45,13 @@ class HistogramAlignment(PerFrame):
         found = {}
         for view in scene.train:
             values = view.thermal[view.mask] if view.mask is not None else view.thermal
-            found[view.frame.frame_id] = values.flatten().float().quantile(shares)
+            unknown = not values.numel()  # its mask leaves none: the shared histogram stands for its own
+            found[view.frame.frame_id] = shares * torch.nan if unknown else values.flatten().float().quantile(shares)
         rows = torch.stack([found[int(frame_id)] for frame_id in self.frame_ids])
-        shared = rows.mean(0)
+        if rows.isnan().all():
+            raise SceneError(f"masks leave no pixel of the training images of scene '{scene.name}'")
+        shared = rows.nanmean(0)
+        rows = torch.where(rows.isnan(), shared, rows)
         rows = shared + self.strength * (rows - shared)
         self.own = rows[:, :1] + _rising(rows - rows[:, :1])
         self.shared = shared[0] + _rising(shared - shared[0])

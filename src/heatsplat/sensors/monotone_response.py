@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Frame
 from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.tone import corrected
 
 
 class MonotoneResponse(SensorPart):
@@ -34,13 +35,11 @@ class MonotoneResponse(SensorPart):
         self.rises = nn.Parameter(torch.zeros(pieces))
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:
-        pieces = len(self.rises)
         shares = self.rises.softmax(0)
         nodes = torch.cat((shares.new_zeros(1), shares.cumsum(0)))
-        inside = image.clamp(0.0, 1.0)
-        piece = (inside.detach() * pieces).long().clamp(max=pieces - 1)
-        along = inside * pieces - piece
-        return nodes[piece] + along * shares[piece] + (image - inside)
+        bend = nodes - torch.linspace(0.0, 1.0, len(nodes), dtype=nodes.dtype, device=nodes.device)
+        curve = torch.stack((torch.zeros_like(bend), bend), 1)
+        return corrected(image.reshape(len(image), -1, 1), curve).view_as(image)  # each channel by itself
 
     def penalty(self) -> Tensor:
         slopes = len(self.rises) * self.rises.softmax(0)

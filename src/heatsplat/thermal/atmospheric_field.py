@@ -52,6 +52,7 @@ class AtmosphericField(Wrapper):
         ValueError: an option is unknown, or a size is not positive.
     """
 
+    paced = True
     factor_name = "transmission"  # of the factor among the attributes
     further: tuple[float, ...] = ()  # what the network gives beside the three quantities, before training
 

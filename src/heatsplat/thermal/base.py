@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -108,8 +108,7 @@ class PerGaussian:
         group: weight of the penalty Σ_k √(Σ_i x_ik²) over the columns k of the last dimension; inside the optimiser, too.
         lr_end: factor on lr at the last step of the run, log-linear in between.
         paced: whether it learns faster in shorter runs (``Optimisation.length_power``). Not what many numbers make up
-            together, such as the gains of a series or the input of a network: their steps add up. Nor what has to be a mean
-            over images that differ.
+            together, such as the gains of a series: their steps add up. Nor what has to be a mean over images that differ.
     """
 
     initial: Tensor
@@ -119,6 +118,20 @@ class PerGaussian:
     lr_end: float = 1.0
     paced: bool = True
     group: float = 0.0
+
+
+class Rate(NamedTuple):
+    """How fast a parameter learns that is not per Gaussian.
+
+    Args:
+        lr: learning rate.
+        lr_end: factor on it at the last step of the run, log-linear in between.
+        paced: whether it learns faster in shorter runs (``Optimisation.length_power``), as the weights of a network do.
+    """
+
+    lr: float
+    lr_end: float = 1.0
+    paced: bool = False
 
 
 def surface_normals(seeds: Seeds) -> dict[str, PerGaussian]:
@@ -135,8 +148,7 @@ class Heat(nn.Module, ABC):
     Class attributes:
         needs: metadata it cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
-        lr: learning rate of its own parameters (those that are not per Gaussian).
-        lr_end: factor on it at the last step of the run, log-linear in between.
+        lr, lr_end, paced: the ``Rate`` of its own parameters (those that are not per Gaussian).
         inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
@@ -148,6 +160,7 @@ class Heat(nn.Module, ABC):
     beyond_record: str = "it is evaluated as within the record, which nothing has tested"
     lr: float = 1e-3
     lr_end: float = 1.0
+    paced: bool = False
 
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs`` or its range
@@ -209,9 +222,9 @@ class Heat(nn.Module, ABC):
         """What it takes for granted, by name: contexts in which that is wrong by one standard deviation."""
         return {}
 
-    def rate_of(self, name: str) -> tuple[float, float]:
-        """Learning rate of its own parameter of that name, and the factor on it at the end of the run."""
-        return self.lr, self.lr_end
+    def rate_of(self, name: str) -> Rate:
+        """That of its own parameter of that name."""
+        return Rate(self.lr, self.lr_end, self.paced)
 
     def effects(self) -> dict[str, dict[str, Any]]:
         """The physical effects that it simulates: catalogue name -> settings (for metrics.json)."""

@@ -14,7 +14,7 @@ from heatsplat.physics.curves import resampled_values
 from heatsplat.physics.first_look import first_numbers
 from heatsplat.physics.responses import MOMENTS_KEPT
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian, Query, Seeds
+from heatsplat.thermal.base import PerGaussian, Query, Rate, Seeds
 from heatsplat.thermal.relaxing import Relaxing
 
 LEAST = (
@@ -103,8 +103,8 @@ class CommonSource(Relaxing):
             modes = first_numbers(looks, basis, above)
         return {"modes": PerGaussian(modes, self.lr_modes, lr_end=self.lr_end)}
 
-    def rate_of(self, name: str) -> tuple[float, float]:
-        return (self.lr_course, self.lr_end) if name == "course" else super().rate_of(name)
+    def rate_of(self, name: str) -> Rate:
+        return Rate(self.lr_course, self.lr_end) if name == "course" else super().rate_of(name)
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
         # Of all Gaussians, and then those in view: to pick rows and to spread their gradients takes twice as long.

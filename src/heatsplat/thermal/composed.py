@@ -69,7 +69,7 @@ class Composed(Wrapper):
 
     def effects(self) -> dict[str, dict[str, Any]]:
         """Those of state and parts; of a companion, that it has an opacity of its own."""
-        effects = self.state.effects()
+        effects = dict(self.state.effects())
         for part in self.parts.values():
             effects |= part.effects()
         if self.companion is not None:

@@ -98,14 +98,16 @@ class Conducting(Wrapper):
         if self._due or int(self.joined) != count:
             means = splats.means.detach().cpu().double().numpy()
             near = torch.from_numpy(cKDTree(means).query(means, k=min(self.neighbours + 1, count), workers=1)[1])
+            near = near.reshape(count, -1)
             pairs = torch.stack([torch.arange(count)[:, None].expand_as(near), near]).flatten(1)
             low, high = pairs[:, pairs[0] != pairs[1]].sort(dim=0).values
             keys = (low * count + high).unique()  # of columns it would take a hundred times as long
             self.edges = torch.stack([keys // count, keys % count]).to(self.edges.device)
             self.joined.fill_(count)
             self._due = False
-        if self._laplacian is None or self._laplacian[0] is not self.edges:
-            self._laplacian = self.edges, laplacian(self.edges, count)
+        kept, dtype = self._laplacian, splats.means.dtype
+        if kept is None or kept[0] is not self.edges or kept[1].dtype != dtype:
+            self._laplacian = self.edges, laplacian(self.edges, count).to(dtype)
 
     def effects(self) -> dict[str, dict]:
         flow = self.log_flow.detach().clamp(*LOG_FLOWS).exp().item()

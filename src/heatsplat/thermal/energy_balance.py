@@ -374,7 +374,7 @@ class EnergyBalance(ThermalModel):
             self._convects = 1.0
 
     def effects(self) -> dict[str, dict]:
-        return self.simulated
+        return dict(self.simulated)
 
     @property
     def cost(self) -> int:
@@ -507,13 +507,16 @@ class EnergyBalance(ThermalModel):
                 effects["radiation"]["clouds"] = weather.notes.get("clouds", "recorded")
             if not humid:
                 effects["radiation"]["left_out"] = "humidity, which the weather lacks"
+        if self._wind and self._convection is not None and weather.wind_m_s is None and not self.mean_wind > 0:
+            raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
         if self._wind and self.mean_wind > 0:
             if weather.wind_m_s is None:
                 raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
             parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
             effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
-        elif self._wind and self._convection is not None:
-            raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
+        elif self._wind and self._convection is not None:  # the convection of still air
+            parts["wind_anomaly"] = torch.zeros_like(air_k)
+            effects["convection"]["wind"] = "recorded, 0 m/s throughout"
         elif self._wind:
             effects["convection"]["left_out"] = "wind, which the weather lacks"
         if self._rain is not None:

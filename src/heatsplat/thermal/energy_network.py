@@ -322,7 +322,7 @@ class EnergyNetwork(ThermalModel):
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
             spread = value.std(correction=0).clamp(min=1e-3)  # of a single Gaussian it is 0
             feature[:, 0] = (value - value.mean()) / spread  # warm and cold differ from the start
-            tensors["feature"] = PerGaussian(feature, self.lr_feature, paced=False)
+            tensors["feature"] = PerGaussian(feature, self.lr_feature)
         self.network.heads["temperature"].bias.fill_(self._raw_of(value.mean()))
         if self._stored is not None:
             own = self.state_dict()
@@ -458,7 +458,7 @@ class EnergyNetwork(ThermalModel):
             parts.append(octaves(self.box.places(rows(splats.means.detach())), self.position_frequencies))
         if self.features_from == "labels":
             labels = rows(splats["label"].detach())[:, None]
-            parts.append((labels == torch.arange(len(CLASSES), device=labels.device)).float())
+            parts.append((labels == torch.arange(len(CLASSES), device=labels.device)).to(self.network.own.weight))
         elif self.feature_size:
             parts.append((rows(splats["feature"]) - self.feature_mean) / self.feature_scale)
         return self.network.own(torch.cat(parts, 1))

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Clock, ImageRange
 from heatsplat.thermal.layers import draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
@@ -200,8 +200,8 @@ class HexPlane(Wrapper):
             change = self._change("radiance", self.hidden(Query(ids).rows(splats.means), time_s))[:, 0]
             return level + self.range.bounds.span_k * change
 
-    def rate_of(self, name: str) -> tuple[float, float]:
-        return (self.lr_planes, self.lr_end) if name.startswith(("space.", "time.")) else super().rate_of(name)
+    def rate_of(self, name: str) -> Rate:
+        return Rate(self.lr_planes, self.lr_end) if name.startswith(("space.", "time.")) else super().rate_of(name)
 
     @property
     def cost(self) -> int:

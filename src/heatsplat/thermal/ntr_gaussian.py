@@ -9,7 +9,7 @@ from torch.nn.functional import layer_norm, softplus
 from heatsplat.contracts import SceneData, check_option
 from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
 from heatsplat.thermal.coordinates import (
     Box,
@@ -65,6 +65,7 @@ class NtrGaussian(ThermalModel):
 
     needs = frozenset({"time", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
+    paced = True
     beyond_record = "the networks see the hour, or the nearest moment of a record without weather of more than a day"
 
     def __init__(
@@ -149,7 +150,7 @@ class NtrGaussian(ThermalModel):
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((module for module in self.modules() if isinstance(module, nn.Linear)), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
-        tensors = {"feature": PerGaussian(feature, self.lr_feature, paced=False)}
+        tensors = {"feature": PerGaussian(feature, self.lr_feature)}
         if self.first_steps > 0:
             # Not paced: one value for all times has to be a mean over images that differ, and must not follow single ones.
             tensors["first_value"] = PerGaussian(seeds.values.mean(1), self.lr_first, paced=False)
@@ -175,8 +176,12 @@ class NtrGaussian(ThermalModel):
                 return self.range.kelvin(Query(ids).rows(splats["first_value"]))
             return self.range.kelvin(self._units(splats, ids, time_s))
 
-    def rate_of(self, name: str) -> tuple[float, float]:
-        return (self.lr_attributes, self.lr_end) if name.startswith(ATTRIBUTE_NETWORKS) else super().rate_of(name)
+    def rate_of(self, name: str) -> Rate:
+        return (
+            Rate(self.lr_attributes, self.lr_end, self.paced)
+            if name.startswith(ATTRIBUTE_NETWORKS)
+            else super().rate_of(name)
+        )
 
     def effects(self) -> dict[str, dict]:
         return {"relaxation": {"nodes": self.nodes, "window_s": self.window_s}, "radiation": {}, "convection": {}}

@@ -201,11 +201,13 @@ class Radiative(Wrapper):
         return torch.cat((self._heat(splats, query), self.color.features(splats, query)), dim=1)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Emissivity, temperature (in (0, 1), no kelvin) and reflectance; none of them without the three parameters."""
+        """Emissivity, temperature (as "relative_temperature" in (0, 1), no kelvin) and reflectance; none of them without the
+        three parameters."""
         told = super().attributes(splats, query)
         if not self.three_parameter:
             return told
-        return told | {name: values[:, 0] for name, values in self._body(splats, query).items()}
+        body = {name: values[:, 0] for name, values in self._body(splats, query).items()}
+        return told | {"relative_temperature" if name == "temperature" else name: body[name] for name in body}
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         """Of bodies that send by Planck's law; the mean over directions of what it is before the sigmoid counts."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Camera, SceneData
 from heatsplat.splats import ANCHORS, Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.layers import draw_uniform
 
 MARGIN = 0.15  # of the image's sides, by which an anchor may lie outside and still have Gaussians inside
@@ -83,9 +83,7 @@ class Scaffold(ThermalModel):
         self.distance, self.volume = distance, volume
         self.rates = {"feature": lr_feature, "offsets": lr_offsets, "log_reach": lr_reach}
         self.end_offsets, *network_ends = ends
-        self.network_rates = dict(
-            zip(HEADS, zip((lr_opacity, lr_shape, lr_value), network_ends, strict=True), strict=True)
-        )
+        self.network_rates = dict(zip(HEADS, map(Rate, (lr_opacity, lr_shape, lr_value), network_ends), strict=True))
         answers = zip(HEADS, (1, 7, channels), strict=True)
         seen = feature_size + 3 + distance
         self.networks = nn.ModuleDict(
@@ -159,7 +157,7 @@ class Scaffold(ThermalModel):
         volumes, self._volumes = self._volumes, None
         return {} if volumes is None else {"volume": self.volume * volumes}
 
-    def rate_of(self, name: str) -> tuple[float, float]:
+    def rate_of(self, name: str) -> Rate:
         return self.network_rates[name.split(".")[1]]
 
     def effects(self) -> dict[str, dict]:

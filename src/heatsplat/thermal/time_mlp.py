@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Clock, ImageRange, octaves
 from heatsplat.thermal.layers import draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
@@ -40,6 +40,7 @@ class TimeMlp(Wrapper):
         ValueError: a size is not positive.
     """
 
+    paced = True
     own_beyond_record = "what the network adds stays as at the nearest moment of the record"
 
     def __init__(
@@ -81,7 +82,7 @@ class TimeMlp(Wrapper):
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((self.moment, self.code, self.of_code, self.of_feature, self.hidden), seeds.generator)
         feature = 0.1 * torch.randn(len(seeds.means), self.feature_size, generator=seeds.generator)
-        return super().per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature, paced=False)}
+        return super().per_gaussian(seeds) | {"feature": PerGaussian(feature, self.lr_feature)}
 
     def on_step(self, step: int) -> None:
         super().on_step(step)
@@ -102,8 +103,8 @@ class TimeMlp(Wrapper):
         with torch.no_grad():
             return level + self.range.bounds.span_k * self.change(Query(ids).rows(splats["feature"]), time_s)
 
-    def rate_of(self, name: str) -> tuple[float, float]:
-        return (self.lr_time, self.lr_end) if name.startswith(ENCODER) else super().rate_of(name)
+    def rate_of(self, name: str) -> Rate:
+        return Rate(self.lr_time, self.lr_end, self.paced) if name.startswith(ENCODER) else super().rate_of(name)
 
     @property
     def cost(self) -> int:

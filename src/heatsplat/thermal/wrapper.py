@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Course, SceneData
 from heatsplat.splats import GAUSSIANS, Splats
-from heatsplat.thermal.base import NORMALS, Geometry, Heat, PerGaussian, Query, Seeds, ThermalModel
+from heatsplat.thermal.base import NORMALS, Geometry, Heat, PerGaussian, Query, Rate, Seeds, ThermalModel
 
 
 class Wrapper(ThermalModel):
@@ -168,7 +168,7 @@ class Wrapper(ThermalModel):
     def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
         return _merged(member.doubts() for member in self.members.values())
 
-    def rate_of(self, name: str) -> tuple[float, float]:
+    def rate_of(self, name: str) -> Rate:
         """Of the member whose parameter it is, else the wrapper's own."""
         for prefix, member in self.members.items():
             if name.startswith(f"{prefix}."):

@@ -56,8 +56,12 @@ class Exposure:
 
     @torch.no_grad()
     def prepare(self, scene: SceneData, renderer: Renderer, discs: Discs, names: Iterable[str]) -> None:
-        """Looks at the discs from sun and sky, as far as SUN_SEEN and SKY_SEEN are among ``names``."""
+        """Looks at the discs from sun and sky, as far as SUN_SEEN and SKY_SEEN are among ``names``.
+
+        They are looked at from afar, whatever the renderer's own ``near`` and ``far``.
+        """
         self._points = discs.shapes[0]
+        renderer = renderer.seeing_far()
 
         def show(frame: Frame, values: Tensor, depth: bool) -> RenderOutput:
             return renderer(*discs.shapes, values, frame.camera, None, (values.shape[1],), depth=depth)

@@ -210,8 +210,9 @@ class SplatTraining(pl.LightningModule):
             for name, item in self._declared.items()
         ]
         for name, parameter in self.thermal.named_parameters():
-            lr, lr_end = self.thermal.rate_of(name)
-            groups.append({"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": lr_end})
+            rate = self.thermal.rate_of(name)
+            lr = rate.lr * (self.optim.pace if rate.paced else 1.0)
+            groups.append({"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": rate.lr_end})
         groups += [
             {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
             for name, part in self.sensor.parts.items()
@@ -366,7 +367,10 @@ class SplatTraining(pl.LightningModule):
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            target = resampled(inputs.target, camera.height, camera.width, "area")
+            target = inputs.target
+            if inputs.mask is not None:
+                target = target.where(inputs.mask[..., None], torch.nan)
+            target = resampled(target, camera.height, camera.width, "area")
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}

@@ -202,9 +202,9 @@ class Optimisation:
 
     Args:
         means, log_scales, quats, opacity_logits: learning rates; that of the means is multiplied by the scene's extent.
-        length_power: how much faster parameters of Gaussians learn in a run shorter than the 30 000 steps for which the
-            papers chose their rates: (30 000 / steps) ** length_power times, at most five. Longer runs learn at those
-            rates. Opacities are left out: they saturate.
+        length_power: how much faster parameters of Gaussians and networks learn in a run shorter than the 30 000 steps for
+            which the papers chose their rates: (30 000 / steps) ** length_power times, at most five. Longer runs learn at
+            those rates. Opacities are left out: they saturate.
         steps: planned length of the run.
         means_end: factor on the means' learning rate at the last step; log-linear in between.
         decay: share of the decay of all learning rates that a run goes through: at the last step each has fallen to

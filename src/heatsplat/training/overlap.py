@@ -37,7 +37,7 @@ class ShortLists(Overlap):
     """Resets sizes, and pulls blending weights apart, so that each Gaussian keeps to the pixels where it counts.
 
     A reset multiplies all semi-axes and forgets all of the optimiser's moments. Gaussians grow back only as far as the
-    image wants them to.
+    image wants them to. While a stage holds sizes still there is none.
 
     The entropy of a pixel is that of order 2, 1 - Σ w² - T²: w its blending weights, T the transmittance that is left. It is
     smallest where one Gaussian has all. The paper takes Shannon's, whose gradient needs the weight of each Gaussian in each
@@ -99,7 +99,7 @@ class ShortLists(Overlap):
 
     @torch.no_grad()
     def shrink(self, cloud: Cloud, step: int) -> None:
-        if not self._resets(step):
+        if not self._resets(step) or cloud.splats["log_scales"].grad is None:  # a stage may have frozen them
             return
         cloud.overwrite("log_scales", cloud.splats["log_scales"] + math.log(self.reset_factor))
         if cloud.optimizer is not None:

@@ -16,6 +16,9 @@ from heatsplat.contracts import SceneError
 from heatsplat.export.moment import Moment
 from heatsplat.io.pictures import colorize
 
+# Columns that files have of every model: a model's attribute of such a name must not stand in their place.
+OWN_COLUMNS = frozenset({"temperature", "value", "opacity"})
+
 
 class Format(ABC):
     """One format is one file with one subclass and one yaml in conf/what/.
@@ -82,8 +85,12 @@ def checked_range(range_c: Sequence[float]) -> tuple[float, float]:
 
 
 def extra_columns(moment: Moment) -> dict[str, Tensor]:
-    """What the Gaussians carry beside temperature, by name, each [N]; names in letters, digits and underscores."""
-    return {
-        "".join(letter if letter.isalnum() else "_" for letter in name): values
-        for name, values in moment.seen.attributes.items()
-    }
+    """What the Gaussians carry beside temperature, by name, each [N]; names in letters, digits and underscores.
+
+    A name that the files' own columns have comes as "model_" with that name.
+    """
+    columns = {}
+    for name, values in moment.seen.attributes.items():
+        plain = "".join(letter if letter.isalnum() else "_" for letter in name)
+        columns[f"model_{plain}" if plain in OWN_COLUMNS else plain] = values
+    return columns
