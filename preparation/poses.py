@@ -131,7 +131,7 @@ class Search:
         self._check_devices()
         self.device_of = {frame.name: i for i, device in enumerate(self.devices) for frame in device.frames}
         index = ImageIndex(target / "images")
-        self.frames = {name: frame for frame in frames if (name := index.find(frame.name)) is not None}
+        self.frames = {name: frame for frame in frames if (name := index.find(f"{frame.name}.tiff")) is not None}
         if options.by == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
             raise SceneError(
                 f"poses=rgb: {len(lacking)} of {len(frames)} frames have no photo, such as {lacking[0]}; "

@@ -10,7 +10,7 @@ import pytest
 import torch
 from weathered import CAMERA, make_scene
 
-from heatsplat.contracts import View, ViewSet
+from heatsplat.contracts import SceneError, View, ViewSet
 from heatsplat.io.tiff import read_temperature
 from heatsplat.shots import shot_frames, sightings, warn_beyond_record, write_shot
 
@@ -107,3 +107,46 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
     assert all((one.camera.width, one.camera.height) == (192, 96) for one in found)
     assert all(not one.mask[:, :96].any() and one.mask[:, 96:].all() for one in found)
     assert [frame.time_s for frame in asked] == list(scene.train.times_s)
+
+
+def two_cameras():
+    """A scene whose training images are called alike in two folders."""
+    scene = make_scene()
+    first = scene.train.frames[0]
+    moved = replace(
+        first.camera, viewmat=first.camera.viewmat + torch.eye(4, dtype=first.camera.viewmat.dtype)[[3, 0, 1, 2]]
+    )
+    frames = [
+        replace(first, name="left/1.png"),
+        replace(first, name="right/1.png", camera=moved),
+        replace(first, name="right/2.png"),
+    ]
+    return replace(scene, train=ViewSet(frames, lambda i: View(frames[i], torch.zeros(4, 4, 1))))
+
+
+def test_a_view_is_named_with_its_folder_where_the_name_alone_is_not_enough():
+    scene = two_cameras()
+    (frame,) = shot_frames(scene, "view", 0.0, "right/1.png", 1)
+    assert torch.equal(frame.camera.viewmat, scene.train.frames[1].camera.viewmat)
+    assert torch.equal(
+        shot_frames(scene, "view", 0.0, "2.png", 1)[0].camera.viewmat, scene.train.frames[2].camera.viewmat
+    )
+    with pytest.raises(SceneError, match="view '1.png' may be left/1.png, right/1.png: name it with its folder"):
+        shot_frames(scene, "view", 0.0, "1.png", 1)
+
+
+def test_images_of_one_name_have_files_of_their_own(tmp_path):
+    scene = two_cameras()
+    frames = scene.train.frames
+    camera = frames[0].camera
+    images = [({"recorded": torch.full((camera.height, camera.width, 1), 0.1 * i)}, None) for i in range(3)]
+    write_shot(images, frames, scene, tmp_path, video=False)
+    assert sorted(path.stem for path in (tmp_path / "tiff").iterdir()) == ["left_1", "right_1", "right_2"]
+    assert np.allclose(
+        read_temperature(tmp_path / "tiff" / "right_1.tiff"), scene.thermal_range.to_celsius(0.1), atol=1e-4
+    )
+    assert [row["frame"] for row in csv.DictReader((tmp_path / "frames.csv").open())] == [
+        "left_1",
+        "right_1",
+        "right_2",
+    ]

@@ -25,17 +25,21 @@ def exif_in(data: bytes) -> dict[str, Any]:
         with Image.open(io.BytesIO(data)) as picture:
             whole = picture.getexif()
             taken, gps = whole.get_ifd(EXIF), whole.get_ifd(GPS)
-            found = {
-                "make": _text(whole.get(MAKE)),
-                "model": _text(whole.get(MODEL)),
-                "serial": _text(taken.get(SERIAL)),
-                "focal_mm": float(taken[FOCAL]) if FOCAL in taken else None,
-                "time": _time(taken, gps),
-                **_position(gps),
-            }
+            found = {"make": whole.get(MAKE), "model": whole.get(MODEL), "serial": taken.get(SERIAL)}
     except Exception as error:  # Pillow raises whatever a damaged directory of tags leads to
         log.debug("no EXIF: %s", error)
         return {}
+    found = {key: text for key, value in found.items() if (text := _text(value)) is not None}
+    readers = (
+        lambda: {"focal_mm": float(taken[FOCAL])} if FOCAL in taken else {},
+        lambda: {"time": _time(taken, gps)},
+        lambda: _position(gps),
+    )
+    for read in readers:  # a clock that was never set must not cost the place
+        try:
+            found |= read()
+        except Exception as error:
+            log.debug("EXIF: %s", error)
     return {key: value for key, value in found.items() if value is not None}
 
 
@@ -53,7 +57,10 @@ def _time(taken: dict[int, Any], gps: dict[int, Any]) -> datetime | None:
     if part and part.isdigit():
         moment += timedelta(seconds=float(f"0.{part}"))
     if zone := _text(taken.get(TAKEN_ZONE)):
-        return datetime.fromisoformat(moment.isoformat() + zone.replace("Z", "+00:00"))
+        try:
+            return datetime.fromisoformat(moment.isoformat() + zone.replace("Z", "+00:00"))
+        except ValueError:
+            log.debug("EXIF: %r is no time zone", zone)
     if 7 in gps and 29 in gps:
         hours, minutes, seconds = (float(x) for x in gps[7])
         day = datetime.strptime(_text(gps[29]) or "", "%Y:%m:%d").replace(tzinfo=UTC)

@@ -104,9 +104,11 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
         SceneError: no focal length, or a camera model that is not supported.
     """
     values = {**transforms.values, **frame}
-    model = str(values.get("camera_model", "OPENCV")).upper()
+    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
     model = _COLMAP_NAME.get(model, model)
     source = f"{transforms.path}, {frame['file_path']}"
+    if values.get("is_fisheye") and "FISHEYE" not in model:
+        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {model}; keep one of them")
     if model not in MODELS:
         lens_of(model, (), 0, 0, source)  # raises, naming the supported models
 

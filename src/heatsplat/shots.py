@@ -88,11 +88,15 @@ def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> 
         return trajectories.orbit(taken, count)
     if trajectory == "path":
         return trajectories.interpolate(taken, count)
-    names = [Path(frame.name).name for frame in scene.train.frames]
     if isinstance(view, str) and not view.lstrip("-").isdigit():
-        if Path(view).name not in names:
+        names = [frame.name for frame in scene.train.frames]
+        alike = [i for i, name in enumerate(names) if Path(name).name == Path(view).name]
+        found = [names.index(view)] if view in names else alike
+        if not found:
             raise SceneError(f"view '{view}' is no training frame; there are {', '.join(names[:8])} ...")
-        return trajectories.fixed_view(taken[names.index(Path(view).name)], count)
+        if len(found) > 1:
+            raise SceneError(f"view '{view}' may be {', '.join(names[i] for i in found)}: name it with its folder")
+        return trajectories.fixed_view(taken[found[0]], count)
     if not -len(taken) <= int(view) < len(taken):
         raise SceneError(f"view {view} does not exist: scene '{scene.name}' has training frames 0 to {len(taken) - 1}")
     return trajectories.fixed_view(taken[int(view)], count)
@@ -193,12 +197,13 @@ def write_shot(
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     bar = Bar(low, high, "°C" if bounds else "")
+    stems = _stems([frame.name for frame in frames])
     written: list[Path] = []
     rows: list[tuple[str, float | None, float, float]] = []
     with ExitStack() as open_videos:
         films: dict[str, Callable[[np.ndarray], None]] = {}
         for frame, (shown, seen) in zip(frames, images, strict=True):
-            stem, share = Path(frame.name).stem, 1.0 if seen is None else seen.float().mean().item()
+            stem, share = stems[frame.name], 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
             title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s)}"
@@ -258,3 +263,11 @@ def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, floa
             "%.1f %% of the pixels show what no training view has seen: NaN in TIFF, hatched in pictures, by frame in %s "
             "(unseen=keep writes what the model makes of them)", 100 * unseen, path,
         )  # fmt: skip
+
+
+def _stems(names: Sequence[str]) -> dict[str, str]:
+    """What the files of frames are called, by name of the frame: with their folders where the names alone are not enough."""
+    stems = {name: Path(name).stem for name in names}
+    if len(set(stems.values())) == len(stems):
+        return stems
+    return {name: Path(name).with_suffix("").as_posix().replace("/", "_") for name in names}

@@ -11,13 +11,15 @@ from heatsplat.callbacks.plateau import Plateau, squared_error
 from heatsplat.contracts import SceneError
 from heatsplat.density.base import DensityControl
 from heatsplat.io.results import RunResults
+from heatsplat.training.overlap import Overlap, ShortLists
 from heatsplat.training.schedule import Schedule
+from heatsplat.training.stages import Freeze, Stages
 
 STEPS = 300
 NOISE = 0.004  # of the wall's images
 
 
-def module_of():
+def module_of(stages=None, overlap=None):
     density = DensityControl()
     density.cap_max = 1000
     return SimpleNamespace(
@@ -27,15 +29,18 @@ def module_of():
         density=density,
         splats=range(300),
         results=RunResults(),
+        stages=stages or Stages({}),
+        overlap=overlap or Overlap(),
+        resolution=SimpleNamespace(whole=True),
     )
 
 
-def trained(error, stopped_at=None):
+def trained(error, stopped_at=None, **parts):
     """(module, callback) after a run whose root mean squared error after a share of the plan is ``error(share)``.
 
     With ``stopped_at`` it is stopped there, and a new callback and module go on from the state.
     """
-    module, callback = module_of(), Plateau()
+    module, callback = module_of(**parts), Plateau()
     run = SimpleNamespace(callbacks=[callback], global_step=0)
     callback.on_fit_start(run, module)
     callback.on_train_start(run, module)
@@ -47,7 +52,7 @@ def trained(error, stopped_at=None):
         callback.on_train_batch_end(run, module, outputs, view)
         if run.global_step == stopped_at:
             state, schedule = callback.state_dict(), module.schedule.state_dict()
-            module, callback = module_of(), Plateau()
+            module, callback = module_of(**parts), Plateau()
             module.schedule.load_state_dict(schedule)
             callback.on_fit_start(run, module)
             callback.load_state_dict(state)
@@ -72,6 +77,26 @@ def test_a_run_that_goes_on_gaining_is_left_alone():
     assert module.schedule.end == STEPS
     assert "early_stop" not in module.results.run
     assert module.density.cap_max == 1000
+
+
+def test_a_last_round_or_stage_is_waited_for():
+    """Where the image that is scored does not train at first, its error is flat."""
+    late = Stages({"geometry": Freeze(["means"], start=120)})
+    for stages in (late, Stages({}, restarts=[120]), Stages({"first": Freeze(["heat"], stop=120)})):
+        module, _ = trained(lambda share: 0.1, stages=stages)
+        assert module.results.run["early_stop"]["at_step"] == 180
+    in_turns = Stages({"geometry": Freeze(["means"], start=120, cycle=10, share=0.5)})
+    assert trained(lambda share: 0.1, stages=in_turns)[0].results.run["early_stop"]["at_step"] == 90
+
+
+def test_no_run_ends_where_sizes_were_just_reset():
+    short = ShortLists(reset_every=80, reset_start=0, reset_stop=161)
+    module, _ = trained(lambda share: 0.1, overlap=short)  # resets after 80 and 160 steps, each mended in 40
+    found = module.results.run["early_stop"]
+    assert found["at_step"] == 240 and found["steps"] == 270  # at 150 the next reset is too near
+    module.resolution.whole = False
+    with pytest.raises(SceneError, match="callbacks=plateau judges whole images"):
+        Plateau().on_fit_start(SimpleNamespace(callbacks=[]), module)
 
 
 def test_errors_that_rise_are_no_plateau():

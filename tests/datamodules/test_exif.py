@@ -44,3 +44,11 @@ def test_what_is_damaged_says_nothing():
         exif_in(whole[:length])
     assert "time" not in exif_in(jpeg({0x9003: "0000:00:00 00:00:00"}, {}))
     assert "latitude_deg" not in exif_in(jpeg(TAKEN, GPS | {2: (146, 0, 0)}))
+
+
+@pytest.mark.parametrize("clock", [{0x9003: "0000:00:00 00:00:00"}, {0x9003: "    :  :     :  :  "}])
+def test_a_clock_that_was_never_set_costs_nothing_else(clock):
+    found = exif_in(jpeg(clock | {0x920A: IFDRational(91, 10)}, GPS))
+    assert found.keys() == {"make", "model", "focal_mm", "latitude_deg", "longitude_deg", "altitude_m"}
+    blank = exif_in(jpeg(TAKEN | {0x9011: "   :  "}, GPS))["time"]
+    assert blank == datetime(2024, 10, 21, 13, 48, 48, 876000)

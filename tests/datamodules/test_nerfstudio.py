@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_colmap, write_image, write_json
 
 from heatsplat.contracts import SceneError
@@ -114,6 +115,22 @@ def test_instant_ngp_and_blender_files(tmp_path, test):
     assert [f.name for f in scene.test.frames] == [f"{test}/r_{i}.png" for i in range(5)]
     assert scene.train[0].camera.K[0, 0] == pytest.approx(0.5 * WIDTH / np.tan(0.35))
     assert scene.train[0].thermal is None and scene.train[0].rgb is not None
+
+
+def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
+    """Its files name no camera model, only is_fisheye: the same k1 to k4 are those of another lens."""
+    coefficients = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
+    for name, kind in (("ngp", {"is_fisheye": True}), ("named", {"camera_model": "OPENCV_FISHEYE"})):
+        for i in range(9):
+            write_image(tmp_path / name / f"{i}.png", photo(i))
+        write_frames(tmp_path / name, [{"file_path": f"{i}.png"} for i in range(9)], **coefficients, **kind)
+    ngp, named = (loaded(tmp_path / name) for name in ("ngp", "named"))
+    assert torch.equal(ngp.train[0].rgb, named.train[0].rgb) and torch.equal(
+        ngp.train[0].camera.K, named.train[0].camera.K
+    )
+    write_frames(tmp_path / "ngp", [{"file_path": "0.png"}], is_fisheye=True, camera_model="OPENCV")
+    with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is FULL_OPENCV; keep one of them"):
+        loaded(tmp_path / "ngp")
 
 
 def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):

@@ -1,5 +1,8 @@
 """Temperatures of a mesh's vertices, as another library reads them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from plyfile import PlyData
@@ -27,6 +30,24 @@ def test_another_library_reads_what_was_written(cooling, tmp_path):
     assert (values[known] >= low - 1).all() and (values[known] <= high + 1).all()
     colours = mesh.visual.vertex_colors[:, :3]
     assert set(map(tuple, colours[~known])) <= {(128, 128, 128), (176, 176, 176)}
+
+
+def test_a_mesh_is_in_the_coordinates_of_the_data_set(cooling, tmp_path):
+    """Where an origin was taken off the scene (UTM, say), the mesh that is given still has it, and so has what is written."""
+    scene, origin = cooling.module.scene, np.array([6e5, 5.6e6, 100.0])
+    sphere = trimesh.creation.icosphere(2, radius=0.3 * float(scene.bulk[1]))
+    sphere.apply_translation(scene.bulk[0].numpy())
+    sphere.export(tmp_path / "near.obj", digits=9)
+    sphere.apply_translation(origin)
+    sphere.export(tmp_path / "far.obj", digits=9)
+    moved = SimpleNamespace(
+        scene=replace(scene, notes={**scene.notes, "origin": origin.tolist()}), renderer=cooling.module.renderer
+    )
+    Mesh(f"{tmp_path}/near.obj", views=4, two_sided=True).write(cooling, tmp_path / "a.ply")
+    Mesh(f"{tmp_path}/far.obj", views=4, two_sided=True).write(replace(cooling, module=moved), tmp_path / "b.ply")
+    near, far = (PlyData.read(tmp_path / name)["vertex"] for name in ("a.ply", "b.ply"))
+    assert np.allclose(far["x"] - near["x"], origin[0], atol=1e-6)
+    assert np.allclose(near["temperature_c"], far["temperature_c"], atol=0.05, equal_nan=True)
 
 
 def test_what_cannot_be_seen_or_read_is_said(cooling, tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.export.place import place_of
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
@@ -35,6 +35,22 @@ def test_positions_give_the_projection_the_scale_and_the_turn(cooling, tmp_path)
     turn = math.radians(30.0)
     expected = [[5e5, 5.2e6, 100.0], [5e5 + 2 * math.cos(turn), 5.2e6 + 2 * math.sin(turn), 101.0]]
     assert (found - torch.tensor(expected, dtype=torch.float64)).abs().max() < 1e-3
+
+
+def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path):
+    scene = cooling.module.scene
+    frames = [replace(f, name=f"{'ab'[i % 2]}/{i // 2}.png") for i, f in enumerate(scene.train.frames)]
+    twice = replace(scene, train=ViewSet(frames, lambda i: None))
+    path = table(twice, tmp_path / "gps.csv")
+    spot = torch.zeros(1, 3)
+    expected = place_of(scene, table(scene, tmp_path / "b.csv"))(spot)
+    assert torch.allclose(place_of(twice, path)(spot), expected, atol=1e-3)
+    text = path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert torch.allclose(place_of(twice, path)(spot), expected, atol=1e-3)
+    path.write_text(path.read_text(encoding="utf-8-sig").replace("a/", "").replace("b/", ""))
+    with pytest.raises(SceneError, match="has positions of [01] of the training images"):
+        place_of(twice, path)
 
 
 def test_the_scene_s_own_table_is_taken_unless_it_places_nothing(cooling, tmp_path, caplog):

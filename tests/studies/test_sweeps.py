@@ -58,6 +58,14 @@ def test_rows_have_means_spreads_and_reasons(sweep):
     assert rows["broken"].failed == ["SceneError: no points"] and rows["stopped"].failed == ["not finished"]
 
 
+def test_a_job_that_was_trained_again_counts_once(sweep, caplog):
+    job(sweep, 11, ["row='K = 24'", "seed=0"], 36.0)
+    job(sweep, 12, ["seed=1", "row='K = 24'"], None)  # did not get to its end
+    rows = {row.name: row for row in collect(sweep)}
+    assert sorted(rows["K = 24"].values("psnr")) == [36.0, 37.0]
+    assert "2 jobs were trained more than once; each counts once" in caplog.text
+
+
 def test_the_table_is_written_for_people_programs_and_eyes(sweep):
     written = write_sweep(sweep, ["K = 24", "K = 8"], {"K = 24": quoted("etgs", "4", "K=24", ["average"])})
     assert [path.name for path in written] == ["table.md", "table.csv", "table.png"]

@@ -7,6 +7,7 @@ import html
 import io
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 from markdown_it import MarkdownIt
 from PIL import Image
@@ -49,7 +50,9 @@ def page(text: str, folder: Path) -> str:
     """The page of a report in Markdown whose pictures lie in ``folder``; those that do not are left out."""
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     body = markdown.render(text)
-    body = re.sub(r'<img src="([^"]+)" alt="([^"]*)" />', lambda found: _embedded(folder / found[1], found[2]), body)
+    body = re.sub(
+        r'<img src="([^"]+)" alt="([^"]*)" />', lambda found: _embedded(folder / unquote(found[1]), found[2]), body
+    )
     body = re.sub(r"<table>.*?</table>", lambda found: f'<div class="wide">{found[0]}</div>', body, flags=re.S)
     head, *parts = re.split(r"<h2>(.*?)</h2>", body)
     sections, titles = [], []

@@ -29,6 +29,9 @@ class Plateau(pl.Callback):
     Learning rates are still high then. So the rest of the plan is spread over ``tail`` (``Schedule.end_at``), and no Gaussians
     are added in it.
 
+    No run is stopped before its last round or stage has had two tenths of the plan, nor where opacities or sizes would be
+    reset in the tail, which is too short to mend them.
+
     What came of it is in ``module.results.run["early_stop"]`` and so in the report. A resumed run stops where the uninterrupted
     one does.
 
@@ -55,6 +58,10 @@ class Plateau(pl.Callback):
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if any(isinstance(callback, BudgetClock) for callback in trainer.callbacks):
             raise SceneError("callbacks=plateau and budget= both move the end of the run: leave one out")
+        if not module.resolution.whole:
+            raise SceneError(
+                "callbacks=plateau judges whole images, and steps of schedule=lattice see parts: leave it out"
+            )
         self._variance = noise_of_views(module.scene.train, module.modality) ** 2
 
     @torch.no_grad()
@@ -73,8 +80,10 @@ class Plateau(pl.Callback):
         if step % tenth:
             return
         now = {frame: float(total) / visits for frame, (total, visits) in self._now.items()}
-        settled = module.density.settled(schedule.round_step(step - 1))
-        if settled and schedule.progress(step) >= self.after and step < schedule.end:
+        settled = self._settled(module, step - 1)
+        changed = module.stages.last_change(schedule.steps)
+        ready = not changed or step >= changed + 2 * tenth
+        if settled and ready and schedule.progress(step) >= self.after and step < schedule.end:
             self._judge(module, step, now)
         # Errors shortly after a reset of opacities say nothing of what training gains.
         self._before, self._now = (now if settled else {}), {}
@@ -93,7 +102,10 @@ class Plateau(pl.Callback):
             return
         schedule = module.schedule
         planned = schedule.end
-        schedule.end_at(step, min(planned, step + self.tail * schedule.steps))
+        end = min(planned, step + self.tail * schedule.steps)
+        if not all(self._settled(module, later) for later in range(step, math.ceil(end))):
+            return  # asked again after the next tenth
+        schedule.end_at(step, end)
         self._found = {
             "at_step": step,
             "planned_steps": planned,
@@ -109,6 +121,11 @@ class Plateau(pl.Callback):
         log.info(
             "plateau at step %d: %s; training ends at step %d of %d", step, self._found["why"], schedule.end, planned
         )
+
+    @staticmethod
+    def _settled(module: pl.LightningModule, step: int) -> bool:
+        """Whether images after ``step`` tell how good the Gaussians are, and not how far they are from a reset."""
+        return all(part.settled(module.schedule.round_step(step)) for part in (module.density, module.overlap))
 
     def _hold(self, module: pl.LightningModule) -> None:
         """Lets no more Gaussians come, for there is no time for them to settle."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from glob import escape
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytorch_lightning as pl
 import torch
@@ -236,7 +238,7 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     if pictures:
         lines += ["", "## Test views", ""]
         for path in pictures:
-            lines += [f"![{path.stem}]({path.relative_to(folder).as_posix()})", ""]
+            lines += [_picture(path, folder), ""]
         if (folder / TEST_FILE).exists():
             lines.append(f"Scores of each test image: [{TEST_FILE}]({TEST_FILE}).")
     lines += _picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning")
@@ -255,6 +257,12 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     if entries := citations(run.get("method")):
         lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
     return "\n".join([*lines, ""])
+
+
+def _picture(path: Path, folder: Path, alternative: str | None = None) -> str:
+    """A picture in Markdown, whatever its file is called: images may be named as a camera or a person liked."""
+    plain = re.sub(r"([\\\[\]`*_<])", r"\\\1", path.stem) if alternative is None else alternative
+    return f"![{plain}]({quote(path.relative_to(folder).as_posix())})"
 
 
 def _picture_section(title: str, folder: Path, name: str, alternative: str) -> list[str]:
@@ -307,7 +315,7 @@ def learned_section(folder: Path) -> list[str]:
         + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
     )  # fmt: skip
     pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
-    maps = [f"![maps of learned quantities]({path.relative_to(folder).as_posix()})" for path in pictures]
+    maps = [_picture(path, folder, "maps of learned quantities") for path in pictures]
     heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit")
     table = markdown_table(heads, rows, "l" + "r" * (len(heads) - 2) + "l")
     return ["", "## Learned quantities", "", *table, "", note, "", *maps]

@@ -33,10 +33,15 @@ def write_files(
     seen = snapshot(module)
     for sentence in seen.left_out:
         log.warning("%s", sentence)
+    if form.from_origin and (origin := module.scene.notes.get("origin")) is not None:
+        log.warning(
+            "coordinates count from %s of the data set, whose numbers are too large for float32; add it to get those back",
+            ", ".join(f"{x:.10g}" for x in origin),
+        )
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for moment in moments(module, seen, times, layer):
-        when = "" if moment.time_s is None else f"_{moment.time_s:.6g}s"
+        when = "" if moment.time_s is None else f"_{moment.time_s:.9g}s"
         written.append(folder / f"{module.scene.name}{when}{form.suffix}")
         form.write(moment, written[-1])
     return written

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import logging
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -117,9 +120,9 @@ def _placed(scene: SceneData, path: Path) -> Place:
     """By the similarity that brings the training cameras closest to their positions."""
     positions = _positions(path)
     found = {
-        frame.camera.center: positions[Path(frame.name).stem]
-        for frame in scene.train.frames
-        if Path(frame.name).stem in positions
+        frame.camera.center: positions[name]
+        for frame, name in zip(scene.train.frames, _named(scene, positions), strict=True)
+        if name is not None
     }
     if len(found) < 3:
         names = ", ".join(frame.name for frame in scene.train.frames[:2])
@@ -142,11 +145,25 @@ def _placed(scene: SceneData, path: Path) -> Place:
     return Place(similarity, crs, "metre")
 
 
+def _named(scene: SceneData, positions: Mapping[str, Any]) -> list[str | None]:
+    """By which name the position of each training image is known: its own, or that of its file where no other has it."""
+    stems = Counter(Path(name).stem for name in positions)
+    alone = {stem: name for stem, name in ((Path(name).stem, name) for name in positions) if stems[stem] == 1}
+    ours = Counter(Path(frame.name).stem for frame in scene.train.frames)
+    found = []
+    for frame in scene.train.frames:
+        whole, stem = Path(frame.name).with_suffix("").as_posix(), Path(frame.name).stem
+        found.append(whole if whole in positions else alone.get(stem) if ours[stem] == 1 else None)
+    return found
+
+
 def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
     """Latitude, longitude and height by name without ending; rows without a position are left out."""
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            head = file.readline()
+            file.seek(0)
+            rows = list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path} cannot be read: {error}") from error
     columns = []
@@ -158,7 +175,9 @@ def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
     name, *numbers = columns
     try:
         return {
-            Path(row[name]).stem: tuple(float(row[n]) for n in numbers) for row in rows if all(row[n] for n in numbers)
+            Path(row[name]).with_suffix("").as_posix(): tuple(float(row[n].replace(",", ".")) for n in numbers)
+            for row in rows
+            if all(row[n] for n in numbers)
         }
     except ValueError as error:
         raise SceneError(f"{path}: {error} in {', '.join(numbers)}") from error

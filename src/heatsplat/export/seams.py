@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter, uniform_filter
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, SceneError
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.io.pictures import ERROR, Bar, Panel, bounds_of, colorize, compose, error_limit_of
 
@@ -38,6 +38,8 @@ def mosaic(scene: SceneData, points: Tensor) -> tuple[np.ndarray, np.ndarray]:
     owner = torch.full(shape, -1)
     for i in range(len(scene.train)):
         view = scene.train[i]
+        if view.thermal is None:
+            raise SceneError(f"what.against compares temperatures, and scene '{scene.name}' has no thermal images")
         camera, image = view.camera, view.thermal[..., 0].double()
         local = to_camera(points.reshape(-1, 3), camera.viewmat.double()).view(*shape, 3)
         place = to_pixels(local.reshape(-1, 3), camera.K.double()).view(*shape, 2).nan_to_num(-1)

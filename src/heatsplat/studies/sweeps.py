@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
 from heatsplat.studies.recorded import OVERRIDES
+
+log = logging.getLogger(__name__)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them, with heading and digits.
@@ -63,6 +66,13 @@ def collect(folder: Path) -> list[Runs]:
     table = read_runs(sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number))
     if table.empty:
         return []
+    # A grid that got another seed numbers its jobs anew, and trains some of them again: each counts once.
+    jobs = [tuple(sorted(row.overrides.items())) or row.folder for row in table.itertuples()]
+    done_last = table.assign(job=jobs, done=table["failed"].isna()).sort_values("done", kind="stable")
+    kept = done_last.drop_duplicates("job", keep="last").index
+    if len(kept) < len(table):
+        log.warning("%s: %d jobs were trained more than once; each counts once", folder, len(table) - len(kept))
+        table = table.loc[table.index.isin(kept)].reset_index(drop=True)
     table[["name", "other"]] = row_names(table["overrides"])
     groups = table.groupby(["scene", "name", "other"], sort=False)
     return [Runs(name, scene, own, other) for (scene, name, other), own in groups]

@@ -82,6 +82,12 @@ class Stages:
         self.freezes = {name: freeze for name, freeze in freezes.items() if freeze is not None}
         self.restarts = tuple(restarts)
 
+    def last_change(self, steps: int) -> int:
+        """The last step of a run of so many at which a round begins, or a stage begins or ends that comes once; 0 for none."""
+        once = [freeze for freeze in self.freezes.values() if freeze.cycle is None]
+        turns = [step for freeze in once for step in (freeze.start, freeze.stop) if step is not None and step < steps]
+        return max((*self.restarts, *turns), default=0)
+
     def check(self, optimizer: torch.optim.Optimizer) -> None:
         """Warns of stages that freeze nothing, as none of their names is a group of this run."""
         for name, freeze in self.freezes.items():

@@ -25,9 +25,12 @@ class Format(ABC):
 
     Class attributes:
         suffix: of its files, with the dot.
+        from_origin: whether coordinates count from the scene's "origin", where one was taken off numbers that float32 cannot
+            hold (``notes["origin"]``).
     """
 
     suffix: str = ""
+    from_origin: bool = True
 
     @abstractmethod
     def write(self, moment: Moment, path: Path) -> None:

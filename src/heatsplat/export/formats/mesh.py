@@ -35,6 +35,7 @@ class Mesh(Format):
     """
 
     suffix = ".ply"
+    from_origin = False
 
     def __init__(
         self,
@@ -64,7 +65,10 @@ class Mesh(Format):
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
         looks = [look(moment, scene.train.frames[i]) for i in chosen]
-        values = values_at(looks, points, None if self.two_sided else normals)
+        origin = torch.tensor(
+            scene.notes.get("origin", [0.0, 0.0, 0.0]), dtype=torch.float64
+        )  # was taken off the scene
+        values = values_at(looks, points - origin, None if self.two_sided else normals)
         if not values.isfinite().any():
             raise SceneError(
                 f"what.mesh={self.mesh}: no training view sees any of its {len(points)} vertices. Is it in the coordinates of "
