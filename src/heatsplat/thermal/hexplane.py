@@ -201,7 +201,8 @@ class HexPlane(Wrapper):
             return level + self.range.bounds.span_k * change
 
     def rate_of(self, name: str) -> Rate:
-        return Rate(self.lr_planes, self.lr_end) if name.startswith(("space.", "time.")) else super().rate_of(name)
+        own = super().rate_of(name)
+        return own._replace(lr=self.lr_planes) if name.startswith(("space.", "time.")) else own
 
     @property
     def cost(self) -> int:

@@ -177,11 +177,8 @@ class NtrGaussian(ThermalModel):
             return self.range.kelvin(self._units(splats, ids, time_s))
 
     def rate_of(self, name: str) -> Rate:
-        return (
-            Rate(self.lr_attributes, self.lr_end, self.paced)
-            if name.startswith(ATTRIBUTE_NETWORKS)
-            else super().rate_of(name)
-        )
+        own = super().rate_of(name)
+        return own._replace(lr=self.lr_attributes) if name.startswith(ATTRIBUTE_NETWORKS) else own
 
     def effects(self) -> dict[str, dict]:
         return {"relaxation": {"nodes": self.nodes, "window_s": self.window_s}, "radiation": {}, "convection": {}}

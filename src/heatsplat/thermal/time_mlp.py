@@ -104,7 +104,8 @@ class TimeMlp(Wrapper):
             return level + self.range.bounds.span_k * self.change(Query(ids).rows(splats["feature"]), time_s)
 
     def rate_of(self, name: str) -> Rate:
-        return Rate(self.lr_time, self.lr_end, self.paced) if name.startswith(ENCODER) else super().rate_of(name)
+        own = super().rate_of(name)
+        return own._replace(lr=self.lr_time) if name.startswith(ENCODER) else own
 
     @property
     def cost(self) -> int:

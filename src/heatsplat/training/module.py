@@ -368,7 +368,7 @@ class SplatTraining(pl.LightningModule):
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
             target = inputs.target
-            if inputs.mask is not None:
+            if inputs.mask is not None and target.shape[:2] == (camera.height, camera.width):
                 target = target.where(inputs.mask[..., None], torch.nan)
             target = resampled(target, camera.height, camera.width, "area")
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)

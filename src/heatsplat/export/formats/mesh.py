@@ -65,9 +65,8 @@ class Mesh(Format):
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
         looks = [look(moment, scene.train.frames[i]) for i in chosen]
-        origin = torch.tensor(
-            scene.notes.get("origin", [0.0, 0.0, 0.0]), dtype=torch.float64
-        )  # was taken off the scene
+        # What was taken off the scene, where its coordinates are too large for float32.
+        origin = torch.tensor(scene.notes.get("origin", [0.0, 0.0, 0.0]), dtype=torch.float64)
         values = values_at(looks, points - origin, None if self.two_sided else normals)
         if not values.isfinite().any():
             raise SceneError(
