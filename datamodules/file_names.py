@@ -6,7 +6,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
 
-from heatsplat.datamodules.timestamps import stem_of
+
+def stem_of(name: str) -> str:
+    """File name without folder and extension."""
+    base = PurePosixPath(name.replace("\\", "/")).name
+    head, dot, tail = base.rpartition(".")
+    return head if dot and tail.isalnum() and not tail.isdigit() else base
 
 
 def same_files(names: Sequence[str], listed: Iterable[str]) -> dict[str, list[str]]:

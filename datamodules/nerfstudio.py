@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
@@ -26,7 +27,6 @@ from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_t
 from heatsplat.datamodules.points import ply_points, random_points, told_random
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
-from heatsplat.datamodules.timestamps import stem_of
 
 log = logging.getLogger(__name__)
 
@@ -166,12 +166,14 @@ class Nerfstudio(SceneDataModule):
             model = read_model(folder)
             # The JSON's world is COLMAP's after applied_transform (nerfstudio turns the axes); its points go along.
             turn = transforms.applied_transform
-            of_model = {stem_of(n): turn @ np.linalg.inv(v) for n, v in zip(model.names, model.viewmats, strict=True)}
-            pairs = [
-                (of_model[stem_of(f.name)], np.linalg.inv(f.viewmat)) for f in frames if stem_of(f.name) in of_model
-            ]
-            apart = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in pairs), default=0.0)
-            spread = np.ptp(np.stack([np.linalg.inv(f.viewmat)[:3, 3] for f in frames]), axis=0).max()
+            of_model = {n: turn @ np.linalg.inv(v) for n, v in zip(model.names, model.viewmats, strict=True)}
+            named = same_files([f.name for f in frames], of_model)
+            centers = np.stack([np.linalg.inv(f.viewmat)[:3, 3] for f in frames])
+            pairs = [(of_model[n], center) for f, center in zip(frames, centers, strict=True) for n in named[f.name]]
+            apart = max((float(np.linalg.norm(pose[:3, 3] - center)) for pose, center in pairs), default=0.0)
+            if not pairs:  # the model may be of photos that are called otherwise: their places tell
+                apart = float(cKDTree([pose[:3, 3] for pose in of_model.values()]).query(centers)[0].max())
+            spread = np.ptp(centers, axis=0).max()
             if apart <= 0.05 * spread + 1e-6:
                 place = model.folder.relative_to(folder)
                 points = model.points @ turn[:3, :3].T + turn[:3, 3]

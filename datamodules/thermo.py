@@ -14,12 +14,12 @@ from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame
 from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.colmap import image_index, match_model
+from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.ntr import FILES, listed_frames, mesh_points
 from heatsplat.datamodules.side_files import finite, json_object, mapping, shortened
 from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
-from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.datamodules.weather import utc_seconds
 
 META_FILE = "meta.json"

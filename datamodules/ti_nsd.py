@@ -9,9 +9,9 @@ from typing import Any
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.colmap import image_index, match_model
+from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
-from heatsplat.datamodules.timestamps import stem_of
 
 # Frames of the second part of a two-part scene (s2_<n>) are numbered on from here (Thermal3D-GS).
 SECOND_PART = 486

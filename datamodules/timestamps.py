@@ -127,10 +127,3 @@ def _seconds_of(text: str) -> float:
         return float(text)
     except ValueError:
         return instant(datetime.fromisoformat(text))
-
-
-def stem_of(name: str) -> str:
-    """File name without folder and extension."""
-    base = PurePosixPath(name.replace("\\", "/")).name
-    head, dot, tail = base.rpartition(".")
-    return head if dot and tail.isalnum() and not tail.isdigit() else base

@@ -23,9 +23,9 @@ from torch import Tensor
 from heatsplat.contracts import Camera, SceneData, SceneError, View, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
+from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.side_files import read_table
-from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.geometry.sight_lines import cosines, distances, normals
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
@@ -147,7 +147,8 @@ def correct(
         trust: classes of yours that the checkpoint may name.
 
     Raises:
-        SceneError: the scene has no temperatures or no scale, or the conditions leave nothing to correct.
+        SceneError: the scene has no temperatures or no scale, ``target`` is its own folder, or the conditions leave nothing to
+            correct.
     """
     trained = load(ckpt, data={"downscale": downscale}, trust=trust)
     root = Path(trained.config["data"]["root"] or ".")

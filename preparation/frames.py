@@ -395,7 +395,7 @@ def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list
     """Frames with what a table says of them, which goes before what their files say.
 
     Raises:
-        SceneError: the table has no row for any frame or no column that is known, or a cell cannot be read.
+        SceneError: the table has no row for any frame or several for one, or no column that is known, or a cell cannot be read.
     """
     if reading.table is None:
         return frames

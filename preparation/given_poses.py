@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import find_model, read_model, write_model
 from heatsplat.datamodules.formats.images import ImageIndex
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.nerfstudio import find_transforms
 from heatsplat.datamodules.points import ply_points
-from heatsplat.datamodules.timestamps import stem_of
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.poses import PICTURE, WORK, put_whole

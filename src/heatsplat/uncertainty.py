@@ -134,7 +134,7 @@ class Uncertainty:
         module: a trained module with its scene.
 
     Raises:
-        SceneError: the scene has no training view.
+        SceneError: the scene has no training view, or masks leave none of their pixels.
     """
 
     def __init__(self, module: Any) -> None:

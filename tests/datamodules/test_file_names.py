@@ -2,7 +2,7 @@
 
 import pytest
 
-from heatsplat.datamodules.file_names import same_files
+from heatsplat.datamodules.file_names import same_files, stem_of
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,8 @@ from heatsplat.datamodules.file_names import same_files
 )
 def test_folders_tell_files_of_one_name_apart(names, listed, expected):
     assert list(same_files(names, listed).values()) == expected
+
+
+def test_stems_lose_folder_and_extension_only():
+    assert stem_of("a/b/DJI_1_T.JPG") == stem_of("DJI_1_T") == "DJI_1_T"
+    assert stem_of("12.500") == "12.500"

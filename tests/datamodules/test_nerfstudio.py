@@ -198,3 +198,23 @@ def test_lists_name_frames_by_their_visible_image(tmp_path):
     visible = [frame["file_path"] for frame in frames]
     write_frames(tmp_path, frames, train_filenames=visible[:4], test_filenames=visible[4:])
     assert [f.name for f in loaded(tmp_path).test.frames] == ["4_T.png", "5_T.png"]
+
+
+@pytest.mark.parametrize(("center", "used"), [((0.0, 0.0, 0.0), True), ((600.0, 0.0, 0.0), False)])
+def test_a_model_of_images_that_are_called_otherwise_is_known_by_its_places(tmp_path, center, used):
+    frames = [{"file_path": f"thermal/{i}_T.png"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_frames(tmp_path, frames)
+    write_colmap(tmp_path, names(9), images=None, center=center)
+    source = loaded(tmp_path, split="every_8th").notes["points_source"]
+    assert ("(COLMAP)" in source) == used and ("units elsewhere" in source) != used
+
+
+def test_a_model_of_two_cameras_is_matched_by_folders(tmp_path):
+    files = [f"thermal/cam{camera}/{i}.png" for camera in (0, 1) for i in range(4)]
+    for i, file in enumerate(files):
+        write_image(tmp_path / file, grey(i))
+    write_frames(tmp_path, [{"file_path": file} for file in files])
+    write_colmap(tmp_path, [file.removeprefix("thermal/") for file in files], images=None)
+    assert "(COLMAP)" in loaded(tmp_path, split="every_8th").notes["points_source"]

@@ -7,7 +7,6 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.timestamps import (
     dji_time,
     seconds_of_day,
-    stem_of,
     time_by_pattern,
     times_from_csv,
     unrolled_midnight,
@@ -86,8 +85,3 @@ def test_a_table_names_missing_columns_and_bad_cells(tmp_path):
         times_from_csv(table, "file", "s")
     with pytest.raises(SceneError, match="data.time_csv: there is no file"):
         times_from_csv(tmp_path / "no.csv", "file", "s")
-
-
-def test_stems_lose_folder_and_extension_only():
-    assert stem_of("a/b/DJI_1_T.JPG") == stem_of("DJI_1_T") == "DJI_1_T"
-    assert stem_of("12.500") == "12.500"

@@ -25,13 +25,8 @@ log = logging.getLogger(__name__)
 
 INTERPOLATIONS = ("lanczos", "bicubic")
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
-PLAIN_MODES = {
-    "1": "L",
-    "LA": "L",
-    "La": "L",
-    "P": "RGB",
-    "PA": "RGB",
-}  # of Pillow: what no number of a pixel says by itself
+# Modes of Pillow in which numbers are no brightness, or have an alpha among them, and what they become.
+PLAIN_MODES = dict.fromkeys(("1", "LA", "La"), "L") | dict.fromkeys(("P", "PA"), "RGB")
 WHERE = (
     "Give a file with a network (a state dict of SwinIR such as 002_lightweightSR_DIV2K_s64w8_SwinIR-S_x4.pth from "
     "github.com/JingyunLiang/SwinIR/releases; with trust=true also TorchScript or torch.export's .pt2) or a folder with one "
@@ -226,9 +221,8 @@ class Network(Teacher):
             raise SceneError(f"teacher={self.path}: its answer to {frame.name} is not finite")
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(
-                dir=kept.parent, suffix=".part", delete=False
-            ) as partial:  # jobs share the cache
+            # Jobs share the cache: each writes a file of its own.
+            with tempfile.NamedTemporaryFile(dir=kept.parent, suffix=".part", delete=False) as partial:
                 np.save(partial, fine.numpy().astype(np.float16))
             os.chmod(partial.name, 0o644)
             os.replace(partial.name, kept)
