@@ -29,10 +29,11 @@ class BudgetClock(pl.Callback):
     the steps that are left are those for which there is time at the pace of the last steps, more or fewer than planned,
     and what is left of the schedule is spread over them (``Schedule.end_at``).
 
-    Where a scene calls for more Gaussians than expected, or the machine is slower, growing would eat the time in which they
-    settle: as long as the growing half would take more than six tenths of the time, no more Gaussians come
-    (``density.cap_max``); the first tenth of the time is left alone. Where seven tenths of the time are gone before it ends,
-    the schedule is shrunk at once.
+    Where a scene calls for more Gaussians than expected, growing would eat the time in which they settle: as long as the
+    growing half would take more than six tenths of the time, also at the pace that the calibration saw, no more Gaussians
+    come (``density.cap_max``); the first tenth of the time is left alone. A machine that is slower than the calibration saw is no
+    reason: fewer Gaussians would not make up for it (on CUDA they cost next to nothing), and fewer steps lose less than they.
+    Where seven tenths of the time are gone before the half ends, the schedule is shrunk at once, and no more Gaussians come.
 
     Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its schedule.
@@ -49,6 +50,8 @@ class BudgetClock(pl.Callback):
         self._meter: CostMeter | None = None
         self._cap: int | None = None  # Gaussians that there may be by the plan
         self._held: int | None = None  # step at which growing was first held back
+        self._last: int | None = None  # Gaussians that there may be since the schedule was shrunk before it had settled
+        self._calibrated = 0.0  # seconds that the steps so far would have taken at the pace of the calibration
         self._every = max(1, int(plan["steps"]) // LOOKS)
 
     # The run ---------------------------------------------------------------------------------------------------------
@@ -60,16 +63,23 @@ class BudgetClock(pl.Callback):
                 "budget needs callbacks.costs, which measures time: keep callbacks.costs on, or leave budget out"
             )
         self._cap = module.density.cap_max
+        self._close(module)
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
         step, schedule = trainer.global_step, module.schedule
         if step % self._every != 0 and step < schedule.end - self._every:
             return
         spent = self._spent()
+        since = self._seen[-1][0] if self._seen else step
+        self._calibrated += (step - since) * self._calibrated_s(module)
         self._seen.append((step, spent))
         while len(self._seen) > 2 and spent - self._seen[1][1] > WINDOW * self.seconds:
             self._seen.popleft()
         if schedule.progress(step) >= SETTLED or spent >= PRESSED * self.seconds:
+            if schedule.progress(step) < SETTLED and self._last is None:
+                self._last = len(module.splats)
+                self._held = step if self._held is None else self._held
+                self._close(module)
             self._retime(schedule, step, spent)
         else:
             self._hold(module, step, spent)
@@ -90,11 +100,22 @@ class BudgetClock(pl.Callback):
         step_s = self._step_s()
         if step_s is None or self._cap is None or spent < EARLY * self.seconds:
             return
-        growing = spent + step_s * (SETTLED - module.schedule.progress(step)) * module.schedule.end
-        held = growing > GROWING * self.seconds
+        left = (SETTLED - module.schedule.progress(step)) * module.schedule.end
+        limit = GROWING * self.seconds
+        held = spent + step_s * left > limit and self._calibrated + self._calibrated_s(module) * left > limit
         module.density.cap_max = min(self._cap, len(module.splats)) if held else self._cap
         if held and self._held is None:
             self._held = step
+
+    def _close(self, module: pl.LightningModule) -> None:
+        """Lets no more Gaussians come for good, where the schedule was shrunk before it had settled."""
+        if self._last is not None and self._cap is not None:
+            module.density.cap_max = min(self._cap, self._last)
+
+    def _calibrated_s(self, module: pl.LightningModule) -> float:
+        """Seconds of a step with as many Gaussians as there are now, as the calibration saw the machine."""
+        more = len(module.splats) - self.plan["points"]
+        return 1e-3 * self.plan["step_ms"] + 1e-6 * self.plan["gaussian_us"] * more
 
     def _step_s(self) -> float | None:
         """Seconds of one of the last steps; None before it is known."""
@@ -139,7 +160,8 @@ class BudgetClock(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"held": self._held}
+        return {"held": self._held, "last": self._last, "calibrated_s": self._calibrated}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._held = state["held"]
+        self._held, self._last = state["held"], state.get("last")
+        self._calibrated = state.get("calibrated_s", 0.0)

@@ -44,7 +44,7 @@ def visible_temperature(
     **Convention:** units as in ``relaxation.temperature``.
 
     Args:
-        time: [] float64.
+        time: [] float64, best on the CPU.
         ambient: [].
         initial, rate: [N].
         omega: [K] float64.
@@ -74,18 +74,26 @@ def visible_temperature(
             time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places, log_bounds
         )
     if rate.is_cuda and rate.dtype == torch.float32 and gpu.available():
-        on_cpu = omega.cpu()
+        on_cpu = _on_cpu(omega)
         if _no_omega_vanishes(on_cpu):
             return _VisibleTemperatureOnCuda.apply(
                 time, ambient, initial, rate, on_cpu, gains, inverse_capacity, ids, places, log_bounds
             )
     rate = rate if log_bounds is None else rate.clamp(*log_bounds).exp()
-    return _reference(time, ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
+    return _reference(time.to(rate.device), ambient, initial, rate, omega, gains, inverse_capacity, ids, places)
 
 
 def _fits_kernel(rate: Tensor, omega: Tensor) -> bool:
     """Whether the CPU's kernel can be used: on a CPU, and no ω of (almost) zero."""
     return rate.device.type == "cpu" and rate.dtype in NUMPY_TYPES and _no_omega_vanishes(omega)
+
+
+def _on_cpu(omega: Tensor) -> Tensor:
+    """A copy on the CPU, kept with a tensor until that changes: every step reads it, and would wait for the device."""
+    kept = omega.__dict__.get("on_cpu")
+    if kept is None or kept[0] != omega._version:
+        kept = omega.on_cpu = omega._version, omega.cpu()
+    return kept[1]
 
 
 def _no_omega_vanishes(omega: Tensor) -> bool:

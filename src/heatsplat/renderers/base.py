@@ -136,8 +136,9 @@ def rasterization(
         background = None if background is None else torch.cat([background.new_zeros(probe.channels), background])
         first, *rest = modality_channels or (None,)
         modality_channels = first and (first + probe.channels, *rest)
+    cameras = (matrix.to(means, non_blocking=means.is_cuda) for matrix in (viewmats, Ks))  # no step waits for them
     inputs = RenderInputs(
-        means, quats, scales, opacities, features, viewmats.to(means), Ks.to(means), width, height, near, far,
+        means, quats, scales, opacities, features, *cameras, width, height, near, far,
         background, antialiased, tuple(modality_channels) if modality_channels is not None else None, absgrad, depth, eps2d,
         native, raw,
     )  # fmt: skip

@@ -144,12 +144,14 @@ class Plan:
         cap: Gaussians at most, or None where the method keeps what it has.
         growth: that cap in Gaussians of the start; None is no cap but the configuration's.
         decay: ``optim.decay``, or None where the configuration's stays.
-        settings: other overrides, such as ("schedule=coarse_to_fine",).
         expected_psnr: of the demo scenes on which the curves were measured, dB; None where the method has none.
         twice_steps, twice_growth: what would be chosen in twice the time.
         twice_gain_db: and what it would gain.
         step_ms: milliseconds of a step with the Gaussians of the start, by the calibration.
         reasons: sentences: where the numbers come from and how far they reach.
+        settings: other overrides, such as ("schedule=coarse_to_fine",).
+        points: Gaussians of the start.
+        gaussian_us: microseconds that one Gaussian more adds to a step, by the calibration.
     """
 
     asked_s: float
@@ -166,6 +168,8 @@ class Plan:
     step_ms: float
     reasons: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
+    points: int = 0
+    gaussian_us: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in a checkpoint."""
@@ -289,6 +293,8 @@ def plan(
         step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),
         settings=chosen.settings,
+        points=pace.points,
+        gaussian_us=round(1e6 * pace.per_gaussian_s, 6),
     )
 
 

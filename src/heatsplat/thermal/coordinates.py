@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,10 @@ BOX_EDGE = 0.9  # places end here: the code of ``octaves`` has period 2 and woul
 
 class Clock(nn.Module):
     """The record of the training images: its first moment and its span in seconds."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Clock:
+        """Stays on the CPU, where every step reads it: a number on a GPU is waited for."""
+        return self
 
     def __init__(self) -> None:
         super().__init__()

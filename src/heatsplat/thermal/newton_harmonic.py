@@ -225,7 +225,7 @@ class NewtonHarmonic(Relaxing):
         source = self.omega.numel() > 0
         rate, log_bounds = self._given_rate(splats)
         return visible_temperature(
-            torch.tensor(spans, dtype=torch.float64, device=self.omega.device),
+            torch.tensor(spans, dtype=torch.float64),
             self.ambient,
             splats["initial_state"],
             rate,

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from heatsplat.kernels import adam as kernel
+from heatsplat.kernels import gpu
 from heatsplat.kernels.simd import LANES
 from heatsplat.physics.fused import Unwritten
 from heatsplat.splats import Splats
@@ -23,9 +24,10 @@ FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does
 
 
 class OnePassAdam(torch.optim.Adam):
-    """torch's Adam, whose step on a processor is one kernel over all float32 tensors (heatsplat.kernels.adam).
+    """torch's Adam, whose step is one kernel over all float32 tensors (heatsplat.kernels.adam, kernels.gpu.adam on CUDA).
 
     State and options are torch's own. torch steps tensor by tensor, which for small scenes takes longer than the arithmetic.
+    Where there is no Triton on CUDA, or a tensor has another dtype, torch steps.
 
     A group may have one more option, "group_penalty": the weight of a penalty Σ_k √(Σ_i x_ik²) over the columns k of the
     last dimension of its tensors. Its gradient is that of a weight decay of weight / √(Σ_i x_ik²), and is added like that.
@@ -73,10 +75,15 @@ class OnePassAdam(torch.optim.Adam):
             for group, x, unwritten in by_rows:
                 x.grad = unwritten.written(x.shape)
                 stepped.append((group, x))
-            for group, x in stepped:
-                if group.get("group_penalty"):
-                    x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
-            super().step()
+            if all(_fits_kernel(x, "cuda") and x.grad.dtype == x.dtype for _, x in stepped) and gpu.available():
+                self._step_on_cuda(stepped)
+            else:
+                for group, x in stepped:
+                    if group.get("group_penalty"):
+                        x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
+                    if group["fused"] and self.state[x]:  # torch counts on the device there, and ours on the CPU
+                        self.state[x]["step"] = self.state[x]["step"].to(x.device)
+                super().step()
             self._sums = None
         return loss
 
@@ -117,6 +124,30 @@ class OnePassAdam(torch.optim.Adam):
             self._squares = parameter, parameter._version, squares
             self._sums = np.concatenate([self._sums, sums])
 
+    def _step_on_cuda(self, stepped: list[tuple[dict[str, Any], torch.Tensor]]) -> None:
+        from heatsplat.kernels.gpu import adam as on_cuda  # here, for Triton is not everywhere
+
+        rows, counts, kept, programs = [], [], [], 0
+        for group, parameter in stepped:
+            state, gradient, count = self._state_of(parameter), parameter.grad.contiguous(), parameter.numel()
+            rates = _counted(group, state)
+            if count == 0:
+                continue
+            kept.append(gradient)  # its memory, until the kernel is queued
+            places = [x.data_ptr() for x in (parameter, gradient, state["exp_avg"], state["exp_avg_sq"])]
+            norms, columns = 0, 1
+            if group.get("group_penalty"):
+                kept.append(torch.linalg.vector_norm(parameter.detach().flatten(0, -2), dim=0))
+                norms, columns = kept[-1].data_ptr(), parameter.shape[-1]
+            pulls = group["weight_decay"], group.get("group_penalty", 0.0)
+            rows.append((*places, norms, programs, count, columns, *rates, *pulls))
+            counts.append(count)
+            programs += on_cuda.blocks(count)
+        if rows:
+            device = kept[0].device
+            tensors = torch.from_numpy(np.array(rows, np.float64)).to(device, non_blocking=True)
+            on_cuda.step[(programs,)](tensors, _owners(tuple(map(on_cuda.blocks, counts)), device), BLOCK=on_cuda.BLOCK)
+
     _squares: tuple[torch.Tensor, int, np.ndarray] | None = None  # of the last tensor stepped by rows, until it changes
 
     def _group_decay(self, group: dict[str, Any], parameter: torch.Tensor) -> np.ndarray:
@@ -139,6 +170,12 @@ class OnePassAdam(torch.optim.Adam):
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         return state
+
+
+@lru_cache(maxsize=4)
+def _owners(programs: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    """The row of each program's tensor, where tensors take so many of them; the same until Gaussians come or go."""
+    return torch.from_numpy(np.repeat(np.arange(len(programs), dtype=np.int32), programs)).to(device)
 
 
 def forget_gradients(parameter: torch.Tensor) -> None:
@@ -172,13 +209,15 @@ def load_waiting_gradients(module: nn.Module, state: Mapping[str, Any]) -> None:
             parameter.grad = found.written(parameter.shape).to(parameter)
 
 
-def _fits_kernel(parameter: torch.Tensor) -> bool:
-    """Whether a parameter is one that the kernel steps."""
-    return parameter.dtype == torch.float32 and parameter.device.type == "cpu" and parameter.is_contiguous()
+def _fits_kernel(parameter: torch.Tensor, device: str = "cpu") -> bool:
+    """Whether a parameter is one that the kernel of a kind of device steps."""
+    return parameter.dtype == torch.float32 and parameter.device.type == device and parameter.is_contiguous()
 
 
 def _counted(group: dict[str, Any], state: dict[str, torch.Tensor]) -> tuple[float, ...]:
     """Counts a step of a parameter; its row of rates for the kernel."""
+    if state["step"].is_cuda:  # of a checkpoint, by torch's rule for fused=True
+        state["step"] = state["step"].cpu()
     done = state["step"].numpy()
     done += 1
     (beta1, beta2), count = group["betas"], float(done)
