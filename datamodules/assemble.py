@@ -218,7 +218,7 @@ def _with_weather_since(raw: RawScene, first_s: float | None, notes: dict[str, A
         return raw
     if first_s is None:
         raise SceneError(f"scene {raw.name} has weather, but its frames have no times: which weather belongs to which?")
-    weather = on_clock(raw.weather, first_s)
+    weather = raw.weather.since(first_s)
     notes |= {f"weather_{key}": value for key, value in weather.notes.items()}
     return replace(raw, weather=weather)
 
@@ -278,14 +278,6 @@ def _store(
     about = Frame(name=frame.name, frame_id=frame_id, camera=camera, time_s=time_s, environment=environment)
     zero, full = _scaling(np.dtype(pixels.found["type"]), raw.counts, raw.thermal_range)
     return _Stored(about, pixels.thermal, pixels.rgb, pixels.mask, zero, full, options.thermal_channels)
-
-
-def on_clock(weather: Weather, zero_s: float) -> Weather:
-    """The weather with ``zero_s`` of its clock as its new second 0; its notes say which moment that is."""
-    notes = dict(weather.notes)
-    key = "utc_at_zero_s" if "utc_at_zero_s" in notes else "clock_at_zero_s"
-    notes[key] = notes.get(key, 0.0) + zero_s
-    return replace(weather, times_s=weather.times_s - zero_s, notes=notes)
 
 
 def weather_of(name: str, weather: Weather, time_s: float) -> Environment:

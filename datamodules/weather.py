@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneData, SceneError, View, ViewSet, Weather
-from heatsplat.datamodules.assemble import on_clock, weather_of
+from heatsplat.datamodules.assemble import weather_of
 from heatsplat.datamodules.side_files import finite, read_table, shortened
 from heatsplat.datamodules.sun import Site, clear_sky, clouds, light_taken, split_irradiance, sun_directions
 from heatsplat.datamodules.timestamps import zone_of
@@ -206,7 +206,8 @@ def make_weather(
 
 
 def with_weather(scene: SceneData, path: Path, zone: str | None = None, max_gap_s: float = MAX_GAP_S) -> SceneData:
-    """The scene under the weather of another table, for the same place; its images stay those of the old weather.
+    """The scene under the weather of another table, for the same place; its images stay those of the old weather, and what is
+    true under that is not known any more.
 
     Raises:
         SceneError: the scene has no weather to replace, or the table does not cover the times of its frames.
@@ -221,7 +222,7 @@ def with_weather(scene: SceneData, path: Path, zone: str | None = None, max_gap_
             f"weather={path} and scene '{scene.name}' do not share a clock: one has times of day, the other seconds; "
             "give the table times as the scene's own record has them"
         )
-    weather = on_clock(weather, known.get("utc_at_zero_s", known.get("clock_at_zero_s", 0.0)))
+    weather = weather.since(known.get("utc_at_zero_s", known.get("clock_at_zero_s", 0.0)))
 
     def under(views: ViewSet) -> ViewSet:
         frames = [replace(f, environment=weather_of(f.name, weather, f.time_s)) for f in views.frames]
@@ -232,9 +233,8 @@ def with_weather(scene: SceneData, path: Path, zone: str | None = None, max_gap_
         return ViewSet(frames, decode)
 
     notes = {**scene.notes, "weather_replaced_by": str(path)}
-    return replace(
-        scene, weather=weather, train=under(scene.train), val=under(scene.val), test=under(scene.test), notes=notes
-    )
+    views = {part: under(getattr(scene, part)) for part in ("train", "val", "test")}
+    return replace(scene, weather=weather, truth=None, notes=notes, **views)
 
 
 def site_of(notes: Mapping[str, Any]) -> Site | None:

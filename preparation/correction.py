@@ -150,7 +150,8 @@ def correct(
         SceneError: the scene has no temperatures or no scale, ``target`` is its own folder, or the conditions leave nothing to
             correct.
     """
-    trained = load(ckpt, data={"downscale": downscale}, trust=trust)
+    recorded = {"downscale": downscale, "degrade": "null", "upsample": "null"}  # a run may have been given less
+    trained = load(ckpt, data=recorded, trust=trust)
     root = Path(trained.config["data"]["root"] or ".")
     folders = [root, root / str(trained.config["data"].get("scene"))]
     return correct_scene(

@@ -201,6 +201,13 @@ class Weather:
             if series is not None and (len(series) != count or not bool(series.isfinite().all())):
                 raise SceneError(f"weather.{name} must hold {count} finite samples, as many as weather.times_s")
 
+    def since(self, zero_s: float) -> Weather:
+        """The weather with ``zero_s`` of its clock as its new second 0; its notes say which moment that is."""
+        notes = dict(self.notes)
+        key = "utc_at_zero_s" if "utc_at_zero_s" in notes else "clock_at_zero_s"
+        notes[key] = notes.get(key, 0.0) + zero_s
+        return replace(self, times_s=self.times_s - zero_s, notes=notes)
+
     def at(self, time_s: float) -> Environment:
         """The weather at a moment. Raises SceneError where the record does not reach it."""
         first, last = float(self.times_s[0]), float(self.times_s[-1])

@@ -421,6 +421,7 @@ def test_another_table_replaces_the_weather_of_a_scene(yard, tmp_path):
             assert view.frame.environment == scene.weather.at(view.time_s) != old.frame.environment
             assert torch.equal(view.thermal, old.thermal)
     assert scene.notes["weather_replaced_by"] == str(path)
+    assert yard.truth is not None and scene.truth is None  # which is that of the old weather
 
 
 def test_a_table_that_misses_frames_is_refused_by_name(yard, tmp_path):

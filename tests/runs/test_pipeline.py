@@ -59,6 +59,50 @@ def test_a_checkpoint_of_a_gpu_is_looked_at_where_there_is_none(trained, tmp_pat
     assert torch.equal(scene.render(frame, unseen="keep"), expected.render(frame, unseen="keep"))
 
 
+def test_a_checkpoint_is_read_on_the_scales_of_its_run(trained, tmp_path):
+    folder, _, _ = trained
+    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")
+    own = heatsplat.load(folder / "checkpoints" / "last.ckpt")
+    bounds, frame = own.scene.thermal_range, own.scene.test.frames[0]
+    assert stored["heatsplat"]["scales"]["range_c"] == [bounds.min_c, bounds.max_c]
+    stored["heatsplat"]["scales"] |= {"range_c": [0.0, 100.0], "first": own.scene.test.frames[0].name}
+    torch.save(stored, tmp_path / "other.ckpt")
+    other = heatsplat.load(tmp_path / "other.ckpt")
+    torch.testing.assert_close(
+        other.render(frame, unseen="keep"), 100 * bounds.to_unit(own.render(frame, unseen="keep")), rtol=1e-4, atol=1e-3
+    )
+    assert other.scene.test.frames[0].time_s == 0.0 and frame.time_s != 0.0
+
+
+def test_data_that_a_model_does_not_fit_are_named(tmp_path):
+    settings = [key for key in QUICK if not key.startswith("method")]
+    config = heatsplat.compose([*settings, "method=etgs", "data.scene=cooling", "test=false"])
+    heatsplat.train(config, tmp_path)
+    with pytest.raises(SceneError, match=r"does not fit data.split=block \(.*leave out what differs from training"):
+        heatsplat.load(tmp_path / "checkpoints" / "last.ckpt", {"split": "block"})
+
+
+def test_what_a_run_was_spared_of_its_images_can_be_had(tmp_path):
+    settings = [key for key in QUICK if not key.startswith(("method", "data.downscale"))]
+    heatsplat.train(
+        heatsplat.compose([*settings, "method=direct_3dgs", "data.scene=noisy_sensor", "test=false"]), tmp_path
+    )
+    small, whole = (
+        heatsplat.load(tmp_path / "checkpoints" / "last.ckpt", data)
+        for data in (None, {"degrade": "null", "upsample": "null"})
+    )
+    sizes = [scene.scene.train.frames[0].camera.width for scene in (small, whole)]
+    assert sizes[1] == 4 * sizes[0] == whole.scene.test.frames[0].camera.width
+
+
+def test_clipping_and_a_plateau_are_settings_that_are_learned_by(trained):
+    _, config, _ = trained
+    clipped = config | {"trainer": config["trainer"] | {"gradient_clip_val": 0.1, "max_time": "1"}}
+    assert differences(clipped, config) == ["trainer.gradient_clip_val"]
+    stopping = config | {"callbacks": config["callbacks"] | {"plateau": {"min_gain": 0.1}, "viewer": {"_target_": "x"}}}
+    assert differences(stopping, config) == ["callbacks.plateau"]
+
+
 @pytest.mark.parametrize("changed", ["data.downscale=2", "data.scene=cooling"])
 def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed, tmp_path):
     folder, _, _ = trained

@@ -2,8 +2,10 @@
 
 import pytest
 import torch
+from running import TINY
 
-from heatsplat.contracts import Camera, Frame, View
+from heatsplat.composition import build, compose
+from heatsplat.contracts import Camera, Frame, SceneError, View
 from heatsplat.geometry.sight_lines import rays
 from heatsplat.training.lattice import Lattice
 
@@ -35,3 +37,10 @@ def test_draws_are_those_of_the_seed_and_the_step():
     assert Lattice(rays=1).chosen(view(), 0, 0).thermal.shape[0] == 1
     with pytest.raises(ValueError, match="must be at least 1, got 0"):
         Lattice(rays=0)
+
+
+@pytest.mark.parametrize("method", ["3dgs", "scaffold_gs"])
+def test_what_is_no_field_is_refused(method):
+    plain = compose([*TINY, f"method={method}", "schedule=lattice"])
+    with pytest.raises(SceneError, match=r"Lattice shows single pixels .* give schedule=off"):
+        build(plain["module"]).attach(build(plain["data"]).scene)

@@ -17,6 +17,10 @@ log = logging.getLogger("heatsplat")
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
 NOT_LEARNED = {"threads", "ckpt", "row", "table", "leaderboard", "test", "trainer", "callbacks", "logger"}
+LEARNED = {  # and what in these says how it learns, or how long
+    "trainer": ("gradient_clip_val", "gradient_clip_algorithm", "accumulate_grad_batches"),
+    "callbacks": ("plateau",),
+}
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
@@ -87,6 +91,9 @@ def differences(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[st
     before = {**stored, **stored.get("composed", {})}
     learned = sorted(config.keys() - NOT_LEARNED - {"overrides"})
     keys = [key for name in learned for key in _differing(name, config[name], before.get(name))]
+    for group, names in LEARNED.items():
+        here, there = config.get(group) or {}, before.get(group) or {}
+        keys += [key for name in names for key in _differing(f"{group}.{name}", here.get(name), there.get(name))]
     return [key for key in keys if key.removeprefix("module.") == key or key.removeprefix("module.") not in keys]
 
 

@@ -35,7 +35,8 @@ from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_recor
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.loop import lean
 from heatsplat.training.machine import prepare_machine
-from heatsplat.training.module import SplatTraining
+from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
+from heatsplat.training.scales import on_scales
 from heatsplat.training.session import fit, restore, without_idle_hooks
 
 log = logging.getLogger("heatsplat")
@@ -217,7 +218,8 @@ def load(
 
     Args:
         checkpoint: such as outputs/<run>/checkpoints/last.ckpt.
-        data: settings of the data that differ from training, such as {"root": "/elsewhere"}; None values keep theirs.
+        data: settings of the data that differ from training, such as {"root": "/elsewhere"}; None keeps a setting, "null" is
+            none.
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
@@ -233,7 +235,7 @@ def load(
     config = trusted(stored_config(loaded), checkpoint, trust)
     if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
-    changed = {key: value for key, value in (data or {}).items() if value is not None}
+    changed = {key: None if value == "null" else value for key, value in (data or {}).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
     if "weather" in changed and "weather" not in config["data"]:
@@ -248,7 +250,8 @@ def load(
     scene_data = build(config["data"] | changed)
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
-    with _naming(checkpoint):
+    scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}))
+    with _naming(checkpoint, changed):
         restore(module, scene_data, loaded)
         if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
             module.renderer.backend = "auto"
@@ -263,8 +266,8 @@ def _try_render(module: SplatTraining, frame: Frame) -> None:
 
 
 @contextmanager
-def _naming(checkpoint: Path | str) -> Iterator[None]:
-    """Errors of building from a checkpoint, in which anything may stand, name it."""
+def _naming(checkpoint: Path | str, changed: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Errors of building from a checkpoint, in which anything may stand, name it, and the settings of its data that changed."""
     try:
         yield
     except SceneError as error:
@@ -276,6 +279,11 @@ def _naming(checkpoint: Path | str) -> Iterator[None]:
             raise SceneError(
                 f"{checkpoint} needs {absent[1]}, which Python does not find here: install its package, or set PYTHONPATH to the "
                 "folder that holds it"
+            ) from error
+        if changed:
+            told = ", ".join(f"data.{key}={value}" for key, value in changed.items())
+            raise SceneError(
+                f"{checkpoint} does not fit {told} ({said}): leave out what differs from training"
             ) from error
         raise SceneError(
             f"{checkpoint} does not fit this heatsplat ({said}): it is of another version, or not as heatsplat wrote it"

@@ -32,6 +32,7 @@ from heatsplat.training.optimisation import Optimisation, load_waiting_gradients
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
+from heatsplat.training.scales import scales_of
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
 from heatsplat.training.surroundings import Surroundings
@@ -180,6 +181,11 @@ class SplatTraining(pl.LightningModule):
             raise SceneError(
                 f"{type(self.resolution).__name__} takes single pixels out of images, which the parts of a sensor take for "
                 f"neighbours ({', '.join(self.sensor.parts)}): give sensor=none, or schedule=off"
+            )
+        if not self.resolution.whole and rows != NOTHING:
+            raise SceneError(
+                f"{type(self.resolution).__name__} shows single pixels far apart, and {names[rows]} between them are never seen: "
+                f"it is for fields, and {model} {what}; give schedule=off"
             )
         if rows != GAUSSIANS and self.smoothing.changes:
             raise SceneError(f"{model} {what}, which no filter of Gaussians in space knows: give smoothing=none")
@@ -537,6 +543,7 @@ class SplatTraining(pl.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {
             "config": self.config,
+            "scales": scales_of(self.scene),
             "schedule": self.schedule.state_dict(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }

@@ -1,0 +1,93 @@
+"""What a checkpoint counts in: the clock and the temperatures of the scene that it was trained on.
+
+Both follow from the training images: time begins at the first of them, and bounds of temperatures may be theirs. Data that are
+divided otherwise, or have other bounds, would be read on other scales than those on which a model has learned.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from heatsplat.contracts import SceneData, ThermalRange, View, ViewSet
+
+log = logging.getLogger("heatsplat")
+
+
+def scales_of(scene: SceneData) -> dict[str, Any]:
+    """What a checkpoint tells of a scene: "range_c", its bounds in °C, and "first", the name of its first training frame.
+
+    Each is None where the scene has no temperatures, or no times.
+    """
+    bounds, frames = scene.thermal_range, scene.train.frames
+    timed = "time" in scene.metadata and len(frames) > 0
+    return {
+        "range_c": None if bounds is None else [bounds.min_c, bounds.max_c],
+        "first": min(frames, key=lambda frame: frame.time_s).name if timed else None,
+    }
+
+
+def on_scales(scene: SceneData, scales: Mapping[str, Any]) -> SceneData:
+    """The scene on the scales of a checkpoint (``scales_of``): times since its first frame, image values of its bounds.
+
+    Where the first frame is not among the scene's any more, times stay as they are, and a warning says so.
+    """
+    first, bounds = scales.get("first"), scales.get("range_c")
+    if first is not None and "time" in scene.metadata:
+        frames = (*scene.train.frames, *scene.val.frames, *scene.test.frames)
+        later = next((frame.time_s for frame in frames if frame.name == first), None)
+        if later is None:
+            log.warning(
+                "the run counted time from frame %s, which the data do not have now: moments may be shifted", first
+            )
+        elif later != 0:
+            log.info("times are counted from frame %s, as in training", first)
+            scene = _since(scene, later)
+    here = scene.thermal_range
+    if bounds is not None and here is not None and bounds != [here.min_c, here.max_c]:
+        log.warning(
+            "the data now have bounds of %.6g to %.6g °C; those of training stay, %.6g to %.6g °C",
+            here.min_c,
+            here.max_c,
+            *bounds,
+        )
+        scene = _within(scene, ThermalRange(*bounds))
+    return scene
+
+
+def _since(scene: SceneData, zero_s: float) -> SceneData:
+    """The scene with ``zero_s`` of its clock as its new second 0."""
+    truth = scene.truth
+    return replace(
+        _mapped(scene, lambda view: replace(view, frame=replace(view.frame, time_s=_less(view.time_s, zero_s)))),
+        weather=None if scene.weather is None else scene.weather.since(zero_s),
+        truth=None if truth is None else lambda points, times_s: truth(points, times_s + zero_s),
+    )
+
+
+def _less(time_s: float | None, zero_s: float) -> float | None:
+    return None if time_s is None else time_s - zero_s
+
+
+def _within(scene: SceneData, bounds: ThermalRange) -> SceneData:
+    """The scene with image values of other bounds, which values outside them leave."""
+    here = scene.thermal_range
+
+    def turned(image: Tensor | None) -> Tensor | None:
+        return None if image is None else bounds.to_unit(here.to_celsius(image))
+
+    scene = _mapped(scene, lambda view: replace(view, thermal=turned(view.thermal), clean=turned(view.clean)))
+    return replace(scene, thermal_range=bounds)
+
+
+def _mapped(scene: SceneData, changed: Callable[[View], View]) -> SceneData:
+    """The scene with every view changed; frames are known without pixels."""
+
+    def of(views: ViewSet) -> ViewSet:
+        return ViewSet([changed(View(frame)).frame for frame in views.frames], lambda k: changed(views[k]))
+
+    return replace(scene, train=of(scene.train), val=of(scene.val), test=of(scene.test))

@@ -1,0 +1,76 @@
+"""A scene on the clock and with the temperatures of a run: what other data say of the same moment and of the same pixel."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from heatsplat.contracts import ThermalRange
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.training.scales import on_scales, scales_of
+
+PARTS = ("train", "val", "test")
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A yard whose first frames train; they are held out of the same yard in ``later``."""
+    return Synthetic(scene="outdoor", size="tiny", frames=8, split="block", split_position=1).scene
+
+
+@pytest.fixture(scope="module")
+def later():
+    return Synthetic(scene="outdoor", size="tiny", frames=8, split="block", split_position=0).scene
+
+
+def views_of(scene):
+    return {view.frame.name: view for part in PARTS for view in getattr(scene, part)}
+
+
+def test_a_scene_that_is_divided_otherwise_has_the_moments_of_training(trained, later):
+    expected, before = views_of(trained), views_of(later)
+    shared = sorted(expected.keys() & before.keys())
+    assert len(shared) > 4 and all(before[name].time_s != expected[name].time_s for name in shared)
+    scene = on_scales(later, scales_of(trained))
+    found = views_of(scene)
+    for name in shared:
+        assert found[name].time_s == pytest.approx(expected[name].time_s, abs=1e-6)
+        assert found[name].frame.environment.air_c == pytest.approx(expected[name].frame.environment.air_c)
+    assert [frame.time_s for frame in scene.train.frames] == scene.train.times_s
+    moment = expected[shared[2]].time_s
+    assert scene.weather.at(moment).air_c == pytest.approx(trained.weather.at(moment).air_c)
+    assert scene.weather.notes["utc_at_zero_s"] == pytest.approx(trained.weather.notes["utc_at_zero_s"])
+    points, times = scene.points[:5], torch.tensor([moment])
+    torch.testing.assert_close(scene.truth(points, times), trained.truth(points, times))
+
+
+def test_image_values_mean_the_temperatures_of_training(trained):
+    bounds = trained.thermal_range
+    wider = replace(trained, thermal_range=ThermalRange(bounds.min_c - 7, bounds.max_c + 30))
+    scene = on_scales(wider, scales_of(trained))
+    assert scene.thermal_range == bounds
+    for name, view in views_of(scene).items():
+        celsius = wider.thermal_range.to_celsius(views_of(wider)[name].thermal)
+        torch.testing.assert_close(bounds.to_celsius(view.thermal), celsius, rtol=0, atol=1e-4)
+
+
+def test_the_same_scene_stays_as_it_is(trained):
+    assert on_scales(trained, scales_of(trained)) is trained
+    assert on_scales(trained, {}) is trained  # of a checkpoint that does not say
+
+
+def test_a_first_frame_that_is_gone_is_missed_with_a_word(trained, caplog):
+    gone = replace(trained, train=trained.train.subset(range(1, len(trained.train))))
+    assert on_scales(gone, scales_of(trained)) is gone and "which the data do not have now" in caplog.text
+
+
+def test_a_static_scene_has_no_clock():
+    scene = Synthetic(scene="static", size="tiny", frames=4).scene
+    timeless = replace(
+        scene,
+        **{
+            part: type(scene.train)([replace(f, time_s=None) for f in getattr(scene, part).frames], None)
+            for part in PARTS
+        },
+    )
+    assert scales_of(timeless)["first"] is None and on_scales(timeless, scales_of(scene)) is timeless
