@@ -11,6 +11,7 @@ Conventions, once for all of them (docs/conventions.md has the page):
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -210,23 +211,32 @@ class Weather:
 
     def at(self, time_s: float) -> Environment:
         """The weather at a moment. Raises SceneError where the record does not reach it."""
-        first, last = float(self.times_s[0]), float(self.times_s[-1])
-        if not first <= time_s <= last:
+        times = self._moments
+        if not times[0] <= time_s <= times[-1]:
             raise SceneError(
-                f"there is no weather for second {time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s after the "
-                "first training frame. Give a record that covers every frame."
+                f"there is no weather for second {time_s:.6g}: the record runs from {times[0]:.6g} to {times[-1]:.6g} s after "
+                "the first training frame. Give a record that covers every frame."
             )
-        above = int(torch.searchsorted(self.times_s, time_s).clamp(1, len(self.times_s) - 1))
-        before, after = float(self.times_s[above - 1]), float(self.times_s[above])
-        share = (time_s - before) / (after - before)
+        after, share = self.between(time_s)
         columns = {name: getattr(self, name) for name in WEATHER_COLUMNS}
         return Environment(
             **{
-                name: float(series[above - 1] * (1 - share) + series[above] * share)
+                name: series[after - 1].item() * (1 - share) + series[after].item() * share
                 for name, series in columns.items()
                 if series is not None
             }
         )
+
+    def between(self, time_s: float) -> tuple[int, float]:
+        """The sample at or after a moment, never the first, and the share of the way to it from the one before."""
+        times = self._moments
+        after = min(max(bisect_left(times, time_s), 1), len(times) - 1)
+        return after, (time_s - times[after - 1]) / (times[after] - times[after - 1])
+
+    @cached_property
+    def _moments(self) -> list[float]:
+        """``times_s`` as numbers: every step of a run asks for moments, for which tensors of one number are slow."""
+        return self.times_s.tolist()
 
 
 @dataclass(frozen=True)

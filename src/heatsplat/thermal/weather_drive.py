@@ -79,7 +79,5 @@ def source_of_sunlight(weather: Weather) -> str:
 
 def value_at(weather: Weather, series: Tensor, time_s: float) -> Tensor:
     """A series at a moment within the record, linear between samples."""
-    times = weather.times_s
-    above = int(torch.searchsorted(times, time_s).clamp(1, len(times) - 1))
-    share = (time_s - float(times[above - 1])) / float(times[above] - times[above - 1])
-    return series[above - 1] * (1 - share) + series[above] * share
+    after, share = weather.between(time_s)
+    return series[after - 1] * (1 - share) + series[after] * share
