@@ -1,11 +1,15 @@
 """What ``make docs`` adds to the pages of this folder: the files at the top of the repository, and a page for every module."""
 
+from __future__ import annotations
+
 import re
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[1]
 TOP = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
@@ -24,10 +28,10 @@ def on_startup(**_: object) -> None:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """The files of the site, with README, CONTRIBUTING, CHANGELOG and the reference; the reference's place in ``nav``."""
+    from mkdocs.structure.files import File
+
     for name, page in TOP.items():
-        text = re.sub(r"\]\(docs/", "](", (ROOT / name).read_text(encoding="utf-8"))
-        for other, target in TOP.items():
-            text = text.replace(f"]({other})", f"]({target})")
+        text = linked(re.sub(r"\]\(docs/", "](", (ROOT / name).read_text(encoding="utf-8")))
         files.append(File.generated(config, page, content=text))
     tree: dict = {}
     for path in sorted((SOURCES / "heatsplat").rglob("*.py")):
@@ -47,8 +51,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """A page whose links to the top of the repository lead to pages of the site."""
+    return linked(markdown, "../")
+
+
+def linked(markdown: str, top: str = "") -> str:
+    """Text whose links to files at the top of the repository, at ``top``, lead to their pages, to the same heading of them."""
     for name, page in TOP.items():
-        markdown = markdown.replace(f"](../{name})", f"]({page})")
+        markdown = re.sub(rf"\]\({re.escape(top + name)}(?=[)#])", f"]({page}", markdown)
     return markdown
 
 

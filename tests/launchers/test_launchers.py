@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from hydra.core.utils import JobStatus
 from omegaconf import OmegaConf
 from running import run
 
+from heatsplat.io.results import RunResults
 from heatsplat.training.machine import cores
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -82,8 +84,8 @@ def alone(tmp_path_factory) -> Path:
     return folder
 
 
-def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path):
-    """The job that has them is run and fails by itself, with the file's name; here it would end the sweep."""
+def launched(folder: Path, *jobs: list[str]) -> tuple[list[int], list[JobStatus]]:
+    """Numbers of the jobs that a launcher starts in the folders 0, 1 and so on, where each fails, and what became of all."""
     from hydra_plugins.heatsplat_launchers._jobs import Job, JobLauncher
 
     started = []
@@ -94,18 +96,39 @@ def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path
             return iter([RuntimeError("not tried")] * len(jobs))
 
         def _job(self, number, overrides):
-            return Job(number, tuple(overrides), tmp_path / str(number), None)
+            return Job(number, tuple(overrides), folder / str(number), None)
 
+    launcher = Launcher()
+    launcher.config = OmegaConf.create(
+        {"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": str(folder)}}}
+    )
+    returned = launcher.launch(jobs, 0)
+    return started, [job.status for job in returned]
+
+
+def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path):
+    """The job that has them is run and fails by itself, with the file's name; here it would end the sweep."""
     for number, text in enumerate(('{"test": {"psnr": 3', None)):
         (tmp_path / str(number)).mkdir()
         if text is not None:
             (tmp_path / str(number) / "metrics.json").write_text(text)
-    launcher = Launcher()
-    launcher.config = OmegaConf.create(
-        {"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": str(tmp_path)}}}
+    assert launched(tmp_path, ["seed=0"], ["seed=1"]) == ([0, 1], [JobStatus.FAILED] * 2)
+
+
+def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
+    """The job is run, and refuses its folder by itself; where and how it runs is no other setting."""
+    before = ["max_steps=40", "seed=0", "row=a", "threads=1", "callbacks.images=null"]
+    for number in range(3):
+        (tmp_path / str(number) / ".hydra").mkdir(parents=True)
+        (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(before))
+        RunResults().write(tmp_path / str(number) / "metrics.json")
+    jobs = (
+        ["seed=0", "max_steps=40", "row=b", "threads=2", "launcher=joblib"],
+        ["seed=0", "max_steps=80", "row=a"],
+        ["seed=0", "max_steps=40", "+thermal.clip=null"],
     )
-    returned = launcher.launch([["seed=0"], ["seed=1"]], 0)
-    assert started == [0, 1] and [job.status for job in returned] == [JobStatus.FAILED] * 2
+    done, failed = JobStatus.COMPLETED, JobStatus.FAILED
+    assert launched(tmp_path, *jobs) == ([1, 2], [done, failed, failed])
 
 
 @pytest.mark.slow  # processes of their own load torch five times over; shares and going on: test_stop_and_go_on.py

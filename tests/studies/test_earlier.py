@@ -88,6 +88,15 @@ def test_a_page_that_is_none_is_refused(tmp_path):
     for text, message in (
         ("<html>", "no page of a leaderboard"),
         (whole.replace("tiny", "demo"), "sizes"),
+        (
+            whole.replace("cpu_seconds", "train_seconds"),
+            "are train_seconds, .* cpu_seconds; give leaderboard.clock=train_",
+        ),
+        (
+            whole.replace("max_steps=2000", "max_steps=900"),
+            r"track steps .* is max_steps=900 cap_max=30000, .* board max_steps=2000 cap_max=30000; leave the page out, or .*"
+            r"leaderboard.protocol.tracks.steps=\['max_steps=900','cap_max=30000'\]",
+        ),
         (cut, "other.html is damaged"),
     ):
         (tmp_path / "other.html").write_text(text)

@@ -186,6 +186,21 @@ def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
     assert recipe.name == "etgs max_steps=9" and recipe.count == 3
 
 
+def test_runs_that_differ_in_more_than_their_seeds_are_recipes_of_their_own(tmp_path):
+    for i, (clip, seed) in enumerate((("1e-4", 0), ("1e-4", 1), ("null", 0))):
+        given = [f"+trainer.gradient_clip_val={clip}", f"seed={seed}"]
+        made(tmp_path / f"{i}", "etgs", given, [], 1.0, 30.0)
+        made(tmp_path / f"row{i}", "etgs", [*given, "row=plain"], [], 1.0, 30.0)
+    clips = [f"+trainer.gradient_clip_val={clip}" for clip in ("1e-4", "null")]
+    names = {f"{start} {clip}" for start in ("etgs", "etgs, plain") for clip in clips}
+    assert names_by_panel(tmp_path) == {"cooling": names}
+
+
+def test_a_knob_that_is_null_is_null_for_its_run():
+    ((place, overrides),) = asked_for(["etgs"], ["heated"], [0], {"thermal.clip": [None]})
+    assert overrides[-1] == "thermal.clip=null" and place.endswith("thermal.clip=null_seed=0")
+
+
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
@@ -249,8 +264,7 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
     assert asked[0] == [
         "data.size=tiny", "method=etgs", "data.scene=heated", "seed=0", "dtype=float32", "thermal.frequencies=8"
     ]  # fmt: skip
-    assert {recipe.count for recipe in recipes} == {4}  # the stand-in says cooling of all: seeds and scenes are one
-    assert len(recipes) == 6
+    assert {recipe.count for recipe in recipes} == {2} and len(recipes) == 2 * 6  # the stand-in says cooling of all
 
 
 def test_the_commands_in_the_configuration_make_runs_that_compose(tmp_path):

@@ -6,7 +6,7 @@ import re
 
 import cv2
 import numpy as np
-from boards import board, protocol_folder, run_of
+from boards import ASKED, board, protocol_folder, run_of
 
 from heatsplat.io.pictures import THERMAL
 from heatsplat.studies.leaderboard.page import TEMPLATE, WIDTH, _picture, page
@@ -37,6 +37,16 @@ def test_the_page_has_all_entries_pictures_and_links(tmp_path):
     assert entry["links"] == ["3dgs_cooling_steps_0/.hydra/config.yaml"] and len(entry["rank"]) == 2
     assert next(one for one in told["entries"] if one["method"] == "supirgs")["reason"].startswith("it is for")
     assert content(page(found, asked, None))["entries"][0]["links"] == []
+
+
+def test_the_page_is_told_which_way_is_better(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    for method, off in (("3dgs", 1.0), ("etgs", 0.1)):
+        run_of(sweep, method, "cooling", 0, off)
+    for first, higher in (("mae_c", False), ("psnr", True)):
+        asked = board(root, protocol=ASKED["protocol"] | {"scores": [first]})
+        told = content(page(standings(sweep, asked), asked, sweep))
+        assert told["higher"] == higher and [one["method"] for one in told["beside"]] == ["etgs", "3dgs"]
 
 
 def test_pictures_are_no_wider_than_they_are_shown():

@@ -4,7 +4,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from boards import board, protocol_folder, run_of
+from boards import ASKED, board, protocol_folder, run_of
 from commands import succeeds
 
 from heatsplat.studies.leaderboard.report import write_leaderboard
@@ -43,6 +43,21 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]
     assert [round(float(text), 3) for text in found] == [1.0, 1.2]
     assert {row["method"] for row in rows if row["reason"]} == {"3dgs", "etgs", "supirgs"} and len(rows) == 8
+
+
+def test_more_is_better_where_the_score_says_so(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    for method, off in (("3dgs", 1.0), ("etgs", 0.1)):
+        run_of(sweep, method, "cooling", 0, off)
+    asked = board(root, protocol=ASKED["protocol"] | {"scores": ["psnr", "mae_c"]})
+    write_leaderboard(sweep, asked)
+    text = (sweep / "leaderboard.md").read_text()
+    assert (
+        "| method | above 3dgs | scenes |" in text
+        and "`above 3dgs` is the mean difference of a method's psnr to" in text
+    )
+    assert text.index("| `etgs` | 20.00 | 1 |") < text.index("| `3dgs` | 0.00 | 1 |") and "relative" not in text
+    assert "| cooling | near | `etgs` 49.542 | `3dgs` 29.542 |" in text
 
 
 @pytest.mark.slow

@@ -1,7 +1,9 @@
 """Which runs a leaderboard asks for, and what it refuses."""
 
 import pytest
-from boards import board, protocol_folder
+from boards import ASKED, board, protocol_folder, submission
+from omegaconf import OmegaConf
+from running import compose_run
 
 from heatsplat.contracts import SceneError
 
@@ -33,3 +35,61 @@ def test_what_there_is_not_is_refused(tmp_path):
     ):
         with pytest.raises(SceneError, match=message):
             board(root, **asked)
+
+
+def test_what_the_board_decides_is_not_given_for_all_runs(tmp_path):
+    root = protocol_folder(tmp_path, "cooling")
+    for key, instead in (("method", "methods"), ("data.scene", "scenes"), ("seed", "seeds")):
+        with pytest.raises(SceneError, match=rf"{key}=.*choose among them with leaderboard.{instead}=\[...\]"):
+            board(root, given=["max_steps", key])
+    assert board(root, given=["max_steps"]).methods
+
+
+def test_the_command_is_refused_before_anything_runs(tmp_path, monkeypatch, caplog):
+    compose_run(tmp_path, "method=3dgs")
+    # Imported here: composing loads plugins, and with them the classes that sweep, anew.
+    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+
+    from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
+
+    started = []
+    monkeypatch.setattr(BasicSweeper, "sweep", lambda self, arguments: started.append(arguments))
+    root = protocol_folder(tmp_path / "root", "cooling")
+    taken = submission(tmp_path / "theirs", 0.1, method="3dgs")
+    for asked, arguments, message in (
+        ({}, ["experiment=leaderboard", "seed=0,1"], "leaderboard.seeds=[...]"),
+        ({"submissions": [str(taken)]}, ["experiment=leaderboard"], "give the submission another name"),
+        ({"earlier": str(tmp_path / "none.html")}, ["experiment=leaderboard"], "cannot be read"),
+    ):
+        sweeper = RowSweeper()
+        loader = type("Loader", (), {"get_group_options": lambda self, group: ["3dgs"]})()
+        sweeper.hydra_context = type("Context", (), {"config_loader": loader})()
+        sweeper.config = OmegaConf.create(
+            {"leaderboard": {**ASKED, "root": str(root), **asked}, "hydra": {"sweep": {"dir": str(tmp_path / "sweep")}}}
+        )
+        with pytest.raises(SystemExit):
+            sweeper.sweep(arguments)
+        assert message in caplog.messages[-1] and started == []
+
+
+def test_a_submission_has_a_name_of_its_own_and_a_track_of_the_board(tmp_path):
+    """With a name of ours it would count as another seed of that method; in a track that there is not it would vanish."""
+    root = protocol_folder(tmp_path / "root", "cooling")
+    for told, message in (
+        (
+            {"method": "3dgs"},
+            r'metrics.json: "method" is 3dgs, a method of heatsplat; give the submission another name',
+        ),
+        (
+            {"method": "supirgs"},
+            "give the submission another name",
+        ),  # not on this board, but perhaps on an earlier page
+        ({"track": "laps"}, r'metrics.json: "track" is laps; this board has steps. Name one'),
+        ({"scenes": {"cooling": 12}}, "scenes.cooling is 12"),
+    ):
+        folder = submission(tmp_path / "theirs", 0.1, **told)
+        with pytest.raises(SceneError, match=message):
+            board(root, methods=["3dgs"], submissions=[str(folder)])
+    (found,) = board(root, submissions=[str(submission(tmp_path / "theirs", 0.1))]).submissions
+    assert (found.method, found.track, found.command) == ("theirs", "steps", "a submission")
+    assert found.scores["cooling"].mean("mae_c") == pytest.approx(0.1, abs=1e-5)

@@ -28,6 +28,16 @@ def submission(tmp_path):
     return folder
 
 
+def renamed_archive(file, whole: bool) -> None:
+    """Puts an .npz that is called .npy, or half of one, where an image was."""
+    file.unlink()
+    with file.with_suffix(".npy").open("wb") as target:
+        np.savez(target, truth(VIEWS[0]))
+    if not whole:
+        content = file.with_suffix(".npy").read_bytes()
+        file.with_suffix(".npy").write_bytes(content[: len(content) // 2])
+
+
 def test_half_a_degree_is_half_a_degree(root, submission, tmp_path):
     np.save(submission / "cooling" / "near_00003.npy", truth("near_00003").astype(np.float64) - 2.0)
     (submission / "cooling" / "near_00003.tiff").unlink()
@@ -51,6 +61,8 @@ def test_half_a_degree_is_half_a_degree(root, submission, tmp_path):
         (lambda f: f.write_bytes(b"no image"), "cannot be read .* write float32 temperatures in °C, one channel"),
         (lambda f: (f.unlink(), np.save(f.with_suffix(".npy"), np.ones((12, 16), np.uint16))), "uint16; write float32"),
         (lambda f: write_temperature(f, truth(VIEWS[0]) - 500), "below absolute zero"),
+        (lambda f: renamed_archive(f, whole=True), r"near_00003.npy cannot be read \(several arrays, as of an .npz\); write"),
+        (lambda f: renamed_archive(f, whole=False), "near_00003.npy cannot be read .* write float32"),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_named_with_its_remedy(root, submission, spoil, message):
@@ -68,6 +80,8 @@ def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path
             '{"method": "ours", "scenes": {"cooling": {"seconds": -1}}}',
             "scenes.cooling.seconds is -1; a number of 0 or more",
         ),
+        ('{"method": "ours", "scenes": {"cooling": 12}}', "metrics.json: scenes.cooling is 12; what it cost"),
+        ('{"method": "ours", "scenes": {"cooling": [12]}}', r"metrics.json: scenes.cooling is \[12\]; what it cost"),
     ):
         (submission / "metrics.json").write_text(told)
         with pytest.raises(SceneError, match=message):

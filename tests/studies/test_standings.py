@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from boards import board, hand_in, protocol_folder, run_of
+from boards import ASKED, board, hand_in, protocol_folder, run_of
 
 from heatsplat.studies.leaderboard.standings import (
     Entry,
@@ -40,6 +40,29 @@ def test_one_seed_spreads_as_the_others_do():
     assert standard_error(entry_of(2.0), "mae_c", None) == 0.0
     assert standard_error(entry_of(1.0, 1.2), "mae_c", usual) == pytest.approx(0.1)
     assert usual_spread([entry_of(1.0), entry_of(2.0)], "mae_c") is None
+
+
+def test_a_seed_counts_once(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+    run_of(tmp_path / "other", "3dgs", "cooling", 0, 3.0)
+    (tmp_path / "other" / "3dgs_cooling_steps_0").rename(sweep / "etgs_cooling_steps_0")
+    (entry,) = (one for one in standings(sweep, board(root)).entries if one.seeds)
+    assert entry.all_numbers == [0] and entry.mean("mae_c") == pytest.approx(1.0, abs=1e-4)
+
+
+def test_of_a_score_of_which_more_is_better_the_difference_stands_beside_the_reference(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+    run_of(sweep, "etgs", "cooling", 0, 0.1)
+    asked = board(root, protocol=ASKED["protocol"] | {"scores": ["psnr", "mae_c"]})
+    found = {one.method: one for one in standings(sweep, asked).entries}
+    assert found["etgs"].rank == (1, 1) and found["3dgs"].rank == (2, 2)
+    beside = beside_reference(list(found.values()), asked)
+    assert beside == {
+        ("3dgs", "steps"): (0.0, 1),
+        ("etgs", "steps"): (pytest.approx(20.0, abs=1e-2), 1),
+    }  # dB of a tenth
 
 
 def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):

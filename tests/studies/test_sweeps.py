@@ -93,8 +93,9 @@ def test_a_job_of_a_grid_is_named_by_what_it_sets():
         {"method": "etgs", "seed": "1", "max_steps": "9", "thermal.frequencies": "24"},
         {"method": "3dgs", "seed": "1", "max_steps": "9"},
     ]
-    assert row_names(jobs) == [("etgs thermal.frequencies=8", ""), ("etgs thermal.frequencies=24", ""), ("3dgs", "")]
-    assert row_names([{"seed": "1", "data.scene": "cooling"}]) == [("run", "")]
+    names = [("etgs thermal.frequencies=8", ""), ("etgs thermal.frequencies=24", ""), ("3dgs", "")]
+    assert row_names(jobs, ["cooling"] * 3) == names
+    assert row_names([{"seed": "1", "data.scene": "cooling"}], ["cooling"]) == [("run", "")]
 
 
 def test_what_all_rows_have_is_told_once(tmp_path):
@@ -145,6 +146,32 @@ def test_jobs_of_one_row_with_other_settings_are_rows_of_their_own(tmp_path):
     text = (tmp_path / "table.md").read_text()
     assert "| K = 8, max_steps=99 | 1 | 129.00 |" in text and text.count("40.57") == 2
     assert text.index("| K = 24 |") < text.index("| K = 8, max_steps=9 |")
+
+
+@pytest.mark.parametrize("row", [[], ["row=plain"]])
+@pytest.mark.parametrize(
+    "values",
+    [
+        ("data.root=/one", "data.root=/other"),
+        ("data.scene=one/cooling", "data.scene=other/cooling"),
+        ("+trainer.gradient_clip_val=1e-4", "+trainer.gradient_clip_val=null"),
+        ("callbacks=default", "callbacks=plateau"),
+        ("threads=1", "threads=2"),
+    ],
+)
+def test_a_grid_has_a_row_for_each_value_and_means_over_seeds_alone(values, row, tmp_path):
+    for number, (value, seed) in enumerate(itertools.product(values, (0, 1))):
+        job(tmp_path, number, ["method=etgs", value, f"seed={seed}", *row], 30.0 + number)
+    rows = {row.label: row.mean("psnr") for row in collect(tmp_path)}
+    start = "plain, " if row else "etgs "
+    assert rows == {f"{start}{values[0]}": 30.5, f"{start}{values[1]}": 32.5}
+
+
+def test_where_jobs_ran_and_that_they_went_on_makes_no_row(tmp_path):
+    job(tmp_path, 0, ["method=etgs", "seed=0", "launcher=joblib", "table.after='a/last.ckpt'"], 30.0)
+    job(tmp_path, 1, ["method=etgs", "seed=1", "table.after='b/last.ckpt'", "ckpt=last.ckpt", "threads=1"], 31.0)
+    (row,) = collect(tmp_path)
+    assert row.label == "etgs" and row.count == 2
 
 
 def test_a_row_of_several_methods_is_a_row_for_each(tmp_path):

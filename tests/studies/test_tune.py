@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 import sys
 
 import pytest
@@ -124,7 +125,7 @@ def test_better_is_what_all_seeds_say_by_more_than_they_differ(default, best, ve
     [
         ({"score": "speed"}, "study.score=speed"),
         ({"trials": 0}, "study.trials"),
-        ({"methods": ["mine"]}, r"mine has no case.*\+study.cases.mine="),
+        ({"methods": ["mine"]}, r"mine has no case.*\+study.cases=\{mine:\{scene"),
         ({"cases": {"etgs": {"scene": []}}}, "keys scene and knobs"),
         ({"cases": {"etgs": {"scene": [], "knobs": {"a": [2, 1]}}}}, r"knobs.a=\[2, 1\]: give \[lowest"),
     ],
@@ -133,6 +134,19 @@ def test_what_is_wrong_is_said_before_anything_trains(changed, message, world, t
     with pytest.raises(SceneError, match=message):
         tune.run(tmp_path, **{"cases": CASES, **changed})
     assert world == []
+
+
+def test_the_case_that_is_proposed_can_be_typed_for_any_method():
+    with pytest.raises(SceneError) as refused:
+        tune._checked(CASES, ["3dgs"], 1, [1], "psnr")
+    (case,) = re.findall(r'"(\+study.cases=.+)"$', str(refused.value))
+    assert set(compose(["study=tune", case], "study")["study"]["cases"]["3dgs"]) == {"scene", "knobs"}
+
+
+def test_a_knob_that_is_null_is_null_for_its_run(world, tmp_path):
+    cases = {"etgs": {"scene": ["data.scene=heated"], "knobs": {"b": {"among": [None]}}}}
+    tune.run(tmp_path, cases, trials=1)
+    assert world[1]["b"] == "null" and "| null |" in (tmp_path / "tune.md").read_text()
 
 
 def test_without_optuna_its_extra_is_named(monkeypatch, tmp_path):

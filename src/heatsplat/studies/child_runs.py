@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting
@@ -47,6 +48,11 @@ def trained(place: Path, train: str | None, overrides: Sequence[str], study: Pat
             f"Command: {shlex.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
         )
     return RunResults.read(place / METRICS_FILE)
+
+
+def spelled(value: Any) -> str:
+    """A value as an override of a run has it: null for None."""
+    return "null" if value is None else str(value)
 
 
 def _refuse_others(place: Path, overrides: Sequence[str]) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,9 @@ PLACES = {"data", "data.root", "data.scene", "data.scenes"}
 NAMES = {"method", "row", "ablation", "experiment"}
 HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
-NOT_WHAT_WAS_LEARNED = {
-    "trainer",
-    "launcher",
-    "callbacks",
-    "logger",
-    "hydra",
-    "table",
-    "leaderboard",
-}  # these groups with all below
+# Groups with all that is below them. Those that say whose job a run was do not tell it from any other.
+WHOSE_JOB = {"launcher", "hydra", "table", "leaderboard"}
+NOT_WHAT_WAS_LEARNED = WHOSE_JOB | {"trainer", "callbacks", "logger"}
 
 
 @dataclass
@@ -133,26 +128,61 @@ def reason_of(folder: Path) -> str:
 # Names ---------------------------------------------------------------------------------------------------------------
 
 
-def row_names(jobs: Sequence[Mapping[str, str]]) -> list[tuple[str, str]]:
+def row_names(jobs: Sequence[Mapping[str, str]], scenes: Sequence[str]) -> list[tuple[str, str]]:
     """For each job the name of its row, and the settings that not all jobs of a row of this name have ("" for none).
 
-    A job without a named row is named by its method and by the settings that not all such jobs have.
+    A job without a named row is named by its method and by the settings that not all such jobs have. Jobs of a row that
+    differ on a scene in more than their seeds have that in their name too (``told_apart``).
 
     Args:
         jobs: overrides of each: key -> value.
+        scenes: on which each ran.
     """
     names = [named_row(overrides) for overrides in jobs]
     settings = [[*(_method(o) if name else []), *settings_of(o)] for o, name in zip(jobs, names, strict=True)]
-    others = [" ".join(words) for words in unshared(names, settings)]
+    others = unshared(names, settings)
+    rows = [
+        (name or tuple(_method(o)), *own, scene)
+        for o, name, own, scene in zip(jobs, names, others, scenes, strict=True)
+    ]
+    words = [" ".join([*own, *apart]) for own, apart in zip(others, told_apart(rows, jobs), strict=True)]
     return [
         (name, other) if name else (" ".join([*_method(overrides), other]).strip() or "run", "")
-        for overrides, name, other in zip(jobs, names, others, strict=True)
+        for overrides, name, other in zip(jobs, names, words, strict=True)
     ]
 
 
-def unshared(names: Sequence[str], settings: Sequence[Sequence[str]]) -> list[list[str]]:
+def told_apart(names: Sequence[Hashable], jobs: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """For each job the settings that make no recipe, but in which jobs of its name differ beside their seeds.
+
+    So a grid over data.root or callbacks is no mean over seeds. Where a job ran and how (``PLACES``, ``HOW_IT_RUNS``) tells it
+    from those alone that say otherwise: one that went on (ckpt) is as good as one that did not have to.
+
+    Args:
+        names: of the jobs' rows, with their scenes.
+        jobs: overrides of each.
+    """
+
+    def is_meant(key: str) -> bool:
+        return not _makes_a_recipe(key) and key not in SEEDS | NAMES and key.partition(".")[0] not in WHOSE_JOB
+
+    left = [
+        {name: f"{key}={value}" for key, value in sorted(own.items()) if is_meant(name := key.lstrip("+~"))}
+        for own in jobs
+    ]
+    said = Counter(
+        about
+        for about, _ in {((row, key), text) for row, own in zip(names, left, strict=True) for key, text in own.items()}
+    )
+    return [
+        [text for key, text in own.items() if text in apart and (key not in PLACES | HOW_IT_RUNS or said[row, key] > 1)]
+        for row, own, apart in zip(names, left, unshared(names, [[*own.values()] for own in left]), strict=True)
+    ]
+
+
+def unshared(names: Sequence[Hashable], settings: Sequence[Sequence[str]]) -> list[list[str]]:
     """For each job those of its settings that not all jobs of its name have."""
-    shared: dict[str, set[str]] = {}
+    shared: dict[Hashable, set[str]] = {}
     for name, own in zip(names, settings, strict=True):
         shared[name] = shared.get(name, set(own)) & set(own)
     return [[text for text in own if text not in shared[name]] for name, own in zip(names, settings, strict=True)]
@@ -170,9 +200,8 @@ def _method(overrides: Mapping[str, str]) -> list[str]:
 
 def settings_of(overrides: Mapping[str, str]) -> list[str]:
     """Overrides that make a recipe besides its method: "key=value" in alphabetical order."""
+    return sorted(f"{key}={value}" for key, value in overrides.items() if _makes_a_recipe(key.lstrip("+~")))
 
-    def makes_a_recipe(key: str) -> bool:
-        key = key.lstrip("+~")
-        return key not in NOT_A_ROW and key.partition(".")[0] not in NOT_WHAT_WAS_LEARNED
 
-    return sorted(f"{key}={value}" for key, value in overrides.items() if makes_a_recipe(key))
+def _makes_a_recipe(key: str) -> bool:
+    return key not in NOT_A_ROW and key.partition(".")[0] not in NOT_WHAT_WAS_LEARNED

@@ -20,7 +20,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, write_atomically
 from heatsplat.io.tables import write_csv
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import spelled, trained
 from heatsplat.studies.frontier_report import markdown, page, picture, records
 from heatsplat.studies.frontier_runs import Recipe, find_runs, group
 
@@ -108,7 +108,7 @@ def asked_for(
     for method in methods:
         grid = {**knobs, **(methods[method] or {} if isinstance(methods, Mapping) else {})}
         for scene, seed, *values in itertools.product(scenes, seeds, *grid.values()):
-            settings = [f"{key}={value}" for key, value in zip(grid, values, strict=True)]
+            settings = [f"{key}={spelled(value)}" for key, value in zip(grid, values, strict=True)]
             place = "_".join([method, scene, *(text.replace("/", "-") for text in settings), f"seed={seed}"])
             jobs.append((place, [f"method={method}", f"data.scene={scene}", f"seed={seed}", *settings]))
     return jobs

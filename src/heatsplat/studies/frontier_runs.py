@@ -15,7 +15,7 @@ import pandas as pd
 
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import read_csv
-from heatsplat.studies.finished import Runs, read_runs, settings_of, unshared
+from heatsplat.studies.finished import Runs, read_runs, settings_of, told_apart, unshared
 from heatsplat.studies.recorded import OVERRIDES
 
 log = logging.getLogger("heatsplat")
@@ -152,7 +152,8 @@ def _names(runs: pd.DataFrame, titles: Sequence[str]) -> list[str]:
     """For each run the name of its recipe: method, row, and settings that tell it from others.
 
     A named row has those that not all runs of the row share; else they are those that not all runs share, of the data
-    those that not all runs of the panel share.
+    those that not all runs of the panel share. Runs that differ in more than their seeds have that in their names too
+    (``told_apart``).
     """
     methods, rows, settings = runs["method"], runs["row"], [settings_of(overrides) for overrides in runs["overrides"]]
     several = len({(*one, *own) for *one, own in zip(methods, rows, settings, strict=True)}) > 1
@@ -165,7 +166,8 @@ def _names(runs: pd.DataFrame, titles: Sequence[str]) -> list[str]:
         told = " ".join(text for text in told if text in of_panel or not text.lstrip("+~").startswith("data."))
         start = f"{method}, {row}" if row else method
         names.append(start + (f"{', ' if row else ' '}{told}" if told else ""))
-    return names
+    apart = told_apart([*zip(titles, names, strict=True)], runs["overrides"])
+    return [" ".join([name, *words]) for name, words in zip(names, apart, strict=True)]
 
 
 def dominated(seconds: float, quality: float, points: Iterable[tuple[float, float]]) -> bool:

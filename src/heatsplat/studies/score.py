@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,7 +95,9 @@ def checked(path: Path, shape: tuple[int, ...], bounds: ThermalRange) -> np.ndar
     """The temperatures in a file, [H, W] in °C. Raises SceneError, naming the file and the remedy, where they are none."""
     try:
         image = np.load(path, allow_pickle=False) if path.suffix == ".npy" else read_temperature(path)
-    except (ValueError, OSError, EOFError) as error:
+        if not isinstance(image, np.ndarray):
+            raise ValueError("several arrays, as of an .npz")
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise SceneError(f"{path} cannot be read ({error}); write float32 temperatures in °C, one channel") from error
     if image.dtype.kind != "f":
         raise SceneError(f"{path} holds {image.dtype}; write float32 temperatures in °C, not greys or counts")
@@ -140,6 +143,8 @@ def read_submission(folder: Path) -> dict[str, Any]:
             f'{path} needs "method": a name, and "scenes": {{name: {{"seconds": ..., "memory_mb": ..., "gaussians": ...}}}}'
         )
     for scene, cost in told["scenes"].items():
+        if not isinstance(cost, Mapping | None):
+            raise SceneError(f'{path}: scenes.{scene} is {cost!r}; what it cost, {{"seconds": ...}}, or null')
         for key in COSTS:
             value = (cost or {}).get(key)
             if value is not None and not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):

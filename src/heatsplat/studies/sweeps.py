@@ -73,7 +73,7 @@ def collect(folder: Path) -> list[Runs]:
     if len(kept) < len(table):
         log.warning("%s: %d jobs were trained more than once; each counts once", folder, len(table) - len(kept))
         table = table.loc[table.index.isin(kept)].reset_index(drop=True)
-    table[["name", "other"]] = row_names(table["overrides"])
+    table[["name", "other"]] = row_names(table["overrides"], table["scene"])
     groups = table.groupby(["scene", "name", "other"], sort=False)
     return [Runs(name, scene, own, other) for (scene, name, other), own in groups]
 

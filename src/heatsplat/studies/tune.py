@@ -18,7 +18,7 @@ from typing import Any
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import spelled, trained
 from heatsplat.studies.finished import reason_of
 
 log = logging.getLogger("heatsplat")
@@ -182,7 +182,7 @@ def _checked(
     if unknown := [name for name in methods or () if name not in cases]:
         raise SceneError(
             f"study.methods: {', '.join(unknown)} has no case; there are {', '.join(cases)}. Give one: "
-            f"\"+study.cases.{unknown[0]}={{scene:['data.scene=cooling'],knobs:{{thermal.lr:[1e-4,1e-2]}}}}\""
+            f"\"+study.cases={{{unknown[0]}:{{scene:['data.scene=cooling'],knobs:{{thermal.lr:[1e-4,1e-2]}}}}}}\""
         )
     chosen = {name: cases[name] for name in methods or cases}
     for name, case in chosen.items():
@@ -251,7 +251,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _words(settings: Mapping[str, Any]) -> list[str]:
-    return [f"{key}={value}" for key, value in settings.items()]
+    return [f"{key}={spelled(value)}" for key, value in settings.items()]
 
 
 def _best(tried: Sequence[Trial], score: str) -> Trial:
@@ -334,7 +334,7 @@ def markdown(
         lines += ["", f"## {method}: {' '.join(cases[method]['scene'])}, {steps} steps, seed 0", ""]
         lines += markdown_table(
             [*knobs, "PSNR (dB)", "MAE (°C)", "Gaussians", "cpu s"],
-            [[*(trial.settings.get(key, "default") for key in knobs), *_scores(trial)] for trial in own],
+            [[*(spelled(trial.settings.get(key, "default")) for key in knobs), *_scores(trial)] for trial in own],
             "r" * (len(knobs) + 4),
         )
     return "\n".join(lines) + "\n"

@@ -46,6 +46,11 @@ def folder_name(overrides: str) -> str:
     return name + mark
 
 
+def keys_of(arguments: Sequence[str]) -> set[str]:
+    """Keys that a command line sets."""
+    return {text.lstrip("+~").partition("=")[0] for text in arguments}
+
+
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
@@ -142,7 +147,7 @@ class RowSweeper(BasicSweeper):
         if self.config.get("table") is not None and not self._plan(list(arguments)):
             return None
         if self.config.get("leaderboard") is not None:
-            self._plan_board()
+            self._plan_board(list(arguments))
         idle = (self.reproduction is not None and not self.reproduction.runs) or (self.board and not self.board.jobs())
         try:
             return None if idle else super().sweep(list(arguments))
@@ -207,7 +212,7 @@ class RowSweeper(BasicSweeper):
                 self.config.data.root,
                 self.hydra_context.config_loader.get_group_options("method"),
                 self._ablation(table["ablation"]),
-                {text.lstrip("+~").partition("=")[0] for text in arguments},
+                keys_of(arguments),
             )
         except SceneError as error:
             log.error("%s", error)
@@ -219,14 +224,15 @@ class RowSweeper(BasicSweeper):
             sys.exit(1)
         return not table["dry"]
 
-    def _plan_board(self) -> None:
+    def _plan_board(self, arguments: list[str]) -> None:
         """Plans the runs of the leaderboard and tells how many; exit code 1 where it asks for what there is not."""
         from heatsplat.contracts import SceneError
         from heatsplat.studies.leaderboard.plan import board_of
 
         asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
         try:
-            self.board = board_of(asked, self.hydra_context.config_loader.get_group_options("method"))
+            methods = self.hydra_context.config_loader.get_group_options("method")
+            self.board = board_of(asked, methods, keys_of(arguments))
         except SceneError as error:
             log.error("%s", error)
             sys.exit(1)

@@ -22,7 +22,8 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
     """The contents of a page that a leaderboard wrote.
 
     Raises:
-        SceneError: there is no such page, it is cut off, or it has scenes of another size, another score or another reference.
+        SceneError: there is no such page, it is cut off, or it has scenes of another size, another score, reference or clock,
+            or other settings of a track.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -38,6 +39,20 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
     for key, value in wanted.items():
         if content[key] != value:
             raise SceneError(f"leaderboard.earlier: {path} has {key} {content[key]}, this board {value}; leave it out")
+    clock = content["summary"]["clock"]
+    if clock != board.clock:
+        raise SceneError(
+            f"leaderboard.earlier: the seconds of {path} are {clock}, those of this board {board.clock}; give "
+            f"leaderboard.clock={clock}"
+        )
+    for track, settings in board.settings.items():
+        before = content["tracks"].get(track, settings)
+        if before != settings:
+            quoted = ",".join(f"'{text}'" for text in before.split())
+            raise SceneError(
+                f"leaderboard.earlier: the track {track} of {path} is {before}, that of this board {settings}; leave the page "
+                f'out, or give the track its settings: "leaderboard.protocol.tracks.{track}=[{quoted}]"'
+            )
     return content
 
 

@@ -45,10 +45,11 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     content = {
         "score": score,
+        "higher": board.higher,
         "reference": board.protocol["reference"],
         "unit": DEFINITIONS[score].unit,
         "definitions": {name: DEFINITIONS[name].sentence for name in board.protocol["scores"]},
-        "tracks": {track: " ".join(board.protocol["tracks"][track]) for track in board.tracks},
+        "tracks": board.settings,
         "summary": summary(entries, board),
         "seeds": list(board.seeds),
         "sizes": board.sizes,
@@ -61,8 +62,10 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
         ],
         "entries": [_told(entry, board, folder) for entry in entries],
         "beside": [
-            {"method": method, "track": track, "ratio": ratio, "scenes": count}
-            for (method, track), (ratio, count) in sorted(beside.items(), key=lambda item: item[1][0])
+            {"method": method, "track": track, "beside": value, "scenes": count}
+            for (method, track), (value, count) in sorted(
+                beside.items(), key=lambda item: item[1][0], reverse=board.higher
+            )
         ],
     }  # fmt: skip
     data = json.dumps(content, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")

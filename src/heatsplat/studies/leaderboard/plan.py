@@ -3,14 +3,41 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting
-from heatsplat.studies.score import META, SCENES, scenes_in
+from heatsplat.io.results import METRICS_FILE
+from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.studies.leaderboard.earlier import read_page
+from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission
+
+DECIDED = {
+    "method": "methods",
+    "data.scene": "scenes",
+    "seed": "seeds",
+}  # key of a run -> what chooses among its values
+
+
+@dataclass(frozen=True)
+class Submission:
+    """Renders of other code and what they are worth.
+
+    Args:
+        folder: where they lie.
+        method, track: what they are of.
+        command: where the code is, in place of a command line.
+        scores: scene -> its score.
+    """
+
+    folder: Path
+    method: str
+    track: str
+    command: str
+    scores: Mapping[str, SceneScore]
 
 
 @dataclass(frozen=True)
@@ -22,8 +49,8 @@ class Board:
         root: folder of its scenes/ and truth/.
         methods, scenes, tracks, seeds: names, in the order of the table.
         clock: the cost that counts as seconds, of ``metrics.json``.
-        submissions: folders of renders of other code, scored beside.
-        earlier: page of a leaderboard, whose entries stand where the folder has fewer seeds; None for none.
+        submissions: renders of other code, which count beside.
+        earlier: contents of a leaderboard's page, whose entries stand where the folder has fewer seeds; None for none.
         document, page: where the table and the page go besides the folder of the sweep; None for nowhere.
         train: False to write what is there and run nothing.
         note: on the conditions of the runs, for the table and the page.
@@ -36,18 +63,28 @@ class Board:
     tracks: Sequence[str]
     seeds: Sequence[int]
     clock: str = "train_seconds"
-    submissions: Sequence[Path] = ()
-    earlier: Path | None = None
+    submissions: Sequence[Submission] = ()
+    earlier: Mapping[str, Any] | None = None
     document: Path | None = None
     page: Path | None = None
     train: bool = True
     note: str = ""
 
     @property
+    def higher(self) -> bool:
+        """Whether more of the score that ranks is better."""
+        return DEFINITIONS[self.protocol["scores"][0]].better == "higher"
+
+    @property
     def sizes(self) -> list[str]:
         """Sizes of the scenes, as they were written."""
         metas = (json.loads((self.root / SCENES / name / META).read_text(encoding="utf-8")) for name in self.scenes)
         return list(dict.fromkeys(str(meta.get("size") or "as recorded") for meta in metas))
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Those that make each track."""
+        return {track: " ".join(self.protocol["tracks"][track]) for track in self.tracks}
 
     def left_out(self, method: str, scene: str) -> str | None:
         """Why the protocol does not run a method on a scene; None where it does."""
@@ -86,16 +123,25 @@ class Board:
         return f"{what}: {len(self.jobs())} runs; scenes in {self.root}"
 
 
-def board_of(asked: Mapping[str, Any], known: Iterable[str]) -> Board:
+def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[str] = ()) -> Board:
     """The board that a configuration asks for (conf/experiment/leaderboard.yaml).
+
+    Submissions are scored here and the earlier page is read: what is wrong with them is told before anything runs.
 
     Args:
         asked: its section "leaderboard".
         known: options of conf/method.
+        given: keys that the command line sets.
 
     Raises:
-        SceneError: no folder of scenes, or names that there are not.
+        SceneError: no folder of scenes, names that there are not, or a key that the board decides; a submission is none, or
+            has the name of a method or an unknown track; the page is not one of this board.
     """
+    for key, instead in DECIDED.items():
+        if key in given:
+            raise SceneError(
+                f"{key}=...: a leaderboard has several; choose among them with leaderboard.{instead}=[...]"
+            )
     protocol = asked["protocol"]
     if asked["root"] is None:
         raise SceneError(
@@ -122,9 +168,26 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str]) -> Board:
     def path(text: str | None) -> Path | None:
         return None if text is None else Path(text).expanduser()
 
-    return Board(
+    board = Board(
         protocol, root, **chosen, seeds=list(asked["seeds"] or protocol["seeds"]), clock=asked["clock"],
-        submissions=[Path(text).expanduser() for text in asked["submissions"]],
-        earlier=path(asked["earlier"]),
         document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
     )  # fmt: skip
+    submissions = [_submission(Path(text).expanduser(), board, known) for text in asked["submissions"]]
+    earlier = path(asked["earlier"])
+    return replace(board, submissions=submissions, earlier=None if earlier is None else read_page(earlier, board))
+
+
+def _submission(folder: Path, board: Board, known: Collection[str]) -> Submission:
+    """What a folder hands in. Raises SceneError as ``board_of`` does."""
+    told, scores = score_submission(folder, board.root, board.protocol["scores"])
+    method, track, where = told["method"], told.get("track", board.tracks[0]), folder / METRICS_FILE
+    if method in known:
+        raise SceneError(
+            f'{where}: "method" is {method}, a method of heatsplat; give the submission another name there'
+        )
+    if track not in board.tracks:
+        raise SceneError(
+            f'{where}: "track" is {track}; this board has {", ".join(board.tracks)}. Name one of them there, or leave the '
+            "folder out of leaderboard.submissions"
+        )
+    return Submission(folder, method, track, str(told.get("code", "a submission")), scores)

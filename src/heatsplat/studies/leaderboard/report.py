@@ -54,15 +54,14 @@ def markdown(found: Standings, board: Board) -> str:
         "compares renders with the ground truth.",
         "",
         f"Cells: {score} ({unit}) on held-out views, mean over seeds, and the range of ranks in parentheses: {TIES} "
-        f"{spread_of(entries, board)} `x {board.protocol['reference']}` is the geometric mean of a method's error relative to "
-        "that method, over the scenes on which both ran.",
+        f"{spread_of(entries, board)} `{_beside(board)}` is {_what_is_beside(board)}, over the scenes on which both ran.",
         "",
     ]
     for track in board.tracks:
         own = [entry for entry in entries if entry.track == track]
         if not any(entry.seeds for entry in own):
             continue
-        settings = " ".join(board.protocol["tracks"][track])
+        settings = board.settings[track]
         if steps := sorted({int(entry.cost("steps")) for entry in own if entry.cost("steps")}):
             settings += f"`; steps taken: `{steps[0]:,}" + (f" to {steps[-1]:,}" if len(steps) > 1 else "")
         lines += [f"## Equal {track}", "", f"`{settings}`", "", *_table(own, board, track), ""]
@@ -77,12 +76,25 @@ def _clock(board: Board) -> str:
     return "CPU time" if board.clock == "cpu_seconds" else "training time"
 
 
+def _beside(board: Board) -> str:
+    """Heading of the column of ``beside_reference``."""
+    return f"{'above' if board.higher else 'x'} {board.protocol['reference']}"
+
+
+def _what_is_beside(board: Board) -> str:
+    if board.higher:
+        return f"the mean difference of a method's {board.protocol['scores'][0]} to that method's"
+    return "the geometric mean of a method's error relative to that method"
+
+
 def order(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
     """Methods of a track: those that ran on more scenes first, the better of equally many before the worse."""
     beside = beside_reference(entries, board)
     names = list(dict.fromkeys(entry.method for entry in entries))
-    last = (float("inf"), 0)
-    return sorted(names, key=lambda name: (-beside.get((name, track), last)[1], beside.get((name, track), last)[0]))
+    sign = -1.0 if board.higher else 1.0
+    last = (sign * float("inf"), 0)
+    places = {name: beside.get((name, track), last) for name in names}
+    return sorted(names, key=lambda name: (-places[name][1], sign * places[name][0]))
 
 
 def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
@@ -95,11 +107,11 @@ def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
         own = [places.get((method, scene)) for scene in scenes]
         if not any(one and one.seeds for one in own):
             continue
-        ratio, count = beside.get((method, track), (None, 0))
+        value, count = beside.get((method, track), (None, 0))
         seconds = [one.cost("seconds") for one in own if one and one.cost("seconds") is not None]
         told = number(sum(seconds) / len(seconds) if seconds else None, 0)
-        rows.append([f"`{method}`", number(ratio, 2), count, told, *(_cell(one, score) for one in own)])
-    head = ["method", f"x {board.protocol['reference']}", "scenes", f"s ({_clock(board)})", *scenes]
+        rows.append([f"`{method}`", number(value, 2), count, told, *(_cell(one, score) for one in own)])
+    head = ["method", _beside(board), "scenes", f"s ({_clock(board)})", *scenes]
     return markdown_table(head, rows, "lrrr" + "r" * len(scenes))
 
 
@@ -127,7 +139,7 @@ def _parts(entries: Sequence[Entry], board: Board) -> list[str]:
             found = {entry.method: entry.mean(score, part) for entry in entries if entry.scene == scene and entry.seeds}
             found = {method: value for method, value in found.items() if value is not None}
             if found:
-                best = sorted(found, key=found.get)[:3]
+                best = sorted(found, key=found.get, reverse=board.higher)[:3]
                 rows.append([scene, part, *(f"`{method}` {number(found[method], 3)}" for method in best)])
     longest = max((len(row) for row in rows), default=2)
     head = ["scene", "held out", *("best", "second", "third")[: longest - 2]]

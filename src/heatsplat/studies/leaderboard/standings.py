@@ -14,20 +14,18 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, write_atomically
-from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import (
     add_earlier,
     handed_in,
     numbers_of,
     place_of,
-    read_page,
     sentence,
     told_by,
 )
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
-from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene, score_submission
+from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene
 
 log = logging.getLogger("heatsplat")
 
@@ -163,31 +161,23 @@ class Standings:
 
 
 def standings(folder: Path, board: Board) -> Standings:
-    """What the runs in a folder, the submissions and an earlier page came to.
-
-    Raises:
-        SceneError: a page is not one of this board, or a submission is none.
-    """
+    """What the runs in a folder, the submissions and an earlier page came to."""
     places = {(run.method, run.scene, run.track): run for run in _entries(board)}
     for path in sorted(folder.glob(f"*/{OVERRIDES}")):
         _add_run(places, path.parents[1], board)
     for submission in board.submissions:
-        told, scored = score_submission(submission, board.root, board.protocol["scores"])
-        for scene, score in scored.items():
-            key = (told["method"], scene, told.get("track", board.tracks[0]))
+        for scene, score in submission.scores.items():
+            key = (submission.method, scene, submission.track)
             entry = places.setdefault(key, Entry(*key))
-            command = str(told.get("code", "a submission"))
-            entry.runs.append(Result(entry.seeds, score, score.cost, submission, command))
-    page, note = None, ""
-    if board.earlier is not None:
-        page = read_page(board.earlier, board)
+            entry.runs.append(Result(entry.seeds, score, score.cost, submission.folder, submission.command))
+    page, note = board.earlier, ""
+    if page is not None:
         for key in (place_of(one) for one in told_by(page) if handed_in(one)):
             if key[1] in board.scenes and key[2] in board.tracks:
                 places.setdefault(key, Entry(*key))
         note = sentence(add_earlier(places, page))
     entries = list(places.values())
     first = board.protocol["scores"][0]
-    higher = DEFINITIONS[first].better == "higher"
     usual = usual_spread(entries, first)
     for scene in dict.fromkeys(entry.scene for entry in entries):
         for track in board.tracks:
@@ -195,7 +185,7 @@ def standings(folder: Path, board: Board) -> Standings:
                 one for one in entries if (one.scene, one.track) == (scene, track) and one.mean(first) is not None
             ]
             means, errors = [one.mean(first) for one in ranked], [standard_error(one, first, usual) for one in ranked]
-            for entry, rank in zip(ranked, ranks(means, errors, higher), strict=True):
+            for entry, rank in zip(ranked, ranks(means, errors, board.higher), strict=True):
                 entry.rank = rank
     return Standings(entries, page, note)
 
@@ -210,12 +200,13 @@ def _entries(board: Board) -> list[Entry]:
 
 
 def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: Board) -> None:
-    """Adds what is in the folder of a run to its entry; runs of what the board does not ask for are passed over."""
+    """Adds what is in the folder of a run to its entry; runs of what the board does not ask for, or of a seed that the entry
+    has, are passed over."""
     overrides = overrides_of(folder)
     key = (overrides.get("method", ""), overrides.get("data.scene", ""), overrides.get("leaderboard.track", ""))
     entry = places.get(key)
     seed = int(overrides.get("seed", 0))
-    if entry is None or seed not in board.seeds:
+    if entry is None or seed not in board.seeds or seed in entry.all_numbers:
         return
     if not (folder / METRICS_FILE).exists():
         entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
@@ -304,16 +295,22 @@ def ranks(means: Sequence[float], errors: Sequence[float], higher: bool = False)
 
 
 def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, str], tuple[float, int]]:
-    """(method, track) -> geometric mean of its error as a multiple of the reference's, over the scenes that both ran on, and
-    their number; a method without such a scene is left out."""
+    """(method, track) -> its score beside the reference's, over the scenes that both ran on, and their number; a method without
+    such a scene is left out.
+
+    Of errors that is the geometric mean of the ratios; of a score of which more is better, the mean of the differences.
+    """
     score, reference = board.protocol["scores"][0], board.protocol["reference"]
-    logs: dict[tuple[str, str], list[float]] = {}
+    found: dict[tuple[str, str], list[float]] = {}
     for scene, track in dict.fromkeys((entry.scene, entry.track) for entry in entries):
-        own = {e.method: e.mean(score) for e in entries if (e.scene, e.track) == (scene, track) and e.mean(score)}
-        for method, value in own.items():
+        means = {e.method: e.mean(score) for e in entries if (e.scene, e.track) == (scene, track)}
+        own = {method: mean for method, mean in means.items() if mean is not None and (board.higher or mean > 0)}
+        for method, mean in own.items():
             if reference in own:
-                logs.setdefault((method, track), []).append(math.log(value / own[reference]))
-    return {key: (math.exp(statistics.fmean(found)), len(found)) for key, found in logs.items()}
+                beside = mean - own[reference] if board.higher else math.log(mean / own[reference])
+                found.setdefault((method, track), []).append(beside)
+    means = {key: (statistics.fmean(values), len(values)) for key, values in found.items()}
+    return means if board.higher else {key: (math.exp(mean), count) for key, (mean, count) in means.items()}
 
 
 def summary(entries: Sequence[Entry], board: Board) -> dict[str, Any]:
