@@ -330,9 +330,9 @@ def simulate(clock: BudgetClock, step_s, meter: Clock | None = None, module=None
     return trainer, module
 
 
-def a_clock(seconds: float = 9.0, steps: int = 1000) -> BudgetClock:
+def a_clock(seconds: float = 9.0, steps: int = 1000, **changed: float) -> BudgetClock:
     found = plan(POINTS, "etgs", replace(PACE, spent_s=0.5), seconds + 0.5, cap_max=100_000)
-    return BudgetClock(replace(found, steps=steps).as_dict(), found.twice())
+    return BudgetClock(replace(found, steps=steps, **changed).as_dict(), found.twice())
 
 
 @pytest.mark.parametrize("factor", [0.2, 0.7, 1.0, 1.3, 1.8])
@@ -360,30 +360,28 @@ def test_a_well_judged_pace_changes_nothing():
     assert trainer.rates == pytest.approx([0.01 ** (step / 1000) for step in range(1, 1001)], rel=1e-3)
 
 
-def caps_while(step_s, gaussians):
-    """The cap at every step of a run, and its module; ``gaussians(step)`` is how many there are."""
+def test_growing_is_held_back_while_it_takes_too_much_of_the_time_and_no_longer():
     module, caps = a_module(), []
 
-    def stepped(step: int) -> float:
-        module.splats = range(gaussians(step))
+    def step_s(step: int) -> float:
         caps.append(module.density.cap_max)
-        return step_s(step)
+        slow = 100 <= step < 200 or step < 40  # first steps are, which says nothing
+        return (1.8 if slow else 0.9) * 9.0 / 1000
 
-    simulate(a_clock(), stepped, module=module)
-    return caps, module
-
-
-def test_growing_is_held_back_while_gaussians_take_too_much_of_the_time_and_no_longer():
-    def many(step: int) -> int:  # that the calibration says take 13 ms a step, five more than at the start
-        return 8900 if 100 <= step < 200 or step < 40 else 4000  # first steps are slow, which says nothing
-
-    caps, module = caps_while(lambda step: (1.8 if many(step) > 4000 else 0.8) * 9.0 / 1000, many)
-    assert set(caps[:100]) == {9000} and caps[190] == 8900 and caps[450] == 9000
+    simulate(a_clock(), step_s, module=module)
+    assert set(caps[:100]) == {9000} and caps[190] == 4000 and caps[450] == 9000
     assert 100 < module.results.run["budget"]["growth_held_at_step"] < 200
 
 
-def test_a_slow_machine_takes_steps_and_no_gaussians():
-    caps, module = caps_while(lambda step: 1.5 * 9.0 / 1000, lambda step: 4000 + 4 * step)
+def test_gaussians_that_cost_nothing_come_on_a_slow_machine_until_seven_tenths_of_the_time():
+    module, caps = a_module(), []
+
+    def step_s(step: int) -> float:
+        module.splats = range(4000 + 4 * step)
+        caps.append(module.density.cap_max)
+        return 1.5 * 9.0 / 1000
+
+    simulate(a_clock(gaussian_us=0.0), step_s, module=module)
     found = module.results.run["budget"]
     pressed = next(step for step, cap in enumerate(caps) if cap < 9000)
     assert pressed == pytest.approx(0.7 * 1000 / 1.5, abs=5) and found["growth_held_at_step"] == pressed
@@ -392,10 +390,10 @@ def test_a_slow_machine_takes_steps_and_no_gaussians():
 
 
 def test_what_was_held_back_for_good_stays_so_after_a_stop():
-    clock, meter = a_clock(), Clock()
+    clock, meter = a_clock(gaussian_us=0.0), Clock()
     _, module = simulate(clock, lambda step: 1.5 * 9.0 / 1000, meter, until=550)
     assert module.density.cap_max == 4000
-    second, again = a_clock(), a_module()
+    second, again = a_clock(gaussian_us=0.0), a_module()
     second.load_state_dict(json.loads(json.dumps(clock.state_dict())))
     again.schedule.load_state_dict(json.loads(json.dumps(module.schedule.state_dict())))
     _, again = simulate(second, lambda step: 1.5 * 9.0 / 1000, meter, again, first=550)

@@ -17,6 +17,7 @@ log = logging.getLogger("heatsplat")
 SETTLED = 0.5  # share of the schedule after which no Gaussian is added and the rest may be stretched (density.stop)
 GROWING = 0.6  # share of the time that the schedule up to there may take; else no more Gaussians come
 PRESSED = 0.7  # share of the time after which the schedule is shrunk, settled or not
+CHEAP = 0.25  # share of a step that Gaussians beyond those of the start take, below which holding them back saves nothing
 EARLY = 0.1  # share of the time in which growing is left alone: few Gaussians have come, and first steps are slow
 WINDOW = 0.05  # share of the time over which the pace is measured: a machine may become slower at any moment
 LOOKS = 400  # looks at the clock in a run of the planned length
@@ -29,11 +30,11 @@ class BudgetClock(pl.Callback):
     the steps that are left are those for which there is time at the pace of the last steps, more or fewer than planned,
     and what is left of the schedule is spread over them (``Schedule.end_at``).
 
-    Where a scene calls for more Gaussians than expected, growing would eat the time in which they settle: as long as the
-    growing half would take more than six tenths of the time, also at the pace that the calibration saw, no more Gaussians
-    come (``density.cap_max``); the first tenth of the time is left alone. A machine that is slower than the calibration saw is no
-    reason: fewer Gaussians would not make up for it (on CUDA they cost next to nothing), and fewer steps lose less than they.
-    Where seven tenths of the time are gone before the half ends, the schedule is shrunk at once, and no more Gaussians come.
+    Where a scene calls for more Gaussians than expected, or the machine is slower, growing would eat the time in which they
+    settle: as long as the growing half would take more than six tenths of the time, no more Gaussians come
+    (``density.cap_max``); the first tenth of the time is left alone. Where Gaussians cost next to nothing, as on CUDA, that
+    would save nothing, and they come. Where seven tenths of the time are gone before the half ends, the schedule is shrunk
+    at once, and no more come.
 
     Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its schedule.
@@ -51,7 +52,6 @@ class BudgetClock(pl.Callback):
         self._cap: int | None = None  # Gaussians that there may be by the plan
         self._held: int | None = None  # step at which growing was first held back
         self._last: int | None = None  # Gaussians that there may be since the schedule was shrunk before it had settled
-        self._calibrated = 0.0  # seconds that the steps so far would have taken at the pace of the calibration
         self._every = max(1, int(plan["steps"]) // LOOKS)
 
     # The run ---------------------------------------------------------------------------------------------------------
@@ -70,8 +70,6 @@ class BudgetClock(pl.Callback):
         if step % self._every != 0 and step < schedule.end - self._every:
             return
         spent = self._spent()
-        since = self._seen[-1][0] if self._seen else step
-        self._calibrated += (step - since) * self._calibrated_s(module)
         self._seen.append((step, spent))
         while len(self._seen) > 2 and spent - self._seen[1][1] > WINDOW * self.seconds:
             self._seen.popleft()
@@ -98,11 +96,10 @@ class BudgetClock(pl.Callback):
     def _hold(self, module: pl.LightningModule, step: int, spent: float) -> None:
         """Lets no more Gaussians come as long as growing takes too much of the time; see the class."""
         step_s = self._step_s()
-        if step_s is None or self._cap is None or spent < EARLY * self.seconds:
+        if step_s is None or self._cap is None or spent < EARLY * self.seconds or self._gaussian_share() < CHEAP:
             return
-        left = (SETTLED - module.schedule.progress(step)) * module.schedule.end
-        limit = GROWING * self.seconds
-        held = spent + step_s * left > limit and self._calibrated + self._calibrated_s(module) * left > limit
+        growing = spent + step_s * (SETTLED - module.schedule.progress(step)) * module.schedule.end
+        held = growing > GROWING * self.seconds
         module.density.cap_max = min(self._cap, len(module.splats)) if held else self._cap
         if held and self._held is None:
             self._held = step
@@ -112,10 +109,10 @@ class BudgetClock(pl.Callback):
         if self._last is not None and self._cap is not None:
             module.density.cap_max = min(self._cap, self._last)
 
-    def _calibrated_s(self, module: pl.LightningModule) -> float:
-        """Seconds of a step with as many Gaussians as there are now, as the calibration saw the machine."""
-        more = len(module.splats) - self.plan["points"]
-        return 1e-3 * self.plan["step_ms"] + 1e-6 * self.plan["gaussian_us"] * more
+    def _gaussian_share(self) -> float:
+        """Share of a step with as many Gaussians as there may be that those beyond the start take, by the calibration."""
+        more_ms = 1e-3 * self.plan["gaussian_us"] * max(self._cap - self.plan["points"], 0)
+        return more_ms / (self.plan["step_ms"] + more_ms)
 
     def _step_s(self) -> float | None:
         """Seconds of one of the last steps; None before it is known."""
@@ -160,8 +157,7 @@ class BudgetClock(pl.Callback):
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        return {"held": self._held, "last": self._last, "calibrated_s": self._calibrated}
+        return {"held": self._held, "last": self._last}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._held, self._last = state["held"], state.get("last")
-        self._calibrated = state.get("calibrated_s", 0.0)
