@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
@@ -146,16 +146,24 @@ def _kind(path: Path) -> str:
             return "radiometric"
         if array is not None or dji.is_thermal(data):
             return "sealed"
-    try:
-        with Image.open(path) as image:
-            mode = image.mode
-    except PermissionError as error:
-        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
-    except Exception as error:  # Pillow raises whatever a damaged file leads to
-        raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
+    mode, _ = _mode_and_size(path)
     if mode.startswith("I"):
         return "counts"
     return "float" if mode == "F" else "grey" if mode in ("L", "LA", "1") else "colour"
+
+
+def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
+    """Pillow's mode of an image and its (width, height). Raises SceneError for what is no image."""
+    try:
+        with Image.open(path) as image:
+            return image.mode, image.size
+    except PermissionError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
+    except UnidentifiedImageError:  # such as TIFF of 64 bits, which Pillow does not know
+        pixels = read_image(path)
+        return "F" if pixels.dtype.kind == "f" else "I", (pixels.shape[1], pixels.shape[0])
+    except Exception as error:  # Pillow raises whatever a damaged file leads to
+        raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
 
 
 def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
@@ -179,8 +187,7 @@ def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, not
     found = []
     for path in paths:
         details, camera = _of_exif(read_bytes(path))
-        with Image.open(path) as image:
-            size = image.size
+        _, size = _mode_and_size(path)
         load = partial(_grey if kind == "grey" else read_image, path)
         found.append(Frame(_name(path, folder), path, 0, load, camera=camera, size=size, **details))
     devices, calibrations = devices_of(found), {}

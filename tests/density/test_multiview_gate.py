@@ -160,3 +160,18 @@ def test_options_out_of_range_are_refused():
         control(every=10)
     with pytest.raises(ValueError, match="grad_quantile lies in"):
         control(grad_quantile=1.0)
+
+
+def test_under_the_cap_those_that_pass_the_gate_grow_and_not_those_that_pull_most():
+    policy = control(grad_quantile=0.5)
+    cloud = wall(policy)
+    policy.cap_max = len(cloud) + 3
+    cloud.state["seen"].fill_(10)
+    cloud.state["gradient"].copy_(torch.linspace(10, 20, len(cloud)))
+    cloud.state["gradient"][:5] = 16.0
+    cloud.state["absolute"].copy_(cloud.state["gradient"])
+    cloud.state["wrong"][:5], cloud.state["blaming"][:5] = 100, 5
+    passing = cloud.splats.means[policy._passes(cloud.state)]
+    before = len(cloud)
+    assert len(passing) == 5 and policy._grow(cloud, 100.0, torch.Generator().manual_seed(0)) == 3
+    assert (torch.cdist(cloud.splats.means[before:], passing).amin(1) < 1e-6).all()

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import torch
 from materials import changed, checks, clean
 
 
@@ -15,3 +16,7 @@ def test_saturation_is_found():
     assert "saturation" in checks(
         changed(clean(), clean().images.clamp(max=float(clean().images.quantile(0.97))), clipped=0.0)
     )
+
+
+def test_images_that_are_constant_do_not_saturate():
+    assert "saturation" not in checks(changed(clean(), torch.full_like(clean().images, 0.5), clipped=0.0))

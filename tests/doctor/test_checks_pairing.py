@@ -30,3 +30,16 @@ def test_clocks_of_two_cameras_that_disagree_are_found():
     late = replace(clean(), times_s=times, rgb_times_s=[t + 2.5 for t in times])
     assert any("+2.5 s" in one.what for one in examine(late))
     assert "pairing" not in checks(replace(clean(), times_s=times, rgb_times_s=times))
+
+
+def test_a_black_photo_or_a_closed_shutter_says_nothing_of_the_others():
+    images = torch.stack([torch.roll(clean().images[0], 3 * f, 1) for f in range(10)])
+    photos = [image[..., None].expand(-1, -1, 3).float() for image in images]
+    dark = [torch.zeros_like(photos[0]), *photos[1:]]
+    shut = torch.cat([images[:5], torch.full_like(images[:1], 0.3), images[6:]])
+    about = {"names": [f"{i}" for i in range(10)], "times_s": None, "chosen": list(range(10))}
+    for heat, light in ((images, dark), (shut, photos), (shut, dark)):
+        assert "pairing" not in checks(Material(**about, images=heat, rgb=light))
+        late = Material(**about, images=heat, rgb=light[2:] + light[:2])
+        (found,) = (one.what for one in examine(late) if one.check == "pairing")
+        assert "2 frame(s)" in found or "do not fit" in found

@@ -1,5 +1,6 @@
 """Blurred frames are found."""
 
+import torch
 from materials import changed, clean
 from torch.nn import functional
 
@@ -14,3 +15,19 @@ def test_blurred_frames_are_found():
         )
     found = [one for one in examine(changed(clean(), images)) if one.check == "sharpness"]
     assert found and {clean().name(4), clean().name(9)} <= set(found[0].frames)
+
+
+def test_pixels_that_do_not_count_hide_no_blur():
+    images = clean().images.clone()
+    for f in (4, 9):
+        images[f] = functional.avg_pool2d(
+            functional.pad(images[f][None, None], (4, 4, 4, 4), mode="replicate"), 9, stride=1
+        )
+    celsius = 20.0 + 30.0 * images
+    dead, masks = celsius.clone(), torch.ones_like(celsius, dtype=torch.bool)
+    dead[:, 10:14, 10:14] = torch.nan
+    masks[:, 10:14, 10:14] = False
+    cut = celsius.where(masks, 0.0)
+    for material in (changed(clean(), dead, unit_k=1.0), changed(clean(), cut, unit_k=1.0, masks=masks)):
+        found = [one for one in examine(material) if one.check == "sharpness"]
+        assert found and {clean().name(4), clean().name(9)} <= set(found[0].frames)

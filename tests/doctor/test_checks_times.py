@@ -29,3 +29,10 @@ def test_gaps_are_told_in_the_unit_that_people_would_take():
     times = [10.0 * i if i < 8 else 10.0 * i + 490.0 for i in range(len(clean().names))]
     (found,) = find(replace(clean(), times_s=times))
     assert "of 8.33 min (usual: 10 s)" in found.what
+
+
+def test_cameras_that_are_triggered_together_repeat_no_time():
+    count = len(clean().names)
+    together = replace(clean(), times_s=[10.0 * (i // 2) for i in range(count)])
+    assert any("have the time of another one" in one.what for one in find(together))
+    assert not any("another one" in one.what for one in find(replace(together, lenses=[i % 2 for i in range(count)])))

@@ -27,3 +27,12 @@ def test_points_that_are_seen_too_seldom_do_not_count_and_without_times_a_point_
     seen[1, 1:] = 0.0
     left, weights = beside_courses(values, seen, material)
     assert torch.allclose(left[0], values[0] - values[0].mean()) and weights[0].all() and not weights[1].any()
+
+
+def test_few_moments_tell_few_courses_apart_and_keep_what_one_frame_shows():
+    material, count = clean(), len(clean().chosen)
+    for moments, kept in ((1, 1 - 1 / count), (2, 1 - 2 / count)):
+        times = [float(i * moments // len(material.names)) for i in range(len(material.names))]
+        spikes = torch.eye(count, dtype=torch.float64)
+        left, _ = beside_courses(spikes, torch.ones_like(spikes), replace(material, times_s=times))
+        assert left.diagonal().min() > kept - 0.1

@@ -257,3 +257,11 @@ def test_real_files_give_the_temperatures_that_are_stated_for_them(tmp_path):
     assert len(repeats) == 24
     found = repeats[0].temperature()
     assert 18.9 <= found.min() < found.max() <= 33.17 and not math.isnan(found.mean())
+
+
+def test_floats_of_64_bits_are_read_as_those_of_32(tmp_path):
+    write_images(tmp_path / "wide", {"a.tiff": FLOATS.astype(np.float64)})
+    write_images(tmp_path / "usual", {"a.tiff": FLOATS})
+    wide, usual = (read_recording(tmp_path / name).frames[0] for name in ("wide", "usual"))
+    assert wide.size == usual.size
+    np.testing.assert_array_equal(wide.temperature(), usual.temperature())

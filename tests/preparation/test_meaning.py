@@ -69,3 +69,10 @@ def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
 def test_what_cannot_be_is_refused_by_its_name(wrong, said):
     with pytest.raises(SceneError, match=said):
         Meaning(**wrong)
+
+
+def test_a_scale_is_one_of_kelvin_for_floats_as_for_counts():
+    for read in (Meaning(scale=0.01).of_counts, Meaning(scale=0.01).of_floats):
+        assert celsius(read(np.full((2, 2), 29815.0, np.float32), HERE)[0], [29815.0]) == pytest.approx([25.0])
+    both = Meaning(scale=0.1, offset_c=-40.0).of_floats(np.full((2, 2), 600.0, np.float32), HERE)[0]
+    assert celsius(both, [600.0]) == pytest.approx([20.0])

@@ -119,7 +119,7 @@ class Adaptive(DensityControl):
         """Duplicates those of ``grow`` that are not ``large`` and splits the others; under the cap, strongest pull first."""
         room = self._room(cloud)
         if int(grow.sum()) > room:  # one more Gaussian each, whether it is duplicated or split
-            strongest = pull.argsort(descending=True, stable=True)[:room]
+            strongest = torch.where(grow, pull, -torch.inf).argsort(descending=True, stable=True)[:room]
             grow = torch.zeros_like(grow)
             grow[strongest] = True
         duplicates, splits = (grow & ~large).nonzero().squeeze(1), (grow & large).nonzero().squeeze(1)

@@ -10,8 +10,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, View, evenly_spread
-from heatsplat.effects.observations import Tracks, tracks_of
+from heatsplat.contracts import Camera, Frame, SceneData, View
+from heatsplat.effects.observations import Tracks, followed, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -57,6 +57,7 @@ class Material:
         rgb: visible images [H, W, 3] of the same frames and cameras, or None.
         rgb_times_s: when the photos of all frames were taken, on their own camera's clock, or None.
         cameras: of the same frames, or None.
+        all_cameras: of all training frames, or None.
         points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
@@ -74,6 +75,7 @@ class Material:
     rgb: Sequence[Tensor] | None = None
     rgb_times_s: Sequence[float] | None = None
     cameras: Sequence[Camera] | None = None
+    all_cameras: Sequence[Camera] | None = None
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
     clipped: float | None = None
@@ -169,7 +171,8 @@ class Check:
 def material_of(scene: SceneData) -> Material:
     """What a doctor looks at of a scene: its training views."""
     frames = scene.train.frames
-    chosen = evenly_spread(len(frames), MAX_FRAMES)
+    points = None if "points_random" in scene.notes else scene.points
+    chosen = followed(frames, scene.points[:0] if points is None else points, MAX_FRAMES)
     views = [scene.train[i] for i in chosen]
     kept = [(i, view) for i, view in zip(chosen, views, strict=True) if view.thermal is not None]
     shape = kept[0][1].thermal.shape[:2] if kept else (0, 0)
@@ -192,7 +195,8 @@ def material_of(scene: SceneData) -> Material:
         masks=masks,
         rgb=[view.rgb for view in views] if views and all(view.rgb is not None for view in views) else None,
         cameras=[view.camera for view in views],
-        points=None if "points_random" in scene.notes else scene.points,
+        all_cameras=[frame.camera for frame in frames],
+        points=points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
         clipped=scene.notes.get("clipped_fraction"),
         views=views,

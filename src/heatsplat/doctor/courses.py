@@ -11,6 +11,7 @@ from heatsplat.doctor.base import Material
 RATES = (1.0, 4.0, 16.0)  # of exponentials over the record, in its inverse spans; sums of them follow what settles
 ENOUGH = 2.0  # observations of a point for each of the numbers of its course
 RIDGE = 1e-9
+RANK = 1e-9  # of the largest direction that courses span, below which one is rounding
 
 
 def beside_courses(values: Tensor, weights: Tensor, material: Material) -> tuple[Tensor, Tensor]:
@@ -26,7 +27,8 @@ def beside_courses(values: Tensor, weights: Tensor, material: Material) -> tuple
         columns += [torch.exp(-rate * share) for rate in RATES]
     if material.answers is not None:
         columns += [answer for answer in material.answers.to(values.dtype).T if bool(answer.any())]
-    basis = torch.linalg.qr(torch.stack(columns, 1))[0]
+    directions, sizes, _ = torch.linalg.svd(torch.stack(columns, 1), full_matrices=False)
+    basis = directions[:, sizes > RANK * sizes[0]]  # few moments tell few courses apart
     weights = weights * ((weights > 0).sum(1) >= ENOUGH * basis.shape[1])[:, None]
     inner = torch.einsum("pf,fi,fj->pij", weights, basis, basis)
     scale = inner.diagonal(dim1=1, dim2=2).mean(1).clamp_min(1e-30)

@@ -7,17 +7,20 @@ size at which all evidence takes a few seconds, and held in float64.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import Frame, SceneData, View, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, View, evenly_spread
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
 MAX_FRAMES = 64
+ENOUGH = 0.5  # share of the points that a choice of frames shows at all which have to be followed through some of them
+LENGTHS = (1, 16, 64)  # frames of a run
 # Points whose tracks are fitted, and their observations, by which time goes; all points, up to MAX_IN_FRONT, hide each other.
 MAX_POINTS, MAX_OBSERVATIONS = 500, 24_000
 MAX_CANDIDATES = 1500
@@ -67,7 +70,7 @@ class Observations:
     Args:
         scene: where it comes from.
         frames: [F] of the images.
-        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES evenly spread.
+        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES (``followed``).
         masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
         noise: standard deviation of the noise of a pixel, in image units.
@@ -106,7 +109,7 @@ class Observations:
 def observe(scene: SceneData) -> Observations:
     """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
     frames = scene.train.frames
-    chosen = evenly_spread(len(frames), MAX_FRAMES)
+    chosen = followed(frames, scene.points, MAX_FRAMES)
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
@@ -141,8 +144,37 @@ def observe(scene: SceneData) -> Observations:
     else:
         tracks = tracks_of(scene.points.double(), views, images, noise)
         if tracks is None:
-            why = f"no scene point is seen in {MIN_FRAMES} or more training views"
+            why = f"no scene point is seen in {MIN_FRAMES} or more of {len(views)} training views"
     return Observations(scene, tuple(view.frame for view in views), images, masks, times_s, noise, still, tracks, why)
+
+
+def followed(frames: Sequence[Frame], points: Tensor, limit: int) -> list[int]:
+    """At most ``limit`` positions of frames through which points can be followed, in order.
+
+    They are evenly spread. Where too few points are then seen often enough, as on a long flight, runs of frames that follow each
+    other are, of the shortest of ``LENGTHS`` that will do, or else of that which comes nearest.
+    """
+    even = evenly_spread(len(frames), limit)
+    if len(frames) <= limit or len(points) == 0:
+        return even
+    some = points[torch.tensor(evenly_spread(len(points), MAX_POINTS))].double()
+    found, most = even, -1.0
+    for length in (length for length in LENGTHS if length <= limit):
+        starts = evenly_spread(len(frames) - length + 1, limit // length)
+        chosen = sorted({start + k for start in starts for k in range(length)})
+        seen = torch.stack([in_view(some, frames[i].camera) for i in chosen]).sum(0)
+        often = float((seen[seen > 0] >= MIN_FRAMES).double().mean()) if bool(seen.any()) else 0.0
+        if often > most:
+            found, most = chosen, often
+        if often >= ENOUGH:
+            break
+    return found
+
+
+def in_view(points: Tensor, camera: Camera) -> Tensor:
+    """Which points [P, 3] lie in a camera's field of view, [P] bool."""
+    pixels, depth = camera.project(points)
+    return (depth > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
 
 
 def _stands_still(views: list[View], points: Tensor) -> bool:

@@ -69,8 +69,8 @@ def find(material: Material) -> list[Finding]:
 
 
 def _plateau(values: torch.Tensor) -> float:
-    """Share of the pixels that have the largest value; 0 where so few do that chance explains it."""
-    count = int((values == values.max()).sum()) if len(values) else 0
+    """Share of the pixels that have the largest value; 0 where so few do that chance explains it, or all are the same."""
+    count = int((values == values.max()).sum()) if len(values) and values.min() < values.max() else 0
     return count / len(values) if count >= MIN_PLATEAU else 0.0
 
 

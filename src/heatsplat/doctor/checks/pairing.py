@@ -29,6 +29,12 @@ def find(material: Material) -> list[Finding]:
     light = torch.stack([_edges(photo.double().mean(2)) for photo in material.rgb])
     if heat.shape != light.shape:
         return found
+    shows = (heat.flatten(1).std(1) > 0) & (
+        light.flatten(1).std(1) > 0
+    )  # a closed shutter or a black photo says nothing
+    heat, light = heat[shows], light[shows]
+    if len(heat) < MIN_FRAMES:
+        return found
     fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
@@ -115,7 +121,7 @@ def _edges(image: Tensor) -> Tensor:
     x = functional.pad(small.diff(dim=3), (0, 1))
     y = functional.pad(small.diff(dim=2), (0, 0, 0, 1))
     strength = torch.hypot(x, y)
-    strength = strength / (strength + strength.mean())
+    strength = strength / (strength + strength.mean()).clamp_min(1e-30)
     return functional.avg_pool2d(strength, 3, stride=1, padding=1)[0, 0]
 
 

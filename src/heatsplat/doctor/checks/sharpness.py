@@ -15,13 +15,15 @@ CLEAR = 8.0  # contrast in noise from which sharpness can be told
 def find(material: Material) -> list[Finding]:
     if len(material.images) < 6 or min(material.images.shape[1:]) < 24 or material.contrast < CLEAR * material.noise:
         return []
-    sharp = torch.tensor([_sharpness(image, material.noise) for image in material.images], dtype=torch.float64)
-    around = torch.stack([sharp[max(0, f - 4) : f + 5].median() for f in range(len(sharp))])
+    counts = material.images.isfinite() if material.masks is None else material.images.isfinite() & material.masks
+    images = [_filled(image, known) for image, known in zip(material.images, counts, strict=True)]
+    sharp = torch.tensor([_sharpness(*pair, material.noise) for pair in zip(images, counts, strict=True)]).double()
+    around = torch.stack([sharp[max(0, f - 4) : f + 5].nanmedian() for f in range(len(sharp))])
     worst = [f for f in range(len(sharp)) if float(sharp[f]) < BLURRED * float(around[f])]
     if not worst:
         return []
     names = [material.name(f) for f in worst]
-    along = sum(_direction(material.images[f]) for f in worst) / len(worst)
+    along = sum(_direction(images[f], counts[f]) for f in worst) / len(worst)
     kind = "along one direction: motion" if along > 0.5 else "in all directions: focus, or motion along several"
     return [
         Finding(
@@ -34,24 +36,36 @@ def find(material: Material) -> list[Finding]:
     ]
 
 
-def _sharpness(image: Tensor, noise: float) -> float:
-    """Fine gradients over coarse ones: the strongest hundredth at single pixels, and after a mean over 4."""
-    image = image.nan_to_num()
-    fine = (
-        _gradient(image).flatten().square().topk(max(1, image.numel() // 100)).values.mean() - 2 * noise**2
-    ).clamp_min(0)
-    coarse = functional.avg_pool2d(image[None, None], 4, stride=1)[0, 0]
-    rough = _gradient(coarse).flatten().square().topk(max(1, coarse.numel() // 100)).values.mean()
-    return float((fine / rough.clamp_min(1e-18)).sqrt())
+def _filled(image: Tensor, counts: Tensor) -> Tensor:
+    """The image with its median where pixels do not count."""
+    return image.where(counts, image[counts].median() if bool(counts.any()) else 0.0)
 
 
-def _gradient(image: Tensor) -> Tensor:
-    return torch.hypot(image.diff(dim=1)[:-1], image.diff(dim=0)[:, :-1])
+def _sharpness(image: Tensor, counts: Tensor, noise: float) -> float:
+    """Fine gradients over coarse ones: the strongest hundredth at single pixels, and after a mean over 4; NaN where none is
+    known."""
+    fine = _strongest(image, counts)
+    coarse, whole = (functional.avg_pool2d(x[None, None].double(), 4, stride=1)[0, 0] for x in (image, counts))
+    rough = _strongest(coarse, whole > 1 - 1e-9)
+    return float(((fine - 2 * noise**2).clamp_min(0) / rough.clamp_min(1e-18)).sqrt())
 
 
-def _direction(image: Tensor) -> float:
+def _strongest(image: Tensor, counts: Tensor) -> Tensor:
+    """Mean square of the strongest hundredth of the gradients between pixels that count."""
+    x, y = _steps(image, counts)
+    squares = x.square() + y.square()
+    return squares.topk(max(1, len(squares) // 100)).values.mean() if len(squares) else squares.new_tensor(torch.nan)
+
+
+def _steps(image: Tensor, counts: Tensor) -> Tensor:
+    """Differences to the right and down [2, n] of the pixels that count with both of these neighbours."""
+    inside = counts[:-1, :-1] & counts[:-1, 1:] & counts[1:, :-1]
+    return torch.stack([image.diff(dim=1)[:-1][inside], image.diff(dim=0)[:, :-1][inside]])
+
+
+def _direction(image: Tensor, counts: Tensor) -> float:
     """How much more gradients there are in one direction than across it, 0 to 1."""
-    x, y = image.nan_to_num().diff(dim=1)[:-1], image.nan_to_num().diff(dim=0)[:, :-1]
+    x, y = _steps(image, counts)
     a, b, c = (x * x).mean(), (y * y).mean(), (x * y).mean()
     return float(torch.sqrt((a - b).square() + 4 * c.square()) / (a + b).clamp_min(1e-18))
 

@@ -34,7 +34,9 @@ def find(material: Material) -> list[Finding]:
             )
         )
     steps = times.sort().values.diff()
-    if (same := int((steps == 0).sum())) > 0.05 * len(steps):
+    of_lens = [times[[i for i in range(len(times)) if lens[i] == number]] for number in sorted(set(lens))]
+    same = sum(int((own.sort().values.diff() == 0).sum()) for own in of_lens)  # cameras may be triggered together
+    if same > 0.05 * len(steps):
         found.append(
             Finding(
                 "times",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.effects.observations import in_view
 
 MIN_VIEWS = 3
 SHARE = 0.3  # of the points
@@ -12,18 +13,13 @@ SOME = 2000  # points that are looked at
 
 
 def find(material: Material) -> list[Finding]:
-    if (
-        material.cameras is None
-        or material.points is None
-        or len(material.points) < 20
-        or len(material.cameras) < MIN_VIEWS
-    ):
+    cameras = material.all_cameras or material.cameras or ()
+    if material.points is None or len(material.points) < 20 or len(cameras) < MIN_VIEWS:
         return []
     points = material.points[:: max(1, len(material.points) // SOME)].double()
     seen = torch.zeros(len(points), dtype=torch.int64)
-    for camera in material.cameras:
-        pixels, depth = camera.project(points)
-        seen += (depth > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+    for camera in cameras:
+        seen += in_view(points, camera)
     few = float((seen < MIN_VIEWS).double().mean())
     if few < SHARE:
         return []

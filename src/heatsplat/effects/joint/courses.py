@@ -39,7 +39,9 @@ def common_courses(fit: Fit, beside: Model, count: int) -> Tensor:
         own = own_weights(basis, values, fit.weights)
         amplitudes, rest = own[:, -count:], values - (own_basis @ own[:, :-count, None])[..., 0]
         inner = torch.einsum("pf,pi,pj->fij", weights, amplitudes, amplitudes)
-        inner = inner + RIDGE * inner.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-300) * torch.eye(count)
+        inner = inner + RIDGE * inner.diagonal(dim1=1, dim2=2).mean().clamp_min(1e-150) * torch.eye(
+            count, dtype=values.dtype
+        )
         found = torch.linalg.solve(inner, torch.einsum("pf,pi,pf->fi", weights, amplitudes, rest))
         found = torch.linalg.qr(found).Q
     return found
