@@ -12,7 +12,7 @@ from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import SceneError, View, ViewSet
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import shot_frames, sightings, warn_beyond_record, write_shot
+from heatsplat.shots import checked_unseen, shot_frames, sightings, warn_beyond_record, write_shot
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
@@ -107,6 +107,38 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
     assert all((one.camera.width, one.camera.height) == (192, 96) for one in found)
     assert all(not one.mask[:, :96].any() and one.mask[:, 96:].all() for one in found)
     assert [frame.time_s for frame in asked] == list(scene.train.times_s)
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"trajectory": "circle"}, "trajectory must be one of orbit, path, test, train, view, got 'circle'"),
+        ({"time": "abc"}, "time must be a number, got abc"),
+        ({"time": float("nan")}, "time must be a number, got nan"),
+        ({"time": []}, "time must be a number of seconds"),
+        ({"time": [0, 1, 2]}, r"time must be a number of seconds or \[start, end\], got \[0, 1, 2\]"),
+        ({"view": 1.9}, "view must be the whole number or the file name of a training frame, got 1.9"),
+        ({"count": 1.5}, "frames must be a whole number, 1 or more, got 1.5"),
+        ({"count": 0}, "frames must be a whole number, 1 or more, got 0"),
+    ],
+)
+def test_a_setting_that_makes_no_shot_is_named(settings, told):
+    with pytest.raises(SceneError, match=told):
+        shot_frames(make_scene(), **{"trajectory": "view", **settings})
+
+
+def test_a_camera_that_stands_still_has_no_orbit_but_a_path():
+    scene = make_scene()
+    with pytest.raises(SceneError, match="give no orbit; choose trajectory=path or view instead"):
+        shot_frames(scene)
+    assert len(shot_frames(scene, "path", count=2)) == 2
+
+
+def test_an_unquoted_nan_is_the_word():
+    """As Hydra reads unseen=nan."""
+    assert [checked_unseen("unseen", given) for given in (float("nan"), "nan", "keep")] == ["nan", "nan", "keep"]
+    with pytest.raises(SceneError, match="unseen must be one of nan, keep, got 'show'"):
+        checked_unseen("unseen", "show")
 
 
 def two_cameras():

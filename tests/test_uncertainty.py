@@ -71,6 +71,14 @@ def test_it_needs_training_views():
         Uncertainty(nothing)
 
 
+def test_images_of_another_weather_tell_nothing():
+    scene = SimpleNamespace(train=[None], notes={"weather_replaced_by": "gale.csv"})
+    with pytest.raises(
+        SceneError, match="weather=gale.csv: .* recorded in another weather. Leave out weather, or uncertainty"
+    ):
+        Uncertainty(SimpleNamespace(scene=scene))
+
+
 def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path):
     settings = ("method=3dgs", "data.scene=static", "max_steps=300", "test=false", *TINY)
     module, trainer = run(tmp_path, *settings)

@@ -192,10 +192,13 @@ def _keys(settings: dict[str, Any], path: str = "") -> Iterator[str]:
             yield from _keys(value, f"{path}{key}.")
 
 
-def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], Any]:
+def _job(
+    work: Callable[[dict[str, Any], Path], Any], check: Callable[[DictConfig, Path], None] | None = None
+) -> Callable[[DictConfig], Any]:
     """Runs ``work(config, output_dir)`` so that a failure leaves a FAILED file and a readable message.
 
-    The configuration comes as plain containers (``composition.plain``).
+    The configuration comes as plain containers (``composition.plain``). ``check`` may raise OccupiedError: it comes before
+    anything in the folder is changed.
 
     In a sweep the exception goes on to Hydra, which runs the other jobs; a single run ends with exit code 1.
     """
@@ -209,6 +212,8 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
         output_dir = Path(hydra_config.runtime.output_dir)
         try:
             with locked(output_dir), stoppable():
+                if check is not None:
+                    check(config, output_dir)
                 (output_dir / FAILED).unlink(missing_ok=True)
                 if not (output_dir / METRICS_FILE).exists():
                     _write_down(config, hydra_config, output_dir / ".hydra")
@@ -224,6 +229,17 @@ def _job(work: Callable[[dict[str, Any], Path], Any]) -> Callable[[DictConfig], 
             sys.exit(1)
 
     return job
+
+
+def _prepare_machine(threads: int | None) -> None:
+    """``prepare_machine``; raises SceneError for a number of threads that a machine like this one is not given."""
+    from heatsplat.contracts import SceneError
+    from heatsplat.runs.checks import MAX_THREADS_PER_CORE
+
+    most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
+    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
+        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+    prepare_machine(threads)
 
 
 def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> None:
@@ -281,14 +297,25 @@ def check_first(ckpt: str) -> None:
         raise SceneError(f"the run that comes before this one has no results: {reason_of(folder)} (in {folder})")
 
 
+def check_vacant(config: DictConfig, output_dir: Path) -> None:
+    """Raises OccupiedError where results are in a folder, or it is that of the run that wrote the checkpoint."""
+    from heatsplat.io.results import METRICS_FILE
+    from heatsplat.runs.lock import OccupiedError
+
+    if (output_dir / METRICS_FILE).exists() or output_dir.resolve() == Path(run_of(config["ckpt"])):
+        raise OccupiedError(
+            f"{output_dir} holds a run or results, which would be lost: give another folder with hydra.run.dir, or leave that out"
+        )
+
+
 @_command
-@_job
+@functools.partial(_job, check=check_vacant)
 def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     """Measures the test views of a checkpoint. Returns the test PSNR."""
     from heatsplat.runs.device import device_of
     from heatsplat.runs.run import build_trainer, load
 
-    prepare_machine(config["threads"])
+    _prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
     own = "auto" if "backend" in trained.config["renderer"] else None  # not the backend of the machine that trained it
     device = device_of(config["accelerator"], {"backend": own})
@@ -303,27 +330,36 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     """Renders a shot of a checkpoint's scene to TIFF, PNG and video."""
     from rich.progress import track
 
-    from heatsplat.contracts import SceneError, check_option
+    from heatsplat.contracts import SceneError, check_numbers, check_option
+    from heatsplat.export.formats.base import checked_range
     from heatsplat.io.video import CODECS, encoder
-    from heatsplat.runs.run import UNSEEN, load
-    from heatsplat.shots import shot_frames, warn_beyond_record, write_shot
+    from heatsplat.runs.run import load
+    from heatsplat.shots import check_shot, checked_unseen, shot_frames, warn_beyond_record, write_shot
     from heatsplat.uncertainty import Uncertainty
 
-    check_option("unseen", config["unseen"], UNSEEN, SceneError)
+    shot = {key: config[key] for key in ("trajectory", "time", "view")} | {"count": config["frames"]}
+    check_shot(**shot)
+    checked_range(config["range_c"], "range_c")
+    check_numbers("fps", config["fps"], error=SceneError)
+    if config["fps"] <= 0:
+        raise SceneError(f"fps must be above 0, got {config['fps']}")
+    names = [config["images"]] if isinstance(config["images"], str) else config["images"]
+    if not isinstance(names, list) or not names:
+        raise SceneError(f"images must be all, or one or a list of recorded, clean and rgb, got {config['images']}")
+    keep = checked_unseen("unseen", config["unseen"]) == "keep"
     check_option("codec", config["codec"], CODECS, SceneError)
     check_option("figures", config["figures"], (None, "pdf", "svg"), SceneError)
     if config["video"]:
         encoder(config["codec"])  # what is missing is told before anything is rendered
-    prepare_machine(config["threads"])
+    _prepare_machine(config["threads"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
     )
-    frames = shot_frames(trained.scene, config["trajectory"], config["time"], config["view"], config["frames"])
+    frames = shot_frames(trained.scene, **shot)
     warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
-    keep = config["unseen"] == "keep"
-    names = trained.image_names if config["images"] == "all" else config["images"]
     for name in names:
-        check_option("images", name, trained.image_names, SceneError)
+        check_option("images", name, ("all", *trained.image_names), SceneError)
+    names = trained.image_names if "all" in names else names
     images = (
         (trained.images(frame, names), None if keep else trained.seen(frame)) for frame in track(frames, "rendering")
     )
@@ -339,16 +375,25 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 @_job
 def simplify(config: dict[str, Any], output_dir: Path) -> None:
     """Merges the Gaussians of a checkpoint into fewer: a checkpoint and a PLY for each level of detail."""
-    from heatsplat.contracts import SceneError
+    from heatsplat.contracts import SceneError, check_numbers
+    from heatsplat.export.files import write_file
+    from heatsplat.export.formats.ply import Ply
+    from heatsplat.export.moment import moments_in
+    from heatsplat.export.snapshot import span_of
     from heatsplat.runs.levels import write_levels
     from heatsplat.runs.run import load
 
     if HydraConfig.get().runtime.choices.merge == "none":
         raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
-    prepare_machine(config["threads"])
+    if config["time"] is not None:
+        check_numbers("time", config["time"], error=SceneError)
+    _prepare_machine(config["threads"])
     trained = load(config["ckpt"], config["data"], output_dir=output_dir, trust=config["trust"])
-    merging = build(config["merge"])
-    written = write_levels(trained, merging, config["levels_c"], output_dir, config["ply"], config["time"])
+    merging, write_ply = build(config["merge"]), None
+    if config["ply"]:
+        moments_in(trained.scene, span_of(trained.scene), config["time"])  # refused before a long search
+        write_ply = functools.partial(write_file, trained.module, Ply(), time_s=config["time"])
+    written = write_levels(trained, merging, config["levels_c"], output_dir, write_ply)
     log.info("%d files in %s", len(written), output_dir)
 
 
@@ -359,7 +404,7 @@ def view(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.runs.run import load
     from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
 
-    prepare_machine(config["threads"])
+    _prepare_machine(config["threads"])
     cameras = checked_cameras(config["cameras"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
@@ -376,13 +421,18 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     Raises:
         SceneError: no format is chosen.
     """
-    from heatsplat.contracts import SceneError
+    from heatsplat.contracts import SceneError, check_option
     from heatsplat.export.files import write_files
+    from heatsplat.export.moment import LAYERS
     from heatsplat.runs.run import load
+    from heatsplat.shots import checked_times
 
     if config.get("what") is None:
         raise SceneError(f"which format? Give what=..., one of {', '.join(_options('what'))}")
-    prepare_machine(config["threads"])
+    check_option("layer", config["layer"], LAYERS, SceneError)
+    if config["time"] is not None:
+        checked_times(config["time"])
+    _prepare_machine(config["threads"])
     form = build(config["what"])
     trained = load(
         config["ckpt"], config["data"], config["weather"], config["weather_zone"], output_dir, config["trust"]
@@ -409,7 +459,7 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
         raise SceneError(
             f"study={name} is a benchmark of the source checkout: run python src/study.py study={name} in a clone of it"
         )
-    prepare_machine(config["threads"])
+    _prepare_machine(config["threads"])
     build(config["study"], output_dir=output_dir)
     log.info("%s", output_dir)
 
@@ -421,12 +471,12 @@ def prepare(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.contracts import SceneError
 
     if config["check"] is not None:
-        prepare_machine(config["threads"])
+        _prepare_machine(config["threads"])
         build(config["examination"], target=None if config["target"] is None else output_dir)
         return
     if config["target"] is None or (config["source"] is None and config.get("correct") is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
-    prepare_machine(config["threads"])
+    _prepare_machine(config["threads"])
     try:
         build(config.get("correct") or config["preparation"], target=output_dir)
     except KeyboardInterrupt:

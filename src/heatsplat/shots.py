@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible, write_figure, write_png
@@ -26,6 +26,7 @@ log = logging.getLogger("heatsplat")
 DEVIATION = "viridis"  # colours of standard deviations: not those of temperatures
 
 TRAJECTORIES = ("orbit", "path", "test", "train", "view")
+UNSEEN = ("nan", "keep")  # what becomes of pixels that no training view has seen
 
 
 def shot_frames(
@@ -47,12 +48,9 @@ def shot_frames(
         count: frames of "orbit", "path" and "view".
 
     Raises:
-        SceneError: unknown trajectory or view, or a time that is not one or two numbers.
+        SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
     """
-    if trajectory not in TRAJECTORIES:
-        raise SceneError(f"trajectory '{trajectory}' is unknown; choose {', '.join(TRAJECTORIES)}")
-    if count < 1:
-        raise SceneError(f"a shot needs frames, got frames={count}")
+    check_shot(trajectory, time, view, count)
     if trajectory in ("test", "train"):
         taken = getattr(scene, trajectory).frames
         moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
@@ -70,6 +68,34 @@ def shot_frames(
     ]
 
 
+def check_shot(trajectory: str, time: float | Sequence[float] | None, view: int | str, count: int) -> None:
+    """Raises SceneError where a setting of ``shot_frames`` is none, whatever the scene."""
+    check_option("trajectory", trajectory, TRAJECTORIES, SceneError)
+    if time is not None and len(checked_times(time)) > 2:
+        raise SceneError(f"time must be a number of seconds or [start, end], got {list(time)}")
+    if not isinstance(view, int | str):
+        raise SceneError(f"view must be the whole number or the file name of a training frame, got {view}")
+    if not isinstance(count, int) or count < 1:
+        raise SceneError(f"frames must be a whole number, 1 or more, got {count}")
+
+
+def checked_times(time: float | Sequence[float]) -> list[float]:
+    """Moments in seconds that were given as one number or as a list. Raises SceneError where they are not, or there is none."""
+    listed = [*time] if isinstance(time, Sequence) and not isinstance(time, str) else [time]
+    for one in listed:
+        check_numbers("time", one, error=SceneError)
+    if not listed:
+        raise SceneError("time must be a number of seconds or a list of them, got []")
+    return listed
+
+
+def checked_unseen(name: str, value: str | float) -> str:
+    """One of UNSEEN; a NaN is the word, which Hydra reads as a number. Raises SceneError with the option's ``name``."""
+    word = "nan" if value != value else value
+    check_option(name, word, UNSEEN, SceneError)
+    return word
+
+
 def first_free_id(scene: SceneData) -> int:
     """The first ``frame_id`` that no frame of the scene has."""
     return 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
@@ -85,7 +111,10 @@ def at_time(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
 def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> list[Camera]:
     taken = [frame.camera for frame in scene.train.frames]
     if trajectory == "orbit":
-        return trajectories.orbit(taken, count)
+        try:
+            return trajectories.orbit(taken, count)
+        except ValueError as error:
+            raise SceneError(str(error)) from error
     if trajectory == "path":
         return trajectories.interpolate(taken, count)
     if isinstance(view, str) and not view.lstrip("-").isdigit():
@@ -103,9 +132,7 @@ def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> 
 
 
 def _moments(time: float | Sequence[float], count: int) -> list[float]:
-    bounds = [float(t) for t in time] if isinstance(time, Sequence) else [float(time)]
-    if len(bounds) not in (1, 2) or not np.isfinite(bounds).all():
-        raise SceneError(f"time must be a number of seconds or [start, end], got {time}")
+    bounds = checked_times(time)
     return np.linspace(bounds[0], bounds[-1], count).tolist()
 
 

@@ -134,13 +134,19 @@ class Uncertainty:
         module: a trained module with its scene.
 
     Raises:
-        SceneError: the scene has no training view, or masks leave none of their pixels.
+        SceneError: the scene has no training view, masks leave none of their pixels, or it is under another weather than that
+            in which they were recorded.
     """
 
     def __init__(self, module: Any) -> None:
         scene = module.scene
         if not len(scene.train):
             raise SceneError(f"scene '{scene.name}' has no training views, which tell how certain it is")
+        if (other := scene.notes.get("weather_replaced_by")) is not None:
+            raise SceneError(
+                f"weather={other}: how certain a temperature is follows from the images, which were recorded in another weather. "
+                "Leave out weather, or uncertainty"
+            )
         self.module = module
         self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
         self.noise = noise_of_views(scene.train, module.modality)

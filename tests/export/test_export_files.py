@@ -1,6 +1,9 @@
 """Files of several moments, their names."""
 
-from heatsplat.export.files import write_files
+import pytest
+
+from heatsplat.contracts import SceneError
+from heatsplat.export.files import write_file, write_files
 from heatsplat.export.formats.npz import Npz
 
 
@@ -13,3 +16,14 @@ def test_every_moment_has_a_file(cooling, tmp_path):
     written = write_files(cooling.module, Npz(), tmp_path / "new", [0.0, 600.0])
     assert [path.name for path in written] == ["cooling_0s.npz", "cooling_600s.npz"]
     assert all(path.stat().st_size > 1000 for path in written)
+
+
+def test_a_moment_outside_the_record_is_refused_before_the_snapshot(cooling, tmp_path, monkeypatch):
+    """It may take a minute."""
+    monkeypatch.setattr("heatsplat.export.files.snapshot", lambda module: pytest.fail("the snapshot was taken"))
+    for times in (99999, float("nan")):
+        with pytest.raises(SceneError, match="time"):
+            write_files(cooling.module, Npz(), tmp_path, times)
+        with pytest.raises(SceneError, match="time"):
+            write_file(cooling.module, Npz(), tmp_path / "a.npz", times)
+    assert not list(tmp_path.iterdir())

@@ -91,11 +91,19 @@ def test_a_quotient_is_that_of_what_a_pixel_mixes(two_plates, tmp_path, monkeypa
     ("settings", "message"),
     [
         ({"resolution": 0}, "what.resolution must be above 0"),
+        ({"resolution": "abc"}, "what.resolution must be a number, got abc"),
+        ({"bounds": 5}, "what.bounds must be a list of 4 numbers, got 5"),
+        ({"above": 1}, "what.above must be a list of 3 numbers, got 1"),
         ({"bounds": [3, 0, 1, 2]}, "what.bounds must be"),
-        ({"unseen": "show"}, "what.unseen must be nan or keep"),
+        ({"unseen": "show"}, "what.unseen must be one of nan, keep, got 'show'"),
         ({"above": [0, 0, 0]}, "what.above must be a direction"),
     ],
 )
 def test_settings_that_make_no_map_are_named(settings, message):
     with pytest.raises(SceneError, match=message):
         Map(**settings)
+
+
+def test_an_unquoted_nan_is_the_word():
+    """As Hydra reads what.unseen=nan."""
+    assert Map(unseen=float("nan")).unseen == "nan"

@@ -50,6 +50,12 @@ def test_a_mesh_is_in_the_coordinates_of_the_data_set(cooling, tmp_path):
     assert np.allclose(near["temperature_c"], far["temperature_c"], atol=0.05, equal_nan=True)
 
 
+@pytest.mark.parametrize("views", [0, 1.5, "abc"])
+def test_what_is_no_number_of_views_is_refused(views):
+    with pytest.raises(SceneError, match=f"what.views must be a whole number, 1 or more, or null for all, got {views}"):
+        Mesh("given.obj", views=views)
+
+
 def test_what_cannot_be_seen_or_read_is_said(cooling, tmp_path):
     with pytest.raises(SceneError, match=r"Give what.mesh=FILE"):
         Mesh()

@@ -37,6 +37,15 @@ def test_several_moments_and_none_outside_the_record(cooling):
         moments(cooling.module, cooling.seen, -500.0)
 
 
+@pytest.mark.parametrize(
+    ("times", "told"), [("abc", "a number, got abc"), ([1.0, "b"], "a number, got b"), (float("nan"), "a number, got nan"),
+                        ([], "a number of seconds or a list of them")],
+)  # fmt: skip
+def test_what_is_no_time_is_refused(cooling, times, told):
+    with pytest.raises(SceneError, match=f"time must be {told}"):
+        moments(cooling.module, cooling.seen, times)
+
+
 def test_a_scene_without_times_has_one_moment(cooling):
     still = replace(cooling.layer, basis=constant_basis(cooling.blended))
     seen = replace(cooling.seen, layers=[still], start_s=None, end_s=None)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from exported import started
 
+from heatsplat.contracts import SceneError
 from heatsplat.export.snapshot import snapshot
 from heatsplat.shots import at_time
 
@@ -49,6 +50,14 @@ def test_a_static_scene_has_one_moment_and_what_cannot_be_seen_is_left_out(tmp_p
     seen = snapshot(module)
     assert len(seen.means) == len(module.splats) - 5
     assert seen.layers[0].basis.rank == 0 and seen.left_out == []
+
+
+def test_where_nothing_can_be_seen_there_is_nothing_to_export(tmp_path):
+    module = started(tmp_path, "method=3dgs", "data.scene=static")
+    with torch.no_grad():
+        module.splats.raw["opacity_logits"][:] = -20.0
+    with pytest.raises(SceneError, match=f"none of the {len(module.splats)} Gaussians of scene 'static' can be seen"):
+        snapshot(module)
 
 
 def test_what_depends_on_the_view_is_said(tmp_path):

@@ -55,7 +55,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
     monkeypatch.setattr(run, "load_checkpoint", lambda ckpt: stored)
     monkeypatch.setattr(run, "build_module", lambda config, output_dir: module)
     monkeypatch.setattr(run, "build", lambda settings: data)
-    monkeypatch.setattr(run, "restore", lambda *_: None)
+    monkeypatch.setattr(run, "restore", lambda module, data, loaded: setattr(module, "scene", data.scene))
     monkeypatch.setattr("heatsplat.cli.prepare_machine", lambda threads: None)
     options = ("ckpt=any.ckpt", "video=false", "png=false", "frames=3", "unseen=keep", *overrides)
     inspect.unwrap(cli.render)(compose(options, "render"), folder)
@@ -73,6 +73,22 @@ def test_another_table_is_what_model_and_frames_see(monkeypatch, tmp_path):
     assert scene.weather.at(0.0).wind_m_s == 20.0 and scene.weather.pressure_hpa is None
     assert [frame.environment.wind_m_s for frame in seen] == [20.0] * len(scene.test)
     assert seen[0].environment.air_c == pytest.approx(seen[0].time_s / HOUR_S)
+
+
+@pytest.mark.parametrize("images", ["recorded", "[recorded]", "all", "[all]"])
+def test_one_image_is_named_as_a_list_of_it_is(monkeypatch, tmp_path, images):
+    shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=train", f"images={images}")
+    assert {path.name for path in tmp_path.iterdir()} == {"tiff", "frames.csv"}
+
+
+def test_an_image_that_the_model_lacks_is_named(monkeypatch, tmp_path):
+    with pytest.raises(SceneError, match="images must be one of all, recorded, got 'clean'"):
+        shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=train", "images=clean")
+
+
+def test_intervals_do_not_follow_from_images_of_another_weather(monkeypatch, tmp_path):
+    with pytest.raises(SceneError, match="gale.csv: how certain a temperature is"):
+        shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=test", f"weather={gale(tmp_path)}", "uncertainty=true")
 
 
 def test_a_model_without_weather_says_that_it_changes_nothing(monkeypatch, tmp_path):

@@ -1,12 +1,19 @@
 """The commands as a user types them, from another working directory."""
 
+import inspect
 import json
 from pathlib import Path
 
 import cv2
+import hydra
 import numpy as np
 import pytest
 from commands import succeeds
+from omegaconf import OmegaConf
+
+from heatsplat import cli, composition
+from heatsplat.contracts import SceneError
+from heatsplat.runs.lock import OccupiedError
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ("data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1")
@@ -58,6 +65,71 @@ def test_evaluate_needs_the_checkpoint_only_and_agrees_with_training(finished):
     (again,) = finished.glob("evaluations/*/metrics.json")
     first, second = (json.loads(path.read_text())["test"] for path in (finished / "metrics.json", again))
     assert first["psnr"] == second["psnr"] and first["mae_c"] == second["mae_c"]
+
+
+def test_evaluate_keeps_what_a_run_has_measured(finished):
+    kept = {path: path.read_bytes() for path in (*finished.glob("[a-z]*.[jmhc]*"), *finished.glob(".hydra/*"))}
+    assert {"metrics.json", "report.md", "test_per_image.csv", "config.yaml"} <= {path.name for path in kept}
+    ckpt = f"ckpt={finished}/checkpoints/last.ckpt"
+    told = command("evaluate", ckpt, f"hydra.run.dir={finished}", cwd=finished, code=1)
+    assert f"OccupiedError: {finished} holds a run or results" in told
+    assert all(path.read_bytes() == content for path, content in kept.items()) and not (finished / "FAILED").exists()
+
+
+def test_results_and_runs_without_them_are_no_place_to_evaluate_in(tmp_path):
+    config = OmegaConf.create({"ckpt": f"{tmp_path}/run/checkpoints/last.ckpt"})
+    (tmp_path / "other").mkdir()
+    cli.check_vacant(config, tmp_path / "other")
+    (tmp_path / "other" / "metrics.json").touch()
+    for folder in ("other", "run"):
+        with pytest.raises(OccupiedError, match="give another folder with hydra.run.dir"):
+            cli.check_vacant(config, tmp_path / folder)
+
+
+@pytest.mark.parametrize(
+    ("script", "folder"),
+    [
+        ("evaluate", "evaluations"),
+        ("render", "views"),
+        ("simplify", "levels"),
+        ("view", "viewers"),
+        ("export", "exports"),
+    ],
+)
+def test_a_sweep_over_a_checkpoint_stays_with_its_run(script, folder, tmp_path):
+    with hydra.initialize_config_dir(composition.CONF, version_base="1.3"):
+        config = hydra.compose(script, [f"ckpt={tmp_path}/checkpoints/last.ckpt"], return_hydra_config=True)
+    assert Path(config.hydra.sweep.dir).parent == tmp_path / folder
+    assert "job.num" in OmegaConf.to_container(config.hydra.sweep, resolve=False)["subdir"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("range_c=30", "range_c must be a list of 2 numbers, got 30"),
+        ("range_c=[30,10]", "range_c must be two increasing numbers"),
+        ("fps=0", "fps must be above 0, got 0"),
+        ("fps=abc", "fps must be a number, got abc"),
+        ("frames=1.5", "frames must be a whole number"),
+        ("time=abc", "time must be a number, got abc"),
+        ("images=[]", "images must be all, or one or a list of recorded, clean and rgb"),
+        ("images=3", "images must be all, or one or a list of recorded, clean and rgb, got 3"),
+        ("unseen=show", "unseen must be one of nan, keep"),
+        ("threads=0", "threads must be 1 to .* on this machine, or null for all cores, got 0"),
+        ("threads=abc", "threads must be 1 to .* got abc"),
+    ],
+)
+def test_what_render_cannot_take_is_named_before_anything_is_loaded(wrong, told, tmp_path):
+    config = composition.compose(["ckpt=nowhere.ckpt", "video=false", wrong], "render")
+    with pytest.raises(SceneError, match=told):
+        inspect.unwrap(cli.render)(config, tmp_path)
+
+
+@pytest.mark.parametrize("wrong", ["time=abc", "time=[]", "layer=air", "threads=0"])
+def test_what_export_cannot_take_is_named_before_anything_is_loaded(wrong, tmp_path):
+    config = composition.compose(["ckpt=nowhere.ckpt", "what=ply", wrong], "export")
+    with pytest.raises(SceneError, match=f"^{wrong.partition('=')[0]} must be"):
+        inspect.unwrap(cli.export)(config, tmp_path)
 
 
 def test_render_writes_temperatures_pictures_and_a_video(finished):

@@ -1,13 +1,19 @@
 """Levels of detail of a run as files, and a run that merges its Gaussians itself."""
 
+import inspect
 import json
+from functools import partial
 
 import pytest
 import torch
 from running import TINY, run
 
+from heatsplat import cli
+from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.density.merging import FlatMerging
+from heatsplat.export.files import write_file
+from heatsplat.export.formats.ply import Ply
 from heatsplat.io.ply import read_splats
 from heatsplat.runs.levels import write_levels
 from heatsplat.runs.run import load
@@ -46,7 +52,7 @@ def test_a_run_ends_with_its_gaussians_merged_and_says_so(merged):
 def test_levels_are_checkpoints_and_splats_for_viewers(merged, tmp_path):
     folder, _ = merged
     trained = load(folder / "checkpoints" / "step_000020.ckpt")
-    write_levels(trained, FlatMerging(), [0.1, 0.3], tmp_path)
+    write_levels(trained, FlatMerging(), [0.1, 0.3], tmp_path, partial(write_file, trained.module, Ply()))
     told = json.loads((tmp_path / "levels.json").read_text())
     frame = trained.scene.train.frames[0]
     for number, level in enumerate(told):
@@ -56,6 +62,27 @@ def test_levels_are_checkpoints_and_splats_for_viewers(merged, tmp_path):
         assert change <= 5 * level["tolerance_c"]
         vertices = read_splats(tmp_path / f"lod_{number}.ply")
         assert len(vertices["means"]) == level["after"] and "temperature_k" in vertices
+        write_file(shown.module, Ply(), tmp_path / "exported.ply")
+        assert (tmp_path / "exported.ply").read_bytes() == (tmp_path / f"lod_{number}.ply").read_bytes()
+
+
+def simplified(ckpt, folder, *overrides):
+    inspect.unwrap(cli.simplify)(compose([f"ckpt={ckpt}", "threads=1", *overrides], "simplify"), folder)
+
+
+@pytest.mark.parametrize(("time", "told"), [("99999", "outside the record"), ("nan", "must be a number, got nan")])
+def test_a_time_that_the_record_lacks_is_refused_before_the_search(merged, tmp_path, time, told):
+    folder, _ = merged
+    with pytest.raises(SceneError, match=f"time.* {told}"):
+        simplified(folder / "checkpoints" / "step_000020.ckpt", tmp_path, f"time={time}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_levels_have_temperatures_where_the_model_tells_those_of_no_surface(tmp_path):
+    run(tmp_path / "run", *TINY, "method=ravigs", "max_steps=2", "init.count=200", "test=false")
+    simplified(tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path, "levels_c=0.5", "merge.views=4")
+    kelvins = read_splats(tmp_path / "lod_0.ply")["temperature_k"]
+    assert 250 < kelvins.min() < kelvins.max() < 350
 
 
 def test_levels_that_do_not_increase_are_refused(tmp_path):

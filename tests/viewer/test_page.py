@@ -18,7 +18,7 @@ from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
-from heatsplat.viewer.page import FILE, write_viewer
+from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
 
 ActionChains = pytest.importorskip(
     "selenium.webdriver", reason="selenium is not installed (pip install -e '.[dev]')"
@@ -146,7 +146,7 @@ def test_a_page_with_fewer_cameras_is_smaller_and_none_is_refused(trained, folde
     assert [camera["name"] for camera in header["cameras"]] == [names[i] for i in evenly_spread(len(names), 3)]
     assert path.stat().st_size < (folder / FILE).stat().st_size
     for refused in (lambda: write_viewer(trained.module, tmp_path / FILE, cameras=0), lambda: ViewerPage(cameras=0)):
-        with pytest.raises(SceneError, match="at least 1, got 0"):
+        with pytest.raises(SceneError, match="cameras must be a whole number, 1 or more.*got 0"):
             refused()
 
 
@@ -384,3 +384,9 @@ def test_narrow_screens_have_everything_too(folder):
         assert panel.is_displayed() and browser.find_element("id", "quantity").is_displayed()
     finally:
         browser.quit()
+
+
+@pytest.mark.parametrize("cameras", ["abc", 2.5, -1])
+def test_what_is_no_number_of_cameras_is_refused(cameras):
+    with pytest.raises(SceneError, match=f"cameras must be a whole number, 1 or more.*got {cameras}"):
+        checked_cameras(cameras)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.export.formats.base import Format
-from heatsplat.export.moment import moments
-from heatsplat.export.snapshot import snapshot
+from heatsplat.export.moment import Moment, moments, moments_in
+from heatsplat.export.snapshot import snapshot, span_of
 
 log = logging.getLogger("heatsplat")
 
@@ -30,6 +30,25 @@ def write_files(
         SceneError: the scene lacks what was asked for.
         ImportError: a package of the extra "export" is missing.
     """
+    found = _moments(module, form, times, layer)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for moment in found:
+        when = "" if moment.time_s is None else f"_{moment.time_s:.9g}s"
+        written.append(folder / f"{module.scene.name}{when}{form.suffix}")
+        form.write(moment, written[-1])
+    return written
+
+
+def write_file(module: Any, form: Format, path: Path, time_s: float | None = None) -> None:
+    """As ``write_files``, one file at one moment."""
+    (moment,) = _moments(module, form, time_s, "auto")
+    form.write(moment, path)
+
+
+def _moments(module: Any, form: Format, times: float | Sequence[float] | None, layer: str) -> list[Moment]:
+    """The moments that a format is to write; what their files will not hold is warned of."""
+    moments_in(module.scene, span_of(module.scene), times)  # a snapshot may take a minute
     seen = snapshot(module)
     for sentence in seen.left_out:
         log.warning("%s", sentence)
@@ -38,10 +57,4 @@ def write_files(
             "coordinates count from %s of the data set, whose numbers are too large for float32; add it to get those back",
             ", ".join(f"{x:.10g}" for x in origin),
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for moment in moments(module, seen, times, layer):
-        when = "" if moment.time_s is None else f"_{moment.time_s:.9g}s"
-        written.append(folder / f"{module.scene.name}{when}{form.suffix}")
-        form.write(moment, written[-1])
-    return written
+    return moments(module, seen, times, layer)

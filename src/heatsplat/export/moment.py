@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneError, check_option
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.export.snapshot import Layer, Snapshot
+from heatsplat.shots import checked_times
 
 LAYERS = ("auto", "camera", "surface", "truth")
 
@@ -50,6 +51,36 @@ class Moment:
         return found.where(blended.isfinite(), torch.nan)
 
 
+def moments_in(
+    scene: SceneData, span: tuple[float, float] | None, times: float | Sequence[float] | None
+) -> list[float | None]:
+    """Moments of a scene, [None] where nothing changes.
+
+    Args:
+        scene: with the training record.
+        span: of time that can be asked for (``snapshot.span_of``).
+        times: seconds since the first training frame, one or several; None takes the middle of the training record.
+
+    Raises:
+        SceneError: a moment is no number or outside the span, or there is none.
+    """
+    wanted = None if times is None else checked_times(times)
+    if span is None:
+        if wanted is not None:
+            raise SceneError(f"time={times}: scene '{scene.name}' does not change in time; leave time out")
+        return [None]
+    if wanted is None:
+        start, length = scene.record
+        return [start + length / 2]
+    for time_s in wanted:
+        if not span[0] <= time_s <= span[1]:
+            raise SceneError(
+                f"time={time_s:g} s lies outside the record, which runs from {span[0]:g} to {span[1]:g} s; "
+                "src/render.py shows what the model predicts beyond it"
+            )
+    return wanted
+
+
 def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, layer: str = "auto") -> list[Moment]:
     """The Gaussians at each of some moments.
 
@@ -61,27 +92,15 @@ def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, 
             apart from what a camera gets, and the camera elsewhere.
 
     Raises:
-        SceneError: the scene has no such layer, or a moment lies outside its record.
+        SceneError: the scene has no such layer, or a moment lies outside its record (``moments_in``).
     """
     check_option("layer", layer, LAYERS, SceneError)
     there = {one.name: one for one in seen.layers}
     name = ("surface" if "surface" in there else "camera") if layer == "auto" else layer
     if name not in there:
         raise SceneError(f"layer={layer}: this method and scene have {', '.join(there)} only")
-    wanted: list[float | None] = [*times] if isinstance(times, Sequence) else [times]
     found = []
-    for time_s in wanted:
-        if seen.start_s is None:
-            if time_s is not None:
-                raise SceneError(f"time={time_s}: scene '{module.scene.name}' does not change in time; leave time out")
-        elif time_s is None:
-            start, span = module.scene.record
-            time_s = start + span / 2
-        elif not seen.start_s <= time_s <= seen.end_s:
-            raise SceneError(
-                f"time={time_s:g} s lies outside the record, which runs from {seen.start_s:g} to {seen.end_s:g} s; "
-                "src/render.py shows what the model predicts beyond it"
-            )
+    for time_s in moments_in(module.scene, seen.span, times):
         chosen = there[name]
         blended = chosen.basis.at(time_s)
         # As images have it: beyond their range nothing was ever trained, and single Gaussians are far off there.

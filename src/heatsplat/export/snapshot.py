@@ -88,6 +88,11 @@ class Snapshot:
     start_s: float | None
     end_s: float | None
 
+    @property
+    def span(self) -> tuple[float, float] | None:
+        """The two ends of the time that it covers; None without times."""
+        return None if self.start_s is None else (self.start_s, self.end_s)
+
 
 @torch.no_grad()
 def snapshot(module: Any) -> Snapshot:
@@ -97,7 +102,7 @@ def snapshot(module: Any) -> Snapshot:
     ``left_out`` says over which, and how far single cameras are from it, at worst, too.
 
     Raises:
-        SceneError: the model's Gaussians cannot be told apart from it.
+        SceneError: the model's Gaussians cannot be told apart from it, or none can be seen.
     """
     if module.thermal.stays_here:
         raise SceneError(
@@ -105,7 +110,7 @@ def snapshot(module: Any) -> Snapshot:
             "images of it (src/render.py), or train a method whose Gaussians stay as they are, such as method=3dgs"
         )
     scene: SceneData = module.scene
-    span = _span(scene)
+    span = span_of(scene)
     middle = None if span is None else 0.5 * (min(scene.train.times_s) + max(scene.train.times_s))
     first = scene.train.frames[0]
     own_id = first_free_id(scene)
@@ -116,6 +121,11 @@ def snapshot(module: Any) -> Snapshot:
 
     means, quats, scales, opacities = module.shapes(seen_at(first, middle))
     kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
+    if not len(kept):
+        raise SceneError(
+            f"none of the {len(means)} Gaussians of scene '{scene.name}' can be seen (opacities are below {ALPHA_MIN:.2g}): "
+            "train it again, or take an earlier checkpoint"
+        )
     channels = module.thermal.modality_channels[0]
 
     def emitted(frame: Frame, ids: Tensor | None = None) -> Tensor:
@@ -207,7 +217,7 @@ def snapshot(module: Any) -> Snapshot:
     )
 
 
-def _span(scene: SceneData) -> tuple[float, float] | None:
+def span_of(scene: SceneData) -> tuple[float, float] | None:
     """First and last moment of all views; None without times or where all are the same."""
     if "time" not in scene.metadata:
         return None

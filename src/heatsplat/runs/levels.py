@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.ply import write_splats
 from heatsplat.io.results import write_atomically
 from heatsplat.runs.run import Trained
-from heatsplat.shots import at_time
-from heatsplat.splats import Splats
 from heatsplat.training.checkpoints import CheckpointFiles
 from heatsplat.training.module import CHECKPOINT_KEY
 
@@ -27,10 +23,9 @@ def write_levels(
     merging: Any,
     levels_c: Sequence[float] | float,
     output_dir: Path,
-    ply: bool = True,
-    time_s: float | None = None,
+    write_ply: Callable[[Path], None] | None = None,
 ) -> list[Path]:
-    """Paths of the files written: lod_<k>.ckpt and, if asked for, lod_<k>.ply of every level, and levels.json.
+    """Paths of the files written: lod_<k>.ckpt and, with ``write_ply``, lod_<k>.ply of every level, and levels.json.
 
     A checkpoint of a level can be evaluated and rendered. It has no optimiser moments.
 
@@ -39,8 +34,7 @@ def write_levels(
         merging: how Gaussians are merged (``density.merging.FlatMerging``).
         levels_c: °C that each level may lose, increasing; or that of a single one.
         output_dir: folder of the files.
-        ply: write the Gaussians for viewers as well, with their temperature.
-        time_s: of the PLY files, seconds since the first training frame; None takes the middle of the record.
+        write_ply: writes the Gaussians that the module then has to a file for viewers; None writes none.
 
     Raises:
         SceneError: levels do not increase from above 0, or the Gaussians of the method cannot be merged.
@@ -64,35 +58,11 @@ def write_levels(
                 "optimizer_states": [],
                 CHECKPOINT_KEY: kept,
             }
-        written.append(output_dir / f"lod_{number}.ckpt")
-        CheckpointFiles().save_checkpoint(checkpoint, written[-1])
-        if ply:
-            written.append(output_dir / f"lod_{number}.ply")
-            _write_ply(written[-1], trained, level.splats, time_s)
+            written.append(output_dir / f"lod_{number}.ckpt")
+            CheckpointFiles().save_checkpoint(checkpoint, written[-1])
+            if write_ply is not None:
+                written.append(output_dir / f"lod_{number}.ply")
+                write_ply(written[-1])
     written.append(output_dir / LEVELS_FILE)
     write_atomically(written[-1], json.dumps(found, indent=2) + "\n")
     return written
-
-
-@torch.no_grad()
-def _write_ply(path: Path, trained: Trained, splats: Splats, time_s: float | None) -> None:
-    """The Gaussians as they are rendered at a moment; those whose emission depends on the view as the first camera sees them."""
-    module, scene = trained.module, trained.scene
-    first = scene.train.frames[0]
-    if time_s is None and first.time_s is not None:
-        start, span = scene.record
-        time_s = start + span / 2
-    frame = first if time_s is None else at_time(scene, first, time_s)
-    with module.showing(splats):
-        scales, opacities = module.smoothing(splats.scales, splats.opacities)
-        values = module.emissions(splats, replace(frame, camera=first.camera))[:, : module.thermal.modality_channels[0]]
-        temperature = None if time_s is None else module.thermal.temperature(splats, time_s)
-    write_splats(
-        path,
-        splats.means.cpu(),
-        scales.log().cpu(),
-        splats.quats.cpu(),
-        opacities[0].logit().clamp(-30, 30).cpu(),
-        values.clamp(0, 1).cpu(),
-        temperature_k=None if temperature is None else temperature.cpu(),
-    )

@@ -25,10 +25,10 @@ def checked_cameras(count: int) -> int:
     """The number of training cameras of a page.
 
     Raises:
-        SceneError: it is less than one; the page stands at the first when it opens.
+        SceneError: it is no whole number, or less than one; the page stands at the first when it opens.
     """
-    if count < 1:
-        raise SceneError(f"cameras: the page opens at a training camera, so at least 1, got {count}")
+    if not isinstance(count, int) or count < 1:
+        raise SceneError(f"cameras must be a whole number, 1 or more: the page opens at a training camera; got {count}")
     return count
 
 

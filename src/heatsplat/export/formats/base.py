@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.export.moment import Moment
 from heatsplat.io.pictures import colorize
 
@@ -66,7 +66,7 @@ def colours_of(moment: Moment, colormap: str | None, range_c: Sequence[float] | 
         if moment.seen.colours is None:
             raise SceneError("what.colormap=rgb: this method has no colours; give the name of a matplotlib map")
         return moment.seen.colours.numpy()
-    low, high = checked_range(range_c or moment.seen.limits)
+    low, high = checked_range(range_c) or moment.seen.limits
     try:
         colours = colorize(moment.values[:, None], low, high, colormap)
     except (KeyError, ValueError) as error:
@@ -80,10 +80,13 @@ def opacities_of(moment: Moment, colormap: str | None) -> Tensor:
     return moment.seen.opacities if own is None else own
 
 
-def checked_range(range_c: Sequence[float]) -> tuple[float, float]:
-    """Two increasing numbers. Raises SceneError where they are not."""
-    if len(range_c) != 2 or not range_c[0] < range_c[1]:
-        raise SceneError(f"what.range_c must be two increasing numbers, got {list(range_c)}")
+def checked_range(range_c: Sequence[float] | None, name: str = "what.range_c") -> tuple[float, float] | None:
+    """Two increasing numbers; None stays. Raises SceneError with the option's name where they are not."""
+    if range_c is None:
+        return None
+    check_numbers(name, range_c, 2, SceneError)
+    if not range_c[0] < range_c[1]:
+        raise SceneError(f"{name} must be two increasing numbers, got {list(range_c)}")
     return float(range_c[0]), float(range_c[1])
 
 

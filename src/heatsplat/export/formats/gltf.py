@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import heatsplat
-from heatsplat.export.formats.base import Format, colours_of, extra_columns, opacities_of
+from heatsplat.export.formats.base import Format, checked_range, colours_of, extra_columns, opacities_of
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import upright
 from heatsplat.geometry.spherical_harmonics import C0
@@ -37,7 +37,7 @@ class Gltf(Format):
     suffix = ".glb"
 
     def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, range_c
+        self.colormap, self.range_c = colormap, checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.numpy() for values in upright(moment))

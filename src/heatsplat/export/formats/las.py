@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneError, evenly_spread
-from heatsplat.export.formats.base import Format, colours_of, extra_columns, optional
+from heatsplat.contracts import SceneError, check_numbers, evenly_spread
+from heatsplat.export.formats.base import Format, checked_range, colours_of, extra_columns, optional
 from heatsplat.export.formats.mesh import look
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, place_of
@@ -43,8 +43,10 @@ class Las(Format):
         range_c: Sequence[float] | None = None,
         gps: str | None = AUTO,
     ) -> None:
+        check_numbers("what.least_opacity", least_opacity, error=SceneError)
         self.suffix = ".laz" if compressed else ".las"
-        self.least_opacity, self.colormap, self.range_c, self.gps = least_opacity, colormap, range_c, gps
+        self.least_opacity, self.colormap, self.gps = least_opacity, colormap, gps
+        self.range_c = checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         laspy = optional("laspy", "las")

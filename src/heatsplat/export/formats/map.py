@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
 from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_of
@@ -19,7 +19,7 @@ from heatsplat.export.seams import comparison, mosaic, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
 from heatsplat.io.pictures import write_png
-from heatsplat.shots import at_time, first_free_id, sightings
+from heatsplat.shots import at_time, checked_unseen, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
@@ -61,16 +61,17 @@ class Map(Format):
         uncertainty: bool = False,
         against: str | None = None,
     ) -> None:
+        for name, value, count in (("resolution", resolution, None), ("bounds", bounds, 4), ("above", above, 3)):
+            if value is not None:
+                check_numbers(f"what.{name}", value, count, SceneError)
         if resolution is not None and not resolution > 0:
             raise SceneError(f"what.resolution must be above 0, got {resolution}")
-        if bounds is not None and not (len(bounds) == 4 and bounds[0] < bounds[2] and bounds[1] < bounds[3]):
+        if bounds is not None and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
             raise SceneError(f"what.bounds must be [west, south, east, north], got {list(bounds)}")
-        if unseen not in ("nan", "keep"):
-            raise SceneError(f"what.unseen must be nan or keep, got '{unseen}'")
-        if above is not None and (len(above) != 3 or not any(above) or gps not in (None, AUTO)):
+        if above is not None and (not any(above) or gps not in (None, AUTO)):
             raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
-        self.resolution, self.bounds, self.gps, self.unseen = resolution, bounds, gps, unseen
-        self.uncertainty = uncertainty
+        self.resolution, self.bounds, self.gps, self.uncertainty = resolution, bounds, gps, uncertainty
+        self.unseen = checked_unseen("what.unseen", unseen)
         self.against = None if against is None else Path(against).expanduser()
         self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
 

@@ -47,8 +47,10 @@ class Mesh(Format):
     ) -> None:
         if mesh is None:
             raise SceneError("which mesh? Give what.mesh=FILE, in the coordinates of the scene")
+        if views is not None and not (isinstance(views, int) and views >= 1):
+            raise SceneError(f"what.views must be a whole number, 1 or more, or null for all, got {views}")
         self.mesh, self.views, self.two_sided = Path(mesh).expanduser(), views, two_sided
-        self.colormap, self.range_c = colormap, range_c
+        self.colormap, self.range_c = colormap, checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         trimesh = optional("trimesh", "mesh")
@@ -74,7 +76,7 @@ class Mesh(Format):
                 "the scene, and do its normals point outward (what.two_sided=true takes them as they are)?"
             )
         log.info("%d of %d vertices are seen by %d views", values.isfinite().sum(), len(points), len(looks))
-        colours = colorize(values[:, None], *checked_range(self.range_c or moment.seen.limits), self.colormap)[:, 0]
+        colours = colorize(values[:, None], *(self.range_c or moment.seen.limits), self.colormap)[:, 0]
         name = f"{moment.quantity}_c" if moment.seen.unit else moment.quantity
         kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4")]
         vertices = np.empty(len(points), dtype=kinds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from heatsplat.export.formats.base import Format, colours_of, extra_columns, opacities_of
+from heatsplat.export.formats.base import Format, checked_range, colours_of, extra_columns, opacities_of
 from heatsplat.export.moment import Moment
 from heatsplat.io.ply import write_splats
 from heatsplat.physics.units import kelvin
@@ -25,7 +25,7 @@ class Ply(Format):
     suffix = ".ply"
 
     def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, range_c
+        self.colormap, self.range_c = colormap, checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         seen = moment.seen

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heatsplat.export.formats.base import Format, colours_of, opacities_of
+from heatsplat.export.formats.base import Format, checked_range, colours_of, opacities_of
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import upright
 from heatsplat.geometry.spherical_harmonics import C0
@@ -32,7 +32,7 @@ class Spz(Format):
     suffix = ".spz"
 
     def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, range_c
+        self.colormap, self.range_c = colormap, checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.double().numpy() for values in upright(moment))
