@@ -233,12 +233,9 @@ def _job(
 
 def _prepare_machine(threads: int | None) -> None:
     """``prepare_machine``; raises SceneError for a number of threads that a machine like this one is not given."""
-    from heatsplat.contracts import SceneError
-    from heatsplat.runs.checks import MAX_THREADS_PER_CORE
+    from heatsplat.runs.checks import check_threads
 
-    most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
-    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
-        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+    check_threads(threads)
     prepare_machine(threads)
 
 

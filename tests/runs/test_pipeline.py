@@ -126,6 +126,7 @@ def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
         ("seed=abc", "seed must be a whole number, 0 or more, got abc"),
         ("max_steps=0", "max_steps must be"),
         ("threads=0", "threads must be 1 to"),
+        ("threads=abc", "threads must be 1 to .* got abc"),
         ("threads=5000", "threads must be 1 to .*, got 5000"),
         ("optim.means=-1e-3", "optim.means is a learning rate and must be 0 or more, got -0.001"),
         ("thermal.lr_initial=-1", "thermal.lr_initial is a learning rate"),

@@ -21,6 +21,13 @@ RATES = (
 MAX_THREADS_PER_CORE = 4  # more only wait for each other
 
 
+def check_threads(threads: int | None) -> None:
+    """Raises SceneError for a number of threads that a machine like this one is not given; None is all cores."""
+    most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
+    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
+        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+
+
 def checked(config: dict[str, Any]) -> dict[str, Any]:
     """The configuration with ``budget`` in seconds.
 
@@ -48,10 +55,7 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_ranges(config: Mapping[str, Any]) -> None:
-    most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
-    threads = config["threads"]
-    if threads is not None and not 1 <= threads <= most:
-        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+    check_threads(config["threads"])
     for key, least in (("max_steps", 1), ("seed", 0)):
         if not isinstance(config[key], int) or config[key] < least:
             raise SceneError(f"{key} must be a whole number, {least} or more, got {config[key]}")

@@ -31,7 +31,7 @@ from heatsplat.runs.lock import locked
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, filled
-from heatsplat.shots import at_time, first_free_id, sightings, warn_beyond_record
+from heatsplat.shots import UNSEEN, at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.loop import lean
 from heatsplat.training.machine import prepare_machine
@@ -41,7 +41,6 @@ from heatsplat.training.session import fit, restore, without_idle_hooks
 
 log = logging.getLogger("heatsplat")
 
-UNSEEN = ("nan", "keep")
 SMALL = 16  # pixels
 
 
