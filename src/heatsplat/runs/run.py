@@ -249,8 +249,8 @@ def load(
     scene_data = build(config["data"] | changed)
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
-    scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}))
     with _naming(checkpoint, changed):
+        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}))
         restore(module, scene_data, loaded)
         if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
             module.renderer.backend = "auto"
