@@ -128,9 +128,8 @@ class Meaning:
         """The calibration of floating-point images and a sentence about it. Raises SceneError where they may be kelvin."""
         if self.scale is not None or self.offset_c is not None:
             scale = 1.0 if self.scale is None else self.scale
-            offset = (
-                -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
-            )  # a scale alone is one of kelvin, as of counts
+            # A scale alone is one of kelvin, as of counts.
+            offset = -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
             return self.of_temperatures(scale, offset), f"floats: °C = {scale:g} * value {offset:+g}"
         finite = sample[np.isfinite(sample)]
         if finite.size and MAYBE_KELVIN[0] < np.median(finite) < MAYBE_KELVIN[1]:

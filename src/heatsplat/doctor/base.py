@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, View
-from heatsplat.effects.observations import Tracks, followed, tracks_of
+from heatsplat.effects.observations import Tracks, frames_to_follow, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -172,7 +172,7 @@ def material_of(scene: SceneData) -> Material:
     """What a doctor looks at of a scene: its training views."""
     frames = scene.train.frames
     points = None if "points_random" in scene.notes else scene.points
-    chosen = followed(frames, scene.points[:0] if points is None else points, MAX_FRAMES)
+    chosen = frames_to_follow(frames, scene.points[:0] if points is None else points, MAX_FRAMES)
     views = [scene.train[i] for i in chosen]
     kept = [(i, view) for i, view in zip(chosen, views, strict=True) if view.thermal is not None]
     shape = kept[0][1].thermal.shape[:2] if kept else (0, 0)

@@ -70,7 +70,7 @@ class Observations:
     Args:
         scene: where it comes from.
         frames: [F] of the images.
-        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES (``followed``).
+        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES (``frames_to_follow``).
         masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
         noise: standard deviation of the noise of a pixel, in image units.
@@ -109,7 +109,7 @@ class Observations:
 def observe(scene: SceneData) -> Observations:
     """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
     frames = scene.train.frames
-    chosen = followed(frames, scene.points, MAX_FRAMES)
+    chosen = frames_to_follow(frames, scene.points, MAX_FRAMES)
     views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
     nothing = torch.zeros(0, 1, 1)
     if not views:
@@ -148,7 +148,7 @@ def observe(scene: SceneData) -> Observations:
     return Observations(scene, tuple(view.frame for view in views), images, masks, times_s, noise, still, tracks, why)
 
 
-def followed(frames: Sequence[Frame], points: Tensor, limit: int) -> list[int]:
+def frames_to_follow(frames: Sequence[Frame], points: Tensor, limit: int) -> list[int]:
     """At most ``limit`` positions of frames through which points can be followed, in order.
 
     They are evenly spread. Where too few points are then seen often enough, as on a long flight, runs of frames that follow each

@@ -213,7 +213,7 @@ def load(
     output_dir: Path | str = ".",
     trust: Sequence[str] = (),
 ) -> Trained:
-    """The trained scene of a checkpoint.
+    """The trained scene of a checkpoint, on the clock and with the bounds of its run (``training.scales``).
 
     Args:
         checkpoint: such as outputs/<run>/checkpoints/last.ckpt.

@@ -140,6 +140,7 @@ class OnePassAdam(torch.optim.Adam):
                 kept.append(torch.linalg.vector_norm(parameter.detach().flatten(0, -2), dim=0))
                 norms, columns = kept[-1].data_ptr(), parameter.shape[-1]
             pulls = group["weight_decay"], group.get("group_penalty", 0.0)
+            # In the order of the columns of ``on_cuda.step``.
             rows.append((*places, norms, programs, count, columns, *rates, *pulls))
             counts.append(count)
             programs += on_cuda.blocks(count)

@@ -29,9 +29,8 @@ def find(material: Material) -> list[Finding]:
     light = torch.stack([_edges(photo.double().mean(2)) for photo in material.rgb])
     if heat.shape != light.shape:
         return found
-    shows = (heat.flatten(1).std(1) > 0) & (
-        light.flatten(1).std(1) > 0
-    )  # a closed shutter or a black photo says nothing
+    # A closed shutter or a black photo says nothing.
+    shows = (heat.flatten(1).std(1) > 0) & (light.flatten(1).std(1) > 0)
     heat, light = heat[shows], light[shows]
     if len(heat) < MIN_FRAMES:
         return found

@@ -1,4 +1,4 @@
-"""Frames that are looked at: evenly spread where points are seen again, else runs of frames that follow each other."""
+"""Frames that observations look at: evenly spread where points are seen again, else runs of frames that follow each other."""
 
 import torch
 
@@ -6,7 +6,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.doctor.base import material_of
 from heatsplat.doctor.examination import examine
 from heatsplat.effects.catalogue import decide
-from heatsplat.effects.observations import followed, observe
+from heatsplat.effects.observations import frames_to_follow, observe
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
 AHEAD = 0.1 * WIDTH / FOCAL  # of a flight at height 1: nine tenths of an image are in the next one
@@ -37,13 +37,13 @@ def flight(count: int) -> SceneData:
 
 def test_a_long_flight_is_followed_in_runs_and_a_short_one_or_an_orbit_is_not():
     long, short = flight(300), flight(40)
-    chosen = followed(long.train.frames, long.points, 64)
+    chosen = frames_to_follow(long.train.frames, long.points, 64)
     assert len(chosen) == 64 and chosen == sorted(set(chosen)) and chosen[0] == 0 and chosen[-1] == 299
     assert chosen[:16] == list(range(16)) and chosen[16] > 16
-    assert followed(short.train.frames, short.points, 64) == list(range(40))
+    assert frames_to_follow(short.train.frames, short.points, 64) == list(range(40))
     around = [long.train.frames[i % 5] for i in range(300)]  # whose points all frames see
-    assert followed(around, long.points[:200], 64)[:3] == [0, 5, 9]
-    assert followed(long.train.frames, long.points[:0], 64)[:3] == [0, 5, 9]
+    assert frames_to_follow(around, long.points[:200], 64)[:3] == [0, 5, 9]
+    assert frames_to_follow(long.train.frames, long.points[:0], 64)[:3] == [0, 5, 9]
 
 
 def test_points_of_a_long_flight_are_tracked_and_all_of_its_frames_count():
