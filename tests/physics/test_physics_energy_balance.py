@@ -4,11 +4,12 @@ import math
 from dataclasses import replace
 from itertools import product
 
+import mpmath
 import pytest
 import torch
 
 from heatsplat.physics import marching
-from heatsplat.physics.energy_balance import Climate, Core, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate, Core, Drivers, Surface, power_excess
 from heatsplat.physics.wetness import wet_share, wetted
 from tests.physics.weather_reference import drivers, solved
 
@@ -57,6 +58,32 @@ def test_corrected_physics_is_exact_to_a_millikelvin_from_sheet_metal_to_wet_gro
     linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
     assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
     assert linear[3] < 1.0
+
+
+def test_gusts_after_a_calm_are_those_of_a_stiff_solver():
+    """Air that hardly moves and then does within ten minutes, on bodies that follow it within one."""
+    given = drivers(days=0.25)
+    wind = torch.full_like(given.air, 0.05)
+    wind[[6, 20, 21]] = 10.0  # m/s
+    climate = Climate(replace(given, wind_anomaly=wind / wind.mean() - 1))
+    surface = bodies(wind=True)._replace(
+        log_rate=-tensor(10.0, 30.0, 120.0, 600.0).log(), wind=tensor(0.95, 0.6, 0.8, 0.95)
+    )
+    moments = torch.arange(0.0, 21_601.0, 150.0, dtype=torch.float64)
+    found = marching.march(climate, surface, moments, sensitive=False)[..., 0].T
+    assert (found - solved(climate.drivers, surface, moments)).abs().max() < 0.005
+
+
+def test_slow_bodies_lose_nothing_between_samples_a_second_apart():
+    given = drivers(days=0.1, step_s=1.0)
+    climate = Climate(given)
+    surface = bodies(wind=True)._replace(log_rate=tensor(1e-7, 3e-7, 1e-6, 1e-4).log())
+    last = given.times_s[-1:]
+    exact = marching.march(climate, surface, last, sensitive=False)
+    assert (exact[0, :, 0] - surface.start)[0].abs() > 0.005  # the slowest has moved, by 1e-6 K a second
+    single = Surface(*(x if x is None else x.float() for x in surface[: len(BODY)]))
+    found = marching.march(climate, single, last, sensitive=False)
+    torch.testing.assert_close(found.double(), exact, atol=2e-5, rtol=0)
 
 
 def rained_on() -> Climate:
@@ -321,3 +348,50 @@ def test_heat_from_within_is_a_driver_that_never_changes(climate, semi_infinite)
     if semi_infinite:
         with pytest.raises(ValueError, match="bodies without an end are solved about a mean only"):
             there.stepped_temperature(heated, 3600.0)
+
+
+def at_rest(semi_infinite: bool) -> Climate:
+    """A day on which nothing happens, so that bodies lose what they start with."""
+    times = tensor(0, 43200, 86400)
+    return Climate(Drivers(times, 290.0, torch.zeros_like(times)), semi_infinite)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_slope_of_what_bodies_without_an_end_keep_has_all_digits(dtype):
+    """x² = a t, of which e^{x²} erfc(x) is kept; its slope is the difference of two numbers that agree in most digits."""
+    x = torch.tensor([1e-3, 0.3, 3.0, 10.0, 49.0, 51.0, 294.0, 1776.0, 1e5], dtype=torch.float64)
+    log_rate = (x.square() / 86400.0).log().to(dtype).requires_grad_()
+    kept = at_rest(True).linear_temperature(Surface(torch.ones_like(log_rate), log_rate, None), 86400.0)
+    kept.sum().backward()
+    with mpmath.workdps(60):
+        exact = [mpmath.sqrt(mpmath.exp(mpmath.mpf(rate)) * 86400) for rate in log_rate.tolist()]
+        slopes = [float(y / 2 * (2 * y * erfcx(y) - 2 / mpmath.sqrt(mpmath.pi))) for y in exact]
+        values = [float(erfcx(y)) for y in exact]
+    rtol = {torch.float32: 2e-6, torch.float64: 1e-11}[dtype]  # the type's rounding of log a, times 10
+    torch.testing.assert_close(kept.detach(), torch.tensor(values, dtype=dtype), rtol=rtol, atol=0)
+    torch.testing.assert_close(log_rate.grad, torch.tensor(slopes, dtype=dtype), rtol=rtol, atol=0)
+
+
+def erfcx(x):
+    """e^{x²} erfc(x) in mpmath; by its continued fraction where e^{x²} is too large."""
+    if x < 20:
+        return mpmath.exp(x * x) * mpmath.erfc(x)
+    below = x
+    for k in range(60, 0, -1):
+        below = x + mpmath.mpf(k) / 2 / below
+    return 1 / (mpmath.sqrt(mpmath.pi) * below)
+
+
+@pytest.mark.parametrize("coupling", [1.0, 1e4, 1e8, 1e12])
+def test_float32_knows_how_slowly_a_tightly_coupled_core_cools(coupling):
+    """s beside κ, which one minus a share of κ would lose; against the two roots in 60 digits."""
+    rate, behind = torch.tensor([1e-3]).log(), torch.tensor([1e-5 * coupling]).log()
+    core = Core(torch.ones(1), behind, torch.tensor([coupling]))
+    found = at_rest(False).linear_temperature(Surface(torch.ones(1), rate, None, core=core), 86400.0)
+    with mpmath.workdps(60):
+        r, mu = (mpmath.exp(log.item()) for log in (rate, behind))
+        half = (r * (1 + core.coupling.item()) + mu) / 2
+        root = mpmath.sqrt(half**2 - r * mu)
+        slow = (half + root - r) / (2 * root)  # share of what cools slowly, from x' = -r at the beginning
+        kept = slow * mpmath.exp((root - half) * 86400) + (1 - slow) * mpmath.exp((-half - root) * 86400)
+    assert found.item() == pytest.approx(float(kept), rel=1e-5)

@@ -21,6 +21,10 @@ BLOCK = 64  # Gaussians per parallel task
 SERIES_BELOW = 0.5  # of y: seven terms then leave 1e-9, and the plain quotients would cancel for small y
 SUBSTEPS = 8  # of an interval between samples, at most: of bodies that settle within it
 STEP = 0.35  # of y that one substep covers, if they suffice
+GUSTS = 32  # substeps at most where the exchange with the air changes while bodies settle
+BEND = 26.0  # of those, where its fourth root doubles; it then changes by 0.15 of itself in a substep
+SETTLING = 4.0  # y of an interval beyond STEP from which on they are needed in full
+CALM = 1e-3  # exchange below which its changes do not count
 FORGOTTEN = 1e-20  # share of the start that counts as none
 
 # Rows of the drivers of ``march``; those of effects that are off are not read.
@@ -215,6 +219,12 @@ def weights_of_lanes(y):
 
 
 @inline
+def _powers(a, b):
+    """(a⁴ - b⁴) / (a - b), without the difference."""
+    return (a + b) * (a * a + b * b)
+
+
+@inline
 def _bent(balance, second, third, c_d, air_d, x_d, p, steep, w_d):
     """What a substep adds for products of exchange and air, of exchange and x, and for T⁴, by changes over the substep."""
     rest, bent = x_d * 0.0, 2.0 * third
@@ -326,6 +336,7 @@ def _march_group(
         column = normal_column(balance)
         f = load_vector(body, column + 3)
         nx, ny, nz = load_vector(body, column), load_vector(body, column + 1), load_vector(body, column + 2)
+    lost, lost_y = nothing, nothing
     still = nothing, nothing
     d_start, d_rate, d_share, d_sun, d_wind = (one, nothing), still, still, still, still
     d_inner, d_core, d_slower, d_coupling = still, (nothing, one), still, still
@@ -338,7 +349,7 @@ def _march_group(
         if aside:
             ending = (moments[moment] - times[k]) / interval
         seconds = interval * ending
-        kept = x, y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling
+        kept = x, y, lost, lost_y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling
         # Drivers at its beginning, and what they change until its end.
         air_1, air_d = drivers[AIR, k], ending * (drivers[AIR, k + 1] - drivers[AIR, k])
         wind_1, wind_d, sky_1, sky_d, sun_1, sun_d = 0.0, 0.0, nothing, nothing, nothing, nothing
@@ -374,15 +385,39 @@ def _march_group(
                     beam, beam_2 = beam * load_vector(lit, slots[k]), beam_2 * load_vector(lit, slots[k + 1])
                 sun_1, sun_d = sun_1 + beam, sun_d + beam_2
             sun_d = ending * (sun_d - sun_1)
-        substeps = minimum(1.0 + floor(r * fastest * (seconds / STEP)), SUBSTEPS)
+        settled = r * fastest * seconds
+        settles = settled > STEP
+        substeps = minimum(1.0 + floor(settled * (1.0 / STEP)), SUBSTEPS)
+        root, root_d, whole = one, nothing, one * 4.0
+        if changing(balance) and bits(settles) != 0:
+            # Of a body that follows at once, a substep errs by the square of what exchange changes in it: substeps are even
+            # in its fourth root, near enough to its logarithm.
+            exchange, exchange_2 = one, one
+            if windy(balance):
+                exchange, exchange_2 = 1.0 + v * wind_1, 1.0 + v * (wind_1 + wind_d)
+            if wetted(balance):
+                exchange, exchange_2 = exchange * wet_1, exchange_2 * (wet_1 + wet_d)
+            if radiates(balance):
+                exchange, exchange_2 = (1.0 - p) * exchange + p * steep, (1.0 - p) * exchange_2 + p * steep
+            if heated(balance):
+                exchange, exchange_2 = exchange + leak, exchange_2 + leak
+            root = select(settles, sqrt(sqrt(maximum(exchange, CALM))), one)
+            root_d = select(settles, sqrt(sqrt(maximum(exchange_2, CALM))) - root, nothing)
+            whole = _powers(root + root_d, root)
+            folds = maximum(root_d, -root_d) / minimum(root, root + root_d)
+            settling = minimum(maximum(settled - STEP, 0.0) * (1.0 / SETTLING), 1.0)
+            substeps = maximum(substeps, minimum(1.0 + floor(BEND * folds * settling), GUSTS))
         share = 1.0 / substeps
         passed, rh = nothing, r * share * seconds
-        for substep in range(SUBSTEPS):
+        for substep in range(GUSTS):
             going = substeps > substep
             if bits(going) == 0:
                 break
             # Linear part: the slope of w here, and the wind halfway.
-            later = passed + share
+            later = share * (substep + 1)
+            if changing(balance):
+                later = later * _powers(root + later * root_d, root) / whole
+                rh = r * (later - passed) * seconds
             air, air_2, c, c_2 = air_1 + passed * air_d, air_1 + later * air_d, one, one
             w, steep, sky, sky_2, sun, sun_2 = nothing, nothing, nothing, nothing, nothing, nothing
             wind, wind_2 = nothing, nothing
@@ -409,22 +444,29 @@ def _march_group(
             follows = slower * (x - y)
             if cored(balance):
                 force, ahead = force - coupling * (x - y), ahead - coupling * (x - y)
-            new, new_y = x + rh * (phi[0] * force + second[0] * (ahead - force)), y
+            added, added_y = rh * (phi[0] * force + second[0] * (ahead - force)), nothing
             if cored(balance):
-                new = new + rh * phi[2] * follows
-                new_y = y + rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
+                added = added + rh * phi[2] * follows
+                added_y = rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
             w_2 = w
             if changing(balance) or radiates(balance):
                 # What is not linear in time or in x: the products of exchange and air, and of exchange and x, and T⁴.
-                linear, w_2 = new, w
+                linear, w_2 = added, w
                 if radiates(balance):
-                    w_2, _ = power(new, inverse)
-                new = new + rh * _bent(
-                    balance, second[0], third[0], c_2 - c, air_2 - air, linear - x, p, steep, w_2 - w
+                    w_2, _ = power(x + added, inverse)
+                added = added + rh * _bent(
+                    balance, second[0], third[0], c_2 - c, air_2 - air, linear, p, steep, w_2 - w
                 )
                 if cored(balance):
-                    rest = _bent(balance, second[1], third[1], c_2 - c, air_2 - air, linear - x, p, steep, w_2 - w)
-                    new_y = new_y + rh * rest
+                    rest = _bent(balance, second[1], third[1], c_2 - c, air_2 - air, linear, p, steep, w_2 - w)
+                    added_y = added_y + rh * rest
+            # What digits of x do not hold is added with the next substep (Kahan 1965): between samples a second apart a wall
+            # changes by less than they show.
+            added, added_y = added + lost, added_y + lost_y
+            new, new_y = x + added, y + added_y
+            lost = select(going, added - (new - x), lost)
+            if cored(balance):
+                lost_y = select(going, added_y - (new_y - y), lost_y)
             if sensitive(balance):
                 # The linearised balance, along the trajectory from its beginning to its end. Decays at the slope of its
                 # beginning, which takes 0.2 % from what derivatives are, and no second exponential.
@@ -510,7 +552,7 @@ def _march_group(
         if ending == 1.0:
             k += 1
         else:
-            x, y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling = kept
+            x, y, lost, lost_y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling = kept
 
 
 @kernel

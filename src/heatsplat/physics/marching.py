@@ -7,8 +7,10 @@ a temperature is a sum of few products. Who looks keeps the state at samples of 
 on from the sample before it.
 
 **Error:** 0.2 mK against a stiff solver at the parameters that were marched, from sheet metal to wet ground under weather
-every ten minutes. Between marches it is of second order in the change of parameters, 1.7 mK (root mean square) at 2 % of all
-of them and 10 mK at 5 %; ``Kept`` marches anew what has moved by more than CHANGE.
+every ten minutes; 2 mK where a gust of 10 m/s ends a calm between two samples, and up to 30 mK of bodies that follow air within
+a minute and hardly radiate, under gusts three hours apart. In float32 as in float64, with samples a second apart, too. Between
+marches it is of second order in the change of parameters, 1.7 mK (root mean square) at 2 % of all of them and 10 mK at 5 %;
+``Kept`` marches anew what has moved by more than CHANGE.
 """
 
 from __future__ import annotations
