@@ -265,8 +265,16 @@ def _expected(error: BaseException) -> BaseException | None:
             return error
         if isinstance(error, OSError) and error.errno in NO_PLACE:
             return error
+        if isinstance(error, ValueError) and _raised_here(error):  # of a setting, once the scene is known
+            return error
         error = error.__cause__
     return None
+
+
+def _raised_here(error: BaseException) -> bool:
+    """Whether code of this package raised an error, and not a library that it called."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return bool(frames) and frames[-1].f_globals.get("__name__", "").startswith(("heatsplat.", "datamodules."))
 
 
 @_command

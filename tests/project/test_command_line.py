@@ -210,6 +210,12 @@ def test_a_group_set_to_null_is_told_its_options(tmp_path):
     assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
 
 
+def test_a_value_that_only_a_scene_shows_to_be_wrong_is_told_in_a_sentence(tmp_path):
+    output = command("train", "method=etgs", *TINY, "thermal.frequencies=-1", "hydra.run.dir=run", cwd=tmp_path, code=1)
+    assert "frequencies must be a whole number of at least 0, got -1" in output and "Traceback" not in output
+    assert "Traceback" in (tmp_path / "run" / "FAILED").read_text()
+
+
 def test_results_stay_those_of_their_settings(finished):
     before = {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     told = command("train", "method=etgs", *TINY, "optim.means=1e-3", f"hydra.run.dir={finished}", cwd=finished, code=1)

@@ -130,6 +130,8 @@ def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
         ("threads=5000", "threads must be 1 to .*, got 5000"),
         ("optim.means=-1e-3", "optim.means is a learning rate and must be 0 or more, got -0.001"),
         ("thermal.lr_initial=-1", "thermal.lr_initial is a learning rate"),
+        ("loss.terms.photometric.dssim_weight=-0.1", "loss.terms.photometric.dssim_weight is a weight in the loss"),
+        ("thermal.source_penalty=-1e-3", "thermal.source_penalty is a weight in the loss and must be 0 or more"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(override, told):

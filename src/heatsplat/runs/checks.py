@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -18,6 +19,7 @@ RATES = (
     "quats",
     "opacity_logits",
 )  # learning rates in the group "optim"; elsewhere they are lr, lr_*
+WEIGHTS = ("weight", "_l2", "_penalty")  # endings of the names of weights; "weights" holds more of them
 MAX_THREADS_PER_CORE = 4  # more only wait for each other
 
 
@@ -62,6 +64,11 @@ def _check_ranges(config: Mapping[str, Any]) -> None:
     for key, rate in _rates(config):
         if isinstance(rate, int | float) and not rate >= 0:
             raise SceneError(f"{key} is a learning rate and must be 0 or more, got {rate}")
+    for key, weight in _weights_in({group: config[group] for group in ("thermal", "sensor", "loss")}):
+        if isinstance(weight, int | float) and not 0 <= weight < math.inf:
+            raise SceneError(
+                f"{key} is a weight in the loss and must be 0 or more, or training makes worse what it weighs, got {weight}"
+            )
 
 
 def _rates(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -77,6 +84,16 @@ def _rates_in(settings: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any
             yield from _rates_in(value, f"{path}.{name}")
         elif str(name) == "lr" or str(name).startswith("lr_"):
             yield f"{path}.{name}", value
+
+
+def _weights_in(settings: Mapping[str, Any], path: str = "", weighs: bool = False) -> Iterator[tuple[str, Any]]:
+    """Weights of loss terms, penalties and priors with their dotted keys: those that are called so."""
+    for name, value in settings.items():
+        key = f"{path}.{name}".removeprefix(".")
+        if isinstance(value, Mapping):
+            yield from _weights_in(value, key, weighs=name == "weights")
+        elif weighs or str(name).endswith(WEIGHTS):
+            yield key, value
 
 
 def _check_machine(config: Mapping[str, Any]) -> None:
