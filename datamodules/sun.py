@@ -26,7 +26,7 @@ class Site:
 
     Args:
         latitude: degrees north of the equator.
-        longitude: degrees east of Greenwich.
+        longitude: degrees east of Greenwich, from -180 to 360; kept as -180 to below 180.
         altitude_m: above the sea.
         up, north: directions in the world's axes, of any length; by default z is up, y north and so x east (ENU).
     """
@@ -41,8 +41,10 @@ class Site:
         if not (-90.0 <= self.latitude <= 90.0 and -180.0 <= self.longitude <= 360.0):
             raise SceneError(
                 f"data.latitude={self.latitude} and data.longitude={self.longitude} (or those of meta.json) are no place "
-                "on earth: degrees north (-90 to 90) and degrees east (-180 to 180) are needed"
+                "on earth: degrees north (-90 to 90) and degrees east (-180 to 360) are needed"
             )
+        if self.longitude >= 180.0:  # pvlib's map of turbidity ends there
+            object.__setattr__(self, "longitude", self.longitude - 360.0)
         self.axes()
 
     def axes(self) -> np.ndarray:

@@ -227,10 +227,20 @@ def test_world_axes_turn_the_sun():
     assert turned == pytest.approx(np.stack([north, up, east], axis=1))
 
 
+@pytest.mark.parametrize(("east", "west"), [(210.0, -150.0), (180.0, -180.0), (360.0, 0.0)])
+def test_longitudes_are_counted_on_around_the_earth(east, west):
+    when = MIDNIGHT_S + 3600.0 * np.arange(24)
+    light = clear_sky(Site(20.0, east), when)
+    assert light.max() > 500.0
+    assert np.array_equal(light, clear_sky(Site(20.0, west), when))
+    assert np.array_equal(sun_directions(Site(20.0, east), when), sun_directions(Site(20.0, west), when))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"latitude": 95.0}, "latitude=95.0 and data.longitude=9.0 .* are no place"),
+        ({"longitude": 361.0}, "longitude=361.0 .* are no place .*-180 to 360"),
         ({"north": (0.0, 0.0, 2.0)}, "data.north=.* points up"),
         ({"up": (0.0, 0.0, 0.0)}, "data.up and data.north are three numbers"),
     ],

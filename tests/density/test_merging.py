@@ -110,6 +110,16 @@ def test_temperatures_that_cross_are_not_merged(module):
         assert len(level.splats) == left
 
 
+def test_a_gaussian_that_is_never_shown_is_not_merged_into_one_that_is(module):
+    """It has a zero quaternion, which says nothing of how it lies."""
+    pair = {name: module.splats[name].detach()[[0, 0]] for name in module.splats.names}
+    for hidden, left in ((False, 1), (True, 2)):
+        pair["quats"][0] = torch.tensor([0.0 if hidden else 1.0, 0.0, 0.0, 0.0])
+        with module.showing(Splats(pair)):
+            level = next(FlatMerging(tolerance_c=40.0).levels(module, [40.0]))
+        assert len(level.splats) == left
+
+
 def test_options_out_of_range_are_refused():
     for options in ({"tolerance_c": 0.0}, {"share": 0.6}, {"views": 0}, {"neighbours": 0}):
         with pytest.raises(ValueError, match=r"merge\."):

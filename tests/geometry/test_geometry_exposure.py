@@ -43,3 +43,15 @@ def test_a_roof_keeps_the_light_from_above_and_not_from_the_side():
     # Light that comes in from the open side at 37 degrees reaches the floor beside the edge.
     assert (lit[(ground[:, 0] > 0.0) & (ground[:, 0] > 0.99), 1] == 1).all() and lit[:, 1].mean() > lit[:, 0].mean()
     assert lit_beside(ground, around, torch.zeros(0, 3, dtype=torch.float64)).shape == (400, 0)
+
+
+def test_points_that_occur_twice_and_one_far_away_hide_nothing_more():
+    """Cells as small as nothing, or all those between here and far away, would take more memory than there is."""
+    points = torch.rand(600, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    ways = sky_directions(16, UP)
+    lit = lit_beside(points, points, ways)
+    assert 0.3 < lit.mean() < 0.7
+    assert torch.equal(lit_beside(points, points.repeat(2, 1), ways), lit)
+    far = torch.tensor([[4.2e10, 0.0, 1.0]], dtype=torch.float64)
+    assert (lit_beside(points, torch.cat([points, far]), ways).mean(0) - lit.mean(0)).abs().max() < 0.1
+    assert (lit_beside(points[:1], points[:1].expand(5, 3), ways) == 1).all()  # nowhere else is anything

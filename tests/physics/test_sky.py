@@ -33,6 +33,18 @@ def test_the_laws_of_moist_skies_agree_within_what_they_were_fitted_to():
     torch.testing.assert_close(swinbank, 0.0552 * AIR_K**1.5)
 
 
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "swinbank"])
+@pytest.mark.parametrize("air_c", [-40.0, 0.0, 40.0])
+def test_the_drier_the_air_the_colder_the_sky_down_to_none_that_a_station_tells(law, air_c):
+    """Stations round to whole per cent, so that dry air has a humidity of 0."""
+    humidity = torch.linspace(0.0, 100.0, 201, dtype=torch.float64)
+    air_k = torch.full_like(humidity, air_c + KELVIN_AT_0_C)
+    sky_k = sky_temperature_k(air_k, humidity, law)
+    assert (sky_k.diff() >= 0).all()
+    assert 0.65 < sky_k[0] / air_k[0] < 0.9
+    assert sky_k[0] == sky_temperature_k(air_k[0], torch.tensor(1.0, dtype=torch.float64), law)
+
+
 def test_what_is_missing_or_unknown_is_named():
     with pytest.raises(ValueError, match="needs the humidity; without it there is swinbank"):
         sky_temperature_k(AIR_K, None, "brunt")

@@ -1,5 +1,7 @@
 """A response that never falls and keeps its ends: against differences, for any of its curves."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -68,3 +70,15 @@ def test_channels_are_bent_one_by_one():
         part.rises.copy_(torch.tensor([1.0, -1.0, 0.5]))
     frame = Frame("0.png", 0, CAMERA)
     assert torch.equal(part(colours, frame), torch.cat([part(colours[..., i : i + 1], frame) for i in range(3)], 2))
+
+
+def test_a_piece_that_is_all_but_level_is_pulled_back():
+    """Its slope underflows; the logarithm is that of the free numbers, -150 and what the others sum up to."""
+    part = MonotoneResponse(pieces=4, weight=1.0)
+    rises = torch.tensor([0.0, -60.0, -150.0, 3.0])
+    with torch.no_grad():
+        part.rises.copy_(rises)
+    logarithms = rises.double() - rises.double().logsumexp(0) + math.log(4)
+    assert part.regulariser().item() == pytest.approx(logarithms.square().mean().item(), rel=1e-6)
+    part.regulariser().backward()
+    assert part.rises.grad.isfinite().all() and part.rises.grad[2] < 0

@@ -11,7 +11,7 @@ from heatsplat.thermal.band_scale import BandScale
 
 
 class Known:
-    def __init__(self, low, high, ambient):
+    def __init__(self, low, high, ambient=None):
         self.name, self.ambient_c = "known", ambient
         self.thermal_range = None if low is None else ThermalRange(low, high)
 
@@ -31,6 +31,43 @@ def test_roots_are_those_of_plancks_radiance_and_come_back(low, high, ambient):
         assert scale.root_of(there).item() == pytest.approx(exact.item(), abs=2e-7)
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "margin", "band", "degree"),
+    [
+        (23.0, 63.0, 0.25, (7.5, 13.5), 12),
+        (0.0, 100.0, 0.25, (3.0, 5.0), 12),
+        (-40.0, 560.0, 0.25, (7.5, 13.5), 16),
+        (-20.0, 350.0, 0.25, (3.0, 5.0), 16),
+        (0.0, 2000.0, 0.25, (3.0, 5.0), 20),
+        (0.0, 2000.0, 0.25, (7.5, 14.0), 16),
+        (300.0, 1500.0, 0.25, (0.9, 1.7), 16),
+    ],
+)
+def test_curves_are_as_exact_and_of_as_low_a_degree_in_any_band_and_range(low, high, margin, band, degree):
+    scale, law = BandScale(*band, margin=margin), Band(*band)
+    scale.prepare(Known(low, high))
+    assert max(len(scale.of_values), len(scale.of_roots)) == degree + 1
+    values = torch.linspace(*scale.values.tolist(), 2003, dtype=torch.float64, requires_grad=True)
+    temperatures = kelvin(low + (high - low) * values)
+    exact = (law.radiance(temperatures) / law.radiance(torch.tensor([kelvin(high)], dtype=torch.float64))) ** 0.25
+    (slopes,) = torch.autograd.grad(exact.sum(), values)
+    roots = scale.root_of(values)
+    assert ((roots - exact) / slopes).abs().max() < 1e-7
+    assert (scale.value_of(exact) - values).abs().max() < 1e-7
+    (own,) = torch.autograd.grad(roots.sum(), values)
+    assert ((own - slopes) / slopes).abs().max() < 1e-4
+    single = values.detach().float()
+    assert (scale.value_of(scale.root_of(single)) - single).abs().max() < 5e-6
+
+
+@pytest.mark.parametrize(("low", "high", "band"), [(0.0, 2000.0, (0.9, 1.7)), (0.0, 100.0, (0.01, 0.02))])
+def test_a_range_that_no_curve_follows_is_refused_by_name(low, high, band):
+    with pytest.raises(
+        SceneError, match=rf"band of {band[0]} to {band[1]} µm from .* to .* °C, the range of scene 'known'"
+    ):
+        BandScale(*band, margin=0.25).prepare(Known(low, high))
+
+
 def test_float32_loses_no_more_than_its_digits():
     scale = BandScale()
     scale.prepare(Known(23.0, 63.0, 22.0))
@@ -43,9 +80,11 @@ def test_a_scene_without_temperatures_is_told_what_to_do():
         BandScale().prepare(Known(None, None, None))
 
 
-def test_curves_travel_with_the_model():
+@pytest.mark.parametrize("wide", [False, True])
+def test_curves_travel_with_the_model(wide):
     fitted, other = BandScale(), BandScale()
-    fitted.prepare(Synthetic(scene="static", size="tiny", frames=3).scene)
+    fitted.prepare(Known(-100.0, 2000.0) if wide else Synthetic(scene="static", size="tiny", frames=3).scene)
     other.load_state_dict(fitted.state_dict())
     values = torch.rand(9, dtype=torch.float64)
     assert torch.equal(fitted.root_of(values), other.root_of(values))
+    assert torch.equal(fitted.value_of(values), other.value_of(values))

@@ -17,20 +17,26 @@ KEPT = ((1, 2), (0, 2), (0, 1))  # axes that are left of a shape seen along each
 
 @dataclass(frozen=True)
 class Shapes:
-    """n Gaussians: means [n, 3], covariances [n, 3, 3] and opacities [n, M], float64."""
+    """n Gaussians: means [n, 3], axes [n, 3, 3] and opacities [n, M], float64.
+
+    Axes stand in columns, perpendicular to each other and as long as the standard deviation along them. Covariances, of which
+    they are a root, hold their squares: of a needle, all digits of its width would be lost beside its length.
+    """
 
     means: Tensor
-    covariances: Tensor
+    axes: Tensor
     opacities: Tensor
 
     @classmethod
     def of(cls, splats: Splats) -> Shapes:
-        """Those of splats, as they are stored."""
-        axes = quats_to_matrices(splats.quats.detach().double()) * splats.scales.detach().double()[:, None]
-        return cls(splats.means.detach().double(), axes @ axes.mT, splats.opacities.detach().double().T)
+        """Those of splats, as they are stored. One with a zero quaternion, which renderers do not show, has no size."""
+        quats = splats.quats.detach().double()
+        sizes = splats.scales.detach().double() * quats.any(dim=1, keepdim=True)
+        axes = quats_to_matrices(quats) * sizes[:, None]
+        return cls(splats.means.detach().double(), axes, splats.opacities.detach().double().T)
 
     def __getitem__(self, ids: Tensor) -> Shapes:
-        return Shapes(self.means[ids], self.covariances[ids], self.opacities[ids])
+        return Shapes(self.means[ids], self.axes[ids], self.opacities[ids])
 
     @property
     def masses(self) -> Tensor:
@@ -38,9 +44,8 @@ class Shapes:
 
         The volume of a flat Gaussian says nothing of how much of an image it covers, and may be zero.
         """
-        first = self.covariances.diagonal(dim1=1, dim2=2).sum(1).square()
-        minors = (first - self.covariances.square().sum((1, 2))) / 2  # trace of the adjugate
-        return self.opacities.mean(1) * minors.clamp(min=0).sqrt()
+        a, b, c = self.axes.square().sum(1).unbind(1)
+        return self.opacities.mean(1) * (a * b + b * c + c * a).sqrt()
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class Merged:
         variances: [n, 3] along them.
         shares: [n] weight of the first of the pair in every mean, in [0, 1].
         distances: [n] squared difference of the two alphas and the merged one, integrated over the plane, by that of the two
-            alphas squared; mean over three directions of view. 0 where nothing changes.
+            alphas squared; mean over three directions of view. 0 where nothing changes, inf where one of the pair has no size.
     """
 
     shapes: Shapes
@@ -88,19 +93,21 @@ def merged(first: Shapes, second: Shapes) -> Merged:
     shares = (masses[0] / masses.sum(0)).nan_to_num(0.5)
     near, far = shares[:, None], 1 - shares[:, None]
     means = near * first.means + far * second.means
-    covariances = torch.zeros_like(first.covariances)
-    for share, one in ((near, first), (far, second)):
-        off = one.means - means
-        covariances += share[..., None] * (one.covariances + off[:, :, None] * off[:, None])
-    variances, axes = torch.linalg.eigh(covariances)
-    variances = variances.clamp(min=torch.finfo(torch.float32).tiny)
+    spread = [  # columns, whose products with themselves add up to the covariance
+        share.sqrt()[..., None] * torch.cat([one.axes, (one.means - means)[..., None]], dim=2)
+        for share, one in ((near, first), (far, second))
+    ]
+    axes, deviations, _ = torch.linalg.svd(torch.cat(spread, dim=2), full_matrices=False)
+    variances = deviations.square().clamp(min=torch.finfo(torch.float32).tiny)
+    shape = axes * variances.sqrt()[:, None]
 
-    turned = [axes.mT @ one.covariances @ axes for one in (first, second)]
-    turned.append(torch.diag_embed(variances))
+    turned = [axes.mT @ one.axes for one in (first, second)]
+    turned.append(torch.diag_embed(variances.sqrt()))
     places = [(axes.mT @ (one - means)[..., None]).squeeze(-1) for one in (first.means, second.means, means)]
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    products = {pair: _products(*(turned[i] for i in pair), places[pair[0]] - places[pair[1]]) for pair in pairs}
-    areas = [_areas(turned[i]) for i in range(3)]
+    own = [_mixed(one, one) / 2 for one in turned]
+    products = {(i, j): _products(turned[i], turned[j], own[i], own[j], places[i] - places[j]) for i, j in pairs}
+    areas = [2 * math.pi * determinants.sqrt() for determinants in own]  # ∫ exp(-x² / 2) over the plane
 
     o1, o2 = first.opacities, second.opacities
     covered = o1 * _total(areas[0]) + o2 * _total(areas[1]) - o1 * o2 * _total(products[0, 1])
@@ -109,7 +116,9 @@ def merged(first: Shapes, second: Shapes) -> Merged:
     squares = a * a * products[0, 0] + b * b * products[1, 1] + 2 * a * b * products[0, 1]
     change = squares + c * c * products[2, 2] - 2 * a * c * products[0, 2] - 2 * b * c * products[1, 2]
     distances = (change.sum(1) / squares.sum(1)).clamp(min=0).nan_to_num(torch.inf)
-    return Merged(Shapes(means, covariances, opacities), axes, variances, shares, distances)
+    shown = first.axes.any(2).any(1) & second.axes.any(2).any(1)
+    distances = torch.where(shown, distances, torch.inf)
+    return Merged(Shapes(means, shape, opacities), axes, variances, shares, distances)
 
 
 def _total(seen: Tensor) -> Tensor:
@@ -117,27 +126,14 @@ def _total(seen: Tensor) -> Tensor:
     return seen.sum(1, keepdim=True)
 
 
-def _determinants(covariances: Tensor) -> Tensor:
-    """Those of 2 x 2 covariances seen along each axis, [n, 3]."""
-    found = [covariances[:, i, i] * covariances[:, j, j] - covariances[:, i, j] * covariances[:, j, i] for i, j in KEPT]
-    return torch.stack(found, dim=1).clamp(min=0)
+def _mixed(one: Tensor, other: Tensor) -> Tensor:
+    """Of two sets of axes [n, 3, 3], what the determinant of the sum of their 2 x 2 covariances, seen along each axis, has beside
+    those of either, [n, 3]: a sum of squares, of which nothing cancels (Cauchy and Binet). Of a set with itself twice its own."""
+    return torch.linalg.cross(one[:, :, :, None], other[:, :, None], dim=1).square().sum((2, 3))
 
 
-def _areas(covariances: Tensor) -> Tensor:
-    """∫ exp(-x² / 2) over the plane, seen along each axis, [n, 3]."""
-    return 2 * math.pi * _determinants(covariances).sqrt()
-
-
-def _products(one: Tensor, other: Tensor, offset: Tensor) -> Tensor:
-    """∫ of the product of two Gaussians of peak 1 over the plane, seen along each axis, [n, 3]."""
-    both = one + other
-    found = []
-    for i, j in KEPT:
-        x, y = offset[:, i], offset[:, j]
-        squares = both[:, j, j] * x * x - 2 * both[:, i, j] * x * y + both[:, i, i] * y * y
-        found.append(squares)
-    determinants = _determinants(both)
-    tiny = torch.finfo(torch.float64).tiny
-    exponents = torch.stack(found, dim=1) / determinants.clamp(min=tiny)
-    sizes = (_determinants(one) * _determinants(other) / determinants.clamp(min=tiny)).sqrt()
-    return 2 * math.pi * sizes * torch.exp(-exponents / 2)
+def _products(one: Tensor, other: Tensor, own: Tensor, others: Tensor, offset: Tensor) -> Tensor:
+    """∫ of the product of two Gaussians of peak 1 over the plane, seen along each axis, [n, 3]; with their determinants."""
+    both = (own + others + _mixed(one, other)).clamp(min=torch.finfo(torch.float64).tiny)
+    squares = torch.linalg.cross(torch.cat([one, other], dim=2), offset[..., None], dim=1).square().sum(2)
+    return 2 * math.pi * (own * others / both).sqrt() * torch.exp(-squares / both / 2)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 CELL, BEHIND = 1.5, 4.0  # side of a cell and least distance of what hides a point, in distances between points
@@ -44,17 +45,20 @@ def open_share(normals: Tensor, directions: Tensor, seen: Tensor) -> Tensor:
 def lit_beside(points: Tensor, others: Tensor, directions: Tensor) -> Tensor:
     """Which points [P, 3] are lit from directions [D, 3] where others [Q, 3] stand in the way: [P, D] of 1 and 0.
 
-    Others count as squares across the light, 1.5 times as wide as they are apart in the median; a surface does not shade itself:
-    what lies within four such distances hides nothing. The scene's splatted depth (``training.exposure``) is finer.
+    Others count as squares across the light, 1.5 times as wide as they are apart in the median, those at one place counting
+    once; a surface does not shade itself: what lies within four such distances hides nothing. The scene's splatted depth
+    (``training.exposure``) is finer.
     """
-    apart = torch.cdist(points, others).topk(2, largest=False).values[:, 1].median().clamp(min=1e-9)
+    far = torch.from_numpy(cKDTree(others.unique(dim=0).numpy()).query(points.numpy(), k=2)[0])
+    apart = torch.where(far > 0, far, math.inf).amin(1).median()
     found = []
     for direction in directions:
         aside = torch.linalg.svd(direction[None]).Vh[1:].T
         places = torch.cat([others @ aside, points @ aside]) / (CELL * apart)
-        cells = (places - places.amin(0)).long()
-        cells = cells[:, 0] * (int(cells[:, 1].max()) + 1) + cells[:, 1]
-        nearest = torch.full((int(cells.max()) + 1,), -math.inf, dtype=points.dtype)
+        # Only cells that hold points are numbered: between far points there are more than memory holds.
+        across, along = (line.unique(return_inverse=True)[1] for line in (places - places.amin(0)).long().T)
+        cells = (across * len(places) + along).unique(return_inverse=True)[1]
+        nearest = torch.full((len(places),), -math.inf, dtype=points.dtype)
         nearest.scatter_reduce_(0, cells[: len(others)], others @ direction, "amax")
         found.append((nearest[cells[len(others) :]] - points @ direction <= BEHIND * apart).to(points))
     return torch.stack(found, 1) if found else points.new_zeros(len(points), 0)

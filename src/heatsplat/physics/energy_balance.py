@@ -44,11 +44,13 @@ stays constant.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from heatsplat.physics import marching
 from heatsplat.physics.responses import (
@@ -64,7 +66,32 @@ from heatsplat.physics.sunlight import Seen, SunlightTable
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
 _BEAM_RATES, _FARTHEST = 20, 14.0  # of the sun on semi-infinite bodies: how many, and how far from a in log rate
+_FAR = 50.0  # of erfcx: from here on four terms of its series
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
+
+
+class _Erfcx(torch.autograd.Function):
+    """What a semi-infinite body keeps of its start, e^{x²} erfc(x) of any shape, with a slope that keeps its digits.
+
+    The slope is 2 x erfcx(x) - 2/√π, of which 1/(2 x²) is left where x is large: float64 and, from ``_FAR`` on, the asymptotic
+    series lose no more than 1e-12 of it.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        at = x.detach().double()
+        kept = torch.special.erfcx(at)
+        ctx.save_for_backward(at, kept)
+        return kept.to(x)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_kept: Tensor) -> Tensor:
+        at, kept = ctx.saved_tensors
+        near = 2 * at * kept - 2 / math.pi**0.5
+        y = at**-2
+        far = -y / math.pi**0.5 * (1 - y * (1.5 - y * (3.75 - 13.125 * y)))
+        return v_kept * torch.where(at > _FAR, far, near).to(v_kept)
 
 
 class Core(NamedTuple):
@@ -100,15 +127,15 @@ class _TwoRates(NamedTuple):
 def _two_rates(core: Core, log_rate: Tensor, stiffness: Tensor | float) -> _TwoRates:
     """Of surfaces with log r and s: the eigenvalues in units of r (s + κ), so that no digits are lost at any rates."""
     leaving = stiffness + core.coupling
-    coupled = core.coupling / leaving
+    coupled, free = core.coupling / leaving, stiffness / leaving  # 1 - coupled would lose s beside a large κ
     log_scale = log_rate + leaving.log()
     slow = torch.exp(core.log_rate - log_scale)
     root = ((1 - slow).square() + 4 * slow * coupled).sqrt()
     fast = 0.5 * (1 + slow + root)
     own = 0.5 * (1 - slow + root) / root
     log_fast = log_scale + fast.log()
-    log_slow = log_scale + (1 - coupled).log() + core.log_rate - log_fast  # a₁ a₂ = r s μ
-    return _TwoRates((log_fast, log_slow), own * (1 - coupled) / fast, own, coupled / root)
+    log_slow = log_scale + free.log() + core.log_rate - log_fast  # a₁ a₂ = r s μ
+    return _TwoRates((log_fast, log_slow), own * free / fast, own, coupled / root)
 
 
 class Exposure(NamedTuple):
@@ -331,7 +358,7 @@ class Climate:
             settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
             beam = 0.0 if self.beam is None else self._beam(time_s, surface, log_rate).to(log_rate)
             if self.semi_infinite:
-                kept = torch.special.erfcx(torch.exp(0.5 * log_rate) * elapsed**0.5)
+                kept = _Erfcx.apply(torch.exp(0.5 * log_rate) * elapsed**0.5)
             else:
                 kept = torch.exp(-log_rate.exp() * elapsed)
             forced = self.forcing(surface, settled, beam, mean)

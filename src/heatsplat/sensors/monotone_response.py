@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -42,8 +43,8 @@ class MonotoneResponse(SensorPart):
         return corrected(image.reshape(len(image), -1, 1), curve).view_as(image)  # each channel by itself
 
     def penalty(self) -> Tensor:
-        slopes = len(self.rises) * self.rises.softmax(0)
-        return slopes.log().square().mean()
+        logarithms = math.log(len(self.rises)) + self.rises.log_softmax(0)  # of slopes, which may underflow
+        return logarithms.square().mean()
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"tone": {"pieces": len(self.rises), "monotone": True}}
