@@ -13,8 +13,9 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from heatsplat.callbacks.page import PAGE_FILE, write_page
+from heatsplat.callbacks.page import PAGE_FILE, plain, write_page
 from heatsplat.contracts import evenly_spread
+from heatsplat.io.pictures import literal
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
@@ -63,7 +64,7 @@ class Section:
 
 def write_report(target: Path, sections: Sequence[Section], made: str = "prepared from a camera's files") -> Path:
     """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
-    lines = [f"# {target.name}, {made}", ""]
+    lines = [f"# {plain(target.name)}, {made}", ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
     text = "\n".join(lines)
@@ -85,7 +86,9 @@ def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], not
         lines = [
             f"- {counted(len(frames), 'frame')} of {len(devices)} cameras, each with a lens and dead pixels of its own:"
         ]
-        lines += [f"    - {d.label}: {counted(len(d.frames), 'frame')}, such as {d.frames[0].name}" for d in devices]
+        lines += [
+            f"    - {d.label}: {counted(len(d.frames), 'frame')}, such as {plain(d.frames[0].name)}" for d in devices
+        ]
     timed = [f.time for f in frames if f.time is not None]
     if timed:
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
@@ -144,7 +147,7 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
     unsure = [row for row in unsure if any(float(cell or 0.0) for cell in row[2:])]
     different = len({repr(f.conditions) for f in frames})
     stated = [
-        f"Temperatures of surfaces, frame {frame.name}; the air lets {float(c.transmittance()):.4f} pass.",
+        f"Temperatures of surfaces, frame {plain(frame.name)}; the air lets {float(c.transmittance()):.4f} pass.",
         *(
             [f"The conditions differ between frames ({different} sets); each frame has its own."]
             if different > 1
@@ -264,7 +267,7 @@ def _few_frames(frames: Sequence[Frame], quantiles: np.ndarray, unit: str) -> Fi
     low, high = np.percentile(quantiles[:, 1], 5), np.percentile(quantiles[:, -2], 95)
     for place, frame in zip(places, few, strict=False):
         image = place.imshow(frame.pixels(), cmap="inferno", vmin=low, vmax=max(high, low + 1e-6))
-        place.set_title(frame.name, fontsize=7)
+        place.set_title(literal(frame.name), fontsize=7)
     for place in places:
         place.set_axis_off()
     figure.colorbar(image, ax=list(places), label=unit, shrink=0.8)

@@ -206,6 +206,12 @@ def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
     assert "test/probes" in events(tmp_path).Tags()["images"]
 
 
+def test_dollar_signs_of_names_are_no_formulae(tmp_path):
+    scene = replace(wall(), name="a$^$b", notes={"probes": ["$^$", "$5 and $6"]})
+    evaluate(FakeModule(scene, tmp_path), trainer(tmp_path, [TemperatureCurves(times=2)], logger=False))
+    assert (tmp_path / "renders" / "probes.png").exists()
+
+
 def test_moments_beyond_the_training_record_are_counted_and_shaded(tmp_path, monkeypatch):
     pictures = []
 

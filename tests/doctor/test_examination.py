@@ -3,7 +3,8 @@
 import pytest
 from materials import changed, clean
 
-from heatsplat.doctor.examination import CHECKS, examine
+from heatsplat.doctor.base import Finding
+from heatsplat.doctor.examination import CHECKS, examine, show
 
 
 @pytest.mark.parametrize("scene", ["static", "heated", "cooling", "glass", "haze"])
@@ -23,3 +24,11 @@ def test_findings_come_the_most_costly_first_and_say_what_helps():
 def test_every_check_says_what_it_looks_at():
     assert len({check.name for check in CHECKS}) == len(CHECKS) == 12
     assert all(check.summary for check in CHECKS)
+
+
+def test_names_in_square_brackets_are_printed(capsys):
+    show([], "/data/[old] site :fire:")
+    show([Finding("still", 1.0, "image [a].png", "leave [b].png out")], "[old] site")
+    said = capsys.readouterr().out
+    assert "/data/[old] site :fire:: nothing found" in said
+    assert all(name in said for name in ("[a].png", "[b].png", "[old] site"))

@@ -151,6 +151,12 @@ def test_figures_hold_text_and_pixels(tmp_path):
     assert ">ground truth</text>" in svg and ">frame 1</text>" in svg and "<image" in svg
 
 
+def test_a_figure_shows_names_with_dollar_signs_as_they_are(tmp_path):
+    write_figure(tmp_path / "p.svg", [Panel(np.zeros((4, 6, 3), np.uint8), "$5 and $6")], "a$^$b")
+    svg = (tmp_path / "p.svg").read_text()
+    assert ">$5 and $6</text>" in svg and ">a$^$b</text>" in svg
+
+
 def read_video(path):
     film, read = cv2.VideoCapture(str(path)), []
     while (got := film.read())[0]:

@@ -75,6 +75,14 @@ def test_frames_of_one_temperature_have_a_histogram(tmp_path):
     assert section.values["median_span"] == 0
 
 
+def test_names_are_shown_as_they_are(tmp_path):
+    image = np.linspace(10, 30, 64, dtype=np.float32).reshape(8, 8)
+    frames = read_frames(write_images(tmp_path / "files", {f"p$^$_{i}.tiff": image + i for i in range(2)}))
+    section = report.pictures(tmp_path / "*a* $^$", frames, prepared(frames, tmp_path / "*a* $^$"))
+    report.write_report(tmp_path / "*a* $^$", [section])
+    assert "<title>*a* $^$, prepared" in (tmp_path / "*a* $^$" / "report.html").read_text(encoding="utf-8")
+
+
 def test_the_page_has_its_sections_in_order(tmp_path):
     page = report.write_report(tmp_path / "scene", [report.Section("One", ["a"]), report.Section("Two", ["b"])])
     assert page.read_text().index("## One") < page.read_text().index("## Two")

@@ -1,5 +1,6 @@
 """The notebooks of the documentation run from top to bottom, with few steps of training."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,21 @@ def test_a_notebook_runs_in_jupyter_and_shows_pictures(path):
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(FOLDER)}}).execute()
     shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in data for data in shown)
+
+
+def scores(notebook) -> list[float]:
+    """The first score of each row of results that a notebook shows."""
+    shown = [output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output]
+    return [float(found) for data in shown for found in re.findall(r"^\D*(\d+\.\d{3})", data["text/plain"], re.M)]
+
+
+@pytest.mark.slow
+@each_notebook
+def test_what_a_notebook_shows_is_what_its_cells_give_today(path):
+    notebook = nbformat.read(path, as_version=4)
+    stored = scores(notebook)
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    assert stored and stored == pytest.approx(scores(notebook), abs=1.0)  # dB
 
 
 @each_notebook

@@ -18,6 +18,7 @@ from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
+from heatsplat.viewer import page as pages
 from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
 
 ActionChains = pytest.importorskip(
@@ -27,6 +28,7 @@ ActionChains = pytest.importorskip(
 ROOT = Path(__file__).parents[2]
 TINY = ("data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "threads=1", "optim.length_power=0")
 SETTINGS = ("method=etgs", "max_steps=120", "thermal.frequencies=6")
+ALL = ("\ue009", "a", "\ue000")  # Control and A: what a field holds
 
 
 @pytest.fixture(scope="module")
@@ -308,12 +310,78 @@ def test_colours_are_those_of_both_sides_of_another_time(page):
 def test_away_from_a_camera_its_image_gives_way_to_the_scene(page):
     page.execute_script("viewer.goTo(0, true); viewer.choose({other: 'recorded', how: 'difference'})")
     assert page.execute_script("return viewer.differing")
-    told = "viewer.turn(0.05, 0); return document.getElementById('message').textContent"
-    assert "N and P" in page.execute_script(told)
+    told = "return document.getElementById('message').textContent"
+    assert "N and P" in page.execute_script(f"viewer.turn(0.05, 0); {told}")
     wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
     assert not page.execute_script("return viewer.differing") and pixels(page).std(axis=0).max() > 20
     keys(page, "n")
+    assert page.execute_script("viewer.say(''); return viewer.differing && viewer.beside") == "recorded"
+    assert "N and P" in page.execute_script(f"viewer.stepTime(1); {told}")  # at another time as at another place
+    assert page.execute_script("return [viewer.differing, viewer.beside]") == [False, "nothing"]
+    keys(page, "n")
     assert page.execute_script("return viewer.differing && viewer.beside") == "recorded"
+
+
+def test_ends_of_colours_that_make_no_sense_are_refused_and_those_that_hold_shown_again(page):
+    field = page.find_element("id", "low")
+    before, shown = page.execute_script("""viewer.fitted = true;
+      viewer.say = (text) => { viewer.said = text; };
+      const one = viewer.splats.attributes.find(({name}) => name === 'time_constant_s');
+      Object.assign(one, {log: true, low: 2, high: 4});  // as of times that span more than two powers of ten
+      viewer.choose({quantity: 'learned time_constant_s', other: 'nothing'});
+      viewer.frame(performance.now());
+      return [viewer.range, $('low').value];""")
+    for typed, why in (("0", "above 0"), ("-5", "above 0"), ("", ""), ("1e12", "below the upper one")):
+        page.execute_script("viewer.said = ''")
+        field.send_keys(*ALL, typed or "\ue017", "\ue007")  # nothing, by Delete; Enter
+        wait_until(page, f"!viewer.pending && $('low').value === '{shown}'", 5)
+        assert page.execute_script("return viewer.range") == before, typed
+        assert why in page.execute_script("return viewer.said"), typed
+    field.send_keys(*ALL, "10", "\ue007")
+    assert page.execute_script("return viewer.range") == pytest.approx([1, before[1]], abs=1e-3)
+
+
+def test_what_turns_about_a_point_pins_no_probe(page):
+    """Double clicks, and two fingers at once."""
+    names = "return viewer.probes.map((one) => one.name)"
+    before = page.execute_script(
+        f"viewer.probes = []; for (let i = 0; i < 8; i++) viewer.pin(...viewer.middle()); {names}"
+    )
+    target = page.execute_script("return viewer.target")
+    canvas = page.find_element("id", "canvas")
+    ActionChains(page).move_to_element_with_offset(canvas, 40, 30).double_click().perform()
+    assert page.execute_script(names) == before and page.execute_script("return viewer.target") != target
+    ActionChains(page).move_to_element(canvas).click().perform()
+    assert page.execute_script(names) == [*before[1:], str(int(before[-1]) + 1)]
+
+    def touch(kind, *points):
+        held = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": held})
+
+    page.execute_script("viewer.probes = []")
+    touch("touchStart", (200, 250))
+    touch("touchStart", (200, 250), (320, 300))
+    touch("touchEnd", (200, 250))
+    touch("touchEnd")
+    assert page.execute_script(names) == []
+    touch("touchStart", (200, 250))
+    touch("touchEnd")
+    assert len(page.execute_script(names)) == 1
+
+
+def test_sliders_and_buttons_take_only_the_keys_that_they_use(page):
+    page.find_element("id", "time").click()
+    ActionChains(page).send_keys(" ").perform()
+    assert page.execute_script("return viewer.state.playing")
+    page.find_element("id", "play").click()
+    centre, time_s = page.execute_script("return [viewer.camera.centre, viewer.state.time]")
+    ActionChains(page).send_keys("\ue012").perform()  # left
+    assert page.execute_script("return viewer.camera.centre") != centre
+    centre = page.execute_script("return viewer.camera.centre")
+    page.execute_script("$('time').focus()")
+    ActionChains(page).send_keys("\ue012").perform()
+    assert page.execute_script("return viewer.camera.centre") == centre
+    assert page.execute_script("return viewer.state.time") != time_s
 
 
 def test_what_a_gaussian_has_not_learned_is_left_out_of_maps(page):
@@ -337,9 +405,32 @@ def test_what_a_gaussian_has_not_learned_is_left_out_of_maps(page):
     assert found[4] == len(before) > 1000 and before.min() > -1  # log10 of seconds
 
 
-def test_a_second_run_is_itself(page, folder):
-    page.find_element("id", "run").send_keys(str(folder / FILE))
+def by_another_clock(path: Path, later_s: float) -> tuple[dict, bytes]:
+    """The header of a page and its block where another image was the first to be trained on."""
+    header, block = parts_of(path)
+    content = bytearray(block)
+    for layer in header["layers"]:
+        place = layer["times"]
+        times = np.frombuffer(content, "<f8", place["shape"][0], place["offset"])
+        times += later_s
+    header["span"], header["record"] = ([time + later_s for time in header[key]] for key in ("span", "record"))
+    header["moments"] = [[name, time + later_s] for name, time in header["moments"]]
+    for camera in header["cameras"]:
+        camera["time"] += later_s
+    return header, bytes(content)
+
+
+def test_a_second_run_is_itself_whatever_its_clock(page, folder, tmp_path):
+    header, block = by_another_clock(folder / FILE, 431.0)
+    (tmp_path / FILE).write_text(pages.page(header, block), encoding="utf-8")
+    page.find_element("id", "run").send_keys(str(tmp_path / FILE))
     wait_until(page, "viewer.run && viewer.run.scene.ready")
+    assert page.execute_script("return viewer.run.later") == pytest.approx(431.0)
+    assert "clock" not in page.execute_script("return $('other').selectedOptions[0].text")
+    old, none, disagreeing = page.execute_script("""const {cameras, moments} = viewer.run.told;
+      const apart = moments.map(([name, time], i) => [name, time + i]);
+      return [{cameras}, {cameras: []}, {cameras: [], moments: apart}].map((told) => viewer.laterIn(told));""")
+    assert old == pytest.approx(431.0) and none is None and disagreeing is None  # older pages have cameras alone
     page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
     values = np.array(page.execute_script("return viewer.sampled()"))
     assert len(values) > 1000 and np.abs(values).max() < 0.01
@@ -351,6 +442,12 @@ def test_a_second_run_is_itself(page, folder):
     assert abs(float(page.execute_script(at + told).split()[0])) < 0.01  # a difference, not a temperature
     page.execute_script("viewer.choose({how: 'swipe'}); viewer.frame(performance.now())")
     assert float(page.execute_script(at + told).split()[0]) > 5
+    unknown = header | {"moments": [], "cameras": [one | {"name": f"other {one['name']}"} for one in header["cameras"]]}
+    page.execute_script("viewer.say = (text) => { viewer.said = text; }")
+    (tmp_path / "unknown.html").write_text(pages.page(unknown, block), encoding="utf-8")
+    page.find_element("id", "run").send_keys(str(tmp_path / "unknown.html"))
+    wait_until(page, "viewer.run.later === 0 && $('other').selectedOptions[0].text.startsWith('run by its own clock')")
+    assert "Images do not tell" in wait_until(page, "viewer.said")
 
 
 def test_the_cursor_reads_what_is_shown_on_each_side(page):

@@ -9,13 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from exported import started
 from swinging import frames, ready, wall
 
+from heatsplat.contracts import Camera, Frame
+from heatsplat.export.snapshot import snapshot
 from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.rolling_readout import RollingReadout
 from heatsplat.sensors.thermal_lag import ThermalLag
 from heatsplat.viewer.page import page
-from heatsplat.viewer.payload import Block, _added, _attribute, _small
+from heatsplat.viewer.payload import MEAN_CODE, MOMENTS, Block, _added, _attribute, _moments, _small, payload
 
 
 def back(block: bytes, place: dict) -> np.ndarray:
@@ -72,6 +75,26 @@ def test_a_page_holds_what_it_was_given_whatever_a_scene_is_called():
     assert json.loads(found) == header and "<b>" not in text
     packed = re.search(r'id="block">(.*?)</script>', text, re.S)[1]
     assert zlib.decompress(base64.b64decode(packed)) == b"12345678"
+
+
+def test_the_same_images_tell_the_time_however_a_scene_is_split():
+    def split(first, test_every):
+        at = Camera(torch.eye(4), torch.eye(3), 8, 6)
+        shown = [Frame(f"{i}.png", i, at, 10.0 * (i - first)) for i in range(50)]
+        parts = [[f for i, f in enumerate(shown) if (i % test_every == 0) == held] for held in (False, True)]
+        train, test = (SimpleNamespace(frames=part) for part in parts)
+        return SimpleNamespace(train=train, val=test, test=test)
+
+    one, other = _moments(split(0, 8)), _moments(split(3, 7))
+    assert [name for name, _ in one] == [name for name, _ in other] and len(one) == MOMENTS
+    assert {b - a for (_, a), (_, b) in zip(one, other, strict=True)} == {-30.0}
+    assert _moments(SimpleNamespace(**dict.fromkeys(("train", "val", "test"), SimpleNamespace(frames=[])))) == []
+
+
+def test_a_page_says_that_it_shows_the_mean_of_the_codes_of_images(tmp_path):
+    module = started(tmp_path, "method=wild_thermal")
+    header, _ = payload(module, snapshot(module), 1)
+    assert header["leftOut"][-1] == MEAN_CODE
 
 
 def test_what_a_part_adds_that_needs_to_know_how_far_away_things_are():

@@ -71,6 +71,11 @@ def page(text: str, folder: Path) -> str:
     )
 
 
+def plain(text: str) -> str:
+    """Markdown that shows a text as it is: names of scenes and files may hold what it takes for emphasis, links or headings."""
+    return re.sub(r"[\\\[\]`*~<&]|(?<![^\W_])_|_(?![^\W_])|(?<!\S)#", r"\\\g<0>", text)
+
+
 def _embedded(path: Path, alternative: str) -> str:
     """A picture with its content in it; stills as WebP, moving ones as they are."""
     if not path.exists():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import board
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
-from heatsplat.io.pictures import figure_picture, time_unit, write_png
+from heatsplat.io.pictures import figure_picture, literal, time_unit, write_png
 from heatsplat.io.tables import write_csv
 
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
@@ -217,7 +217,7 @@ def _figure(
         axes.axvspan(start / divisor, end / divisor, color="0.9", linewidth=0, zorder=0)
     for i, curve in enumerate(model):
         color = f"C{i}"
-        axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=names[i])
+        axes.plot(times / divisor, curve, color=color, linewidth=1.6, label=literal(names[i]))
         if truth is not None:
             axes.plot(times / divisor, truth[i], color=color, linewidth=1.2, linestyle=(0, (4, 2)), alpha=0.8)
         elif dots:
@@ -225,7 +225,7 @@ def _figure(
     against = "dashes: truth" if truth is not None else "dots: training images" if dots else "no truth known"
     axes.set(xlabel=f"time ({word})", ylabel=f"temperature ({unit})" if unit == "°C" else unit)
     against += "; grey: beyond the record" if outside else ""
-    axes.set_title(f"{title}   (lines: model, {against})", fontsize=10)
+    axes.set_title(f"{literal(title)}   (lines: model, {against})", fontsize=10)
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8, ncols=2, framealpha=0.7)
     return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from glob import escape
 from itertools import zip_longest
@@ -22,7 +21,7 @@ from heatsplat.callbacks.board import board
 from heatsplat.callbacks.courses import COURSES_PICTURE
 from heatsplat.callbacks.images import file_stem
 from heatsplat.callbacks.metrics import TEST_FILE
-from heatsplat.callbacks.page import PAGE_FILE, write_page
+from heatsplat.callbacks.page import PAGE_FILE, plain, write_page
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.contracts import Frame, SceneData, evenly_spread
@@ -223,7 +222,7 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
     """
     content = results.as_json()
     run, reasons = content["run"], content["reasons"]
-    lines = [f"# {run.get('method') or run.get('thermal_model')} on {run.get('scene')}", ""]
+    lines = [f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}", ""]
     pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
     lines += ["## Scores and cost", "", *table]
@@ -261,8 +260,8 @@ def report(results: RunResults, folder: Path, pictures: Sequence[Path], curves: 
 
 def _picture(path: Path, folder: Path, alternative: str | None = None) -> str:
     """A picture in Markdown, whatever its file is called: images may be named as a camera or a person liked."""
-    plain = re.sub(r"([\\\[\]`*_<])", r"\\\1", path.stem) if alternative is None else alternative
-    return f"![{plain}]({quote(path.relative_to(folder).as_posix())})"
+    words = plain(path.stem) if alternative is None else alternative
+    return f"![{words}]({quote(path.relative_to(folder).as_posix())})"
 
 
 def _picture_section(title: str, folder: Path, name: str, alternative: str) -> list[str]:
@@ -379,25 +378,25 @@ def _bullets(values: Mapping[str, Any]) -> list[str]:
     """A list of names and values for Markdown, one level of nesting in line."""
     lines = []
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            value = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on"
-        lines.append(f"- {name}: {_words(value)}")
+        nested = isinstance(value, Mapping)
+        words = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on" if nested else _words(value)
+        lines.append(f"- {name}: {words}")
     return lines
 
 
 def _words(value: Any) -> str:
-    """A value for people: lists with commas, floats with six digits, a dash for nothing."""
+    """A value for people, in Markdown: lists with commas, floats with six digits, a dash for nothing."""
     if isinstance(value, (list, tuple)):
         return ", ".join(_words(item) for item in value)
     if isinstance(value, float):
         return f"{value:.6g}"
-    return "–" if value is None else str(value)
+    return "–" if value is None else plain(str(value))
 
 
 def show(results: RunResults, folder: Path, picture: Path | None, console: Console | None = None) -> None:
     """Prints scores beside cost and where the report and a picture lie."""
     content = results.as_json()
-    console = console or Console()
+    console = console or Console(markup=False, emoji=False)  # names and paths as they are
     run = content["run"]
     table = Table(title=f"{run.get('method') or run.get('thermal_model')} on {run.get('scene')}", title_justify="left")
     for column, justify in (("score", "left"), ("", "right"), ("cost", "left"), (" ", "right")):

@@ -46,13 +46,14 @@ def warn_of(scene: SceneData) -> list[Finding]:
 
 def show(found: Sequence[Finding], title: str) -> None:
     """Prints a table of findings."""
+    console = Console(markup=False, emoji=False)  # names and paths as they are
     if not found:
-        Console().print(f"{title}: nothing found ({len(CHECKS)} checks)")
+        console.print(f"{title}: nothing found ({len(CHECKS)} checks)")
         return
     table = Table("", "check", "what", "what helps", title=title)
     for number, finding in enumerate(found, 1):
         table.add_row(str(number), finding.check, finding.what, finding.remedy)
-    Console().print(table)
+    console.print(table)
 
 
 def write_findings(found: Sequence[Finding], path: Path) -> None:

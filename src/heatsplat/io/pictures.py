@@ -244,17 +244,22 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
     with matplotlib.rc_context(settings):
         figure = Figure(figsize=size, layout="constrained")
         if title:
-            figure.suptitle(title, fontsize=8)
+            figure.suptitle(literal(title), fontsize=8)
         for i, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(1, len(panels), i)
             axes.imshow(panel.image, interpolation="none")
-            axes.set_title(panel.title, fontsize=8)
+            axes.set_title(literal(panel.title), fontsize=8)
             axes.set_axis_off()
             if (bar := panel.bar) is not None:
                 colours = ScalarMappable(Normalize(bar.low, bar.high), bar.colormap)
                 figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit)
         date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
         figure.savefig(path, metadata={date: None})
+
+
+def literal(text: str) -> str:
+    """A text for a figure of matplotlib, which reads what stands between two dollar signs of a name as a formula."""
+    return text.replace("$", r"\$")
 
 
 def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:

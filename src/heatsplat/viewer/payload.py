@@ -23,6 +23,11 @@ UNKNOWN = MOST  # of a Gaussian that has no value of an attribute
 LEVELS = MOST - 1  # steps between the ends of a range where some are unknown
 LEAST_SCALE = 1e-12  # of a Gaussian, in world units: none is drawn
 ATTRIBUTE_SHARE = (0.001, 0.999)  # quantiles between which an attribute is stored
+MOMENTS = 12  # images whose times tell the clock of a run
+MEAN_CODE = (
+    "The model learned a brightness of its own for each training image: shown, also in the model's recording, is that of "
+    "the mean of their codes. src/render.py trajectory=train shows each image's."
+)
 LOG_RATIO = 100.0  # an attribute above 0 whose ends are further apart than this is stored as its logarithm
 
 
@@ -81,7 +86,8 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
         "attributes": [_attribute(name, values, block) for name, values in seen.attributes.items()],
         "span": None if seen.start_s is None else [seen.start_s, seen.end_s],
         "record": None if seen.start_s is None else [min(scene.train.times_s), max(scene.train.times_s)],
-        "leftOut": seen.left_out,
+        "moments": _moments(scene),
+        "leftOut": [*seen.left_out, *[MEAN_CODE] * ("frame_offset" in module.thermal.effects())],
         "beyondRecord": module.thermal.beyond_record,
         "renderer": {
             "eps2d": renderer.eps2d,
@@ -98,6 +104,15 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
         "maps": {name: block.add(_colours(name), "u1") for name in COLORMAPS},
     }
     return header, block.content
+
+
+def _moments(scene: SceneData) -> list[tuple[str, float]]:
+    """Names and times of some images, spread over those of all splits: the same images for every split of a scene, by which the
+    page finds how far the clocks of two runs are apart."""
+    views = (scene.train, scene.val, scene.test)
+    known = {frame.name: frame.time_s for part in views for frame in part.frames if frame.time_s is not None}
+    ordered = sorted(known.items(), key=lambda moment: (moment[1], moment[0]))
+    return [ordered[i] for i in evenly_spread(len(ordered), MOMENTS)]
 
 
 def _colours(name: str) -> np.ndarray:

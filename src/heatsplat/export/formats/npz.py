@@ -12,7 +12,10 @@ from heatsplat.export.moment import Moment
 
 
 class Npz(Format):
-    """Geometry, temperature at the moment, attributes, and the layer over time as a basis (docs/export.md)."""
+    """Geometry, temperature at the moment, attributes, and the layer over time as a basis (docs/export.md).
+
+    **Convention:** where ``about["clipped"]``, what the basis gives is clipped to [0, 1] before the table is asked.
+    """
 
     suffix = ".npz"
 

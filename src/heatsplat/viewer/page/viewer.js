@@ -2,8 +2,9 @@
 
 const $ = (id) => document.getElementById(id);
 const COLOURS = ["#ff9e4a", "#6cb6ff", "#7bd88f", "#f07ab8", "#c9a2ff", "#e8d44d", "#5fd3d0", "#ff7b72"];
-const AT_CAMERAS = "Images of cameras are known where these stood: N and P go to the next.";
-const CHART_TIMES = 121, BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
+const AT_CAMERAS = "Images of cameras are known where and when they were taken: N and P go to the next.";
+const OTHER_CLOCK = "Images do not tell how far the clocks of both runs are apart: each counts from its own first training image.";
+const CHART_TIMES = 121, BINS = 96, PLAY_LIMIT_MS = 45, SAME_MOMENT_S = 1e-3, DIFFERENCES = "RdBu_r";
 
 class Viewer {
   constructor(payload) {
@@ -11,7 +12,7 @@ class Viewer {
     this.splats = new Splats(payload);
     this.drawing = new Drawing($("canvas"));
     this.scene = this.drawing.load(this.splats);
-    this.run = null;  // a second one: {told, scene, sorter}
+    this.run = null;  // a second one: {told, scene, sorter, later}
     this.sorter = new Sorter(this.splats, (ids) => {
       this.drawing.order(this.scene, ids);
       this.request();
@@ -63,9 +64,16 @@ class Viewer {
     return this.differing ? `difference ${this.state.other}` : this.attribute ? this.state.quantity : "values";
   }
 
-  // What stands beside it, of which images of cameras are known at their places alone.
+  // What stands beside it, of which images of cameras are known at their places and times alone.
   get beside() {
-    return this.state.at === null && this.ofCamera ? "nothing" : this.state.other;
+    return this.ofCamera && !this.atImage ? "nothing" : this.state.other;
+  }
+
+  // Whether this is the place and the time of the image of a training camera.
+  get atImage() {
+    const one = this.cameras[this.state.at], { span } = this.told;
+    if (!one || !span || one.time === null) return Boolean(one);
+    return Math.abs(one.time - this.state.time) <= 1e-6 * (span[1] - span[0]);
   }
 
   get ofCamera() {
@@ -181,7 +189,7 @@ class Viewer {
   // Moving ----------------------------------------------------------------------------------------------------------
 
   look(camera) {
-    if (this.ofCamera && this.state.at !== null) this.say(AT_CAMERAS);
+    if (this.ofCamera && this.atImage) this.say(AT_CAMERAS);
     this.show(camera);
     this.state.at = null;
   }
@@ -232,7 +240,9 @@ class Viewer {
 
   setTime(time) {
     if (!this.told.span) return;
+    const before = this.atImage;
     this.state.time = Math.min(Math.max(time, this.told.span[0]), this.told.span[1]);
+    if (this.ofCamera && before && !this.atImage) this.say(AT_CAMERAS);
     this.stale.values = true;
     this.request();
   }
@@ -324,7 +334,7 @@ class Viewer {
     this.drawing.update(scene);
     if (this.run && other === "run") {
       const second = this.run.scene.splats;
-      second.fill(second.layer(this.state.quantity) || second.layers[0], time, this.run.scene.filled, 0, 2);
+      second.fill(second.layer(this.state.quantity) || second.layers[0], time + this.run.later, this.run.scene.filled, 0, 2);
       this.drawing.update(this.run.scene);
     }
   }
@@ -600,8 +610,9 @@ class Viewer {
     const shown = (value) => this.attribute?.log ? 10 ** value : value;
     const digits = (value) => Number(shown(value).toPrecision(4)).toString();
     for (const [id, value] of [["low", this.range[0]], ["high", this.range[1]]]) {
-      if (document.activeElement !== $(id)) $(id).value = digits(value);
+      if (document.activeElement !== $(id) || this.refused) $(id).value = digits(value);
     }
+    this.refused = false;
     $("legend").hidden = state.quantity === "visible";
     $("barLow").textContent = digits(this.range[0]);
     $("barMiddle").textContent = digits((this.range[0] + this.range[1]) / 2);
@@ -804,6 +815,14 @@ class Viewer {
     $("keys").scrollTop = 0;  // the button that has the focus is at its end
   }
 
+  // How many seconds later another run counts the same moment, from images that both know by name; null where these do not tell.
+  laterIn(told) {
+    const moments = ({ cameras, moments = [] }) => [...cameras.map((one) => [one.name, one.time]), ...moments].filter(([, time]) => time !== null);
+    const own = new Map(moments(this.told));
+    const apart = moments(told).filter(([name]) => own.has(name)).map(([name, time]) => time - own.get(name)).sort((a, b) => a - b);
+    return apart.length && apart.at(-1) - apart[0] < SAME_MOMENT_S ? apart[apart.length >> 1] : null;
+  }
+
   async openRun(file) {
     try {
       const page = new DOMParser().parseFromString(await file.text(), "text/html");
@@ -815,11 +834,13 @@ class Viewer {
         this.drawing.order(scene, ids);
         this.request();
       });
-      this.run = { told: payload.told, scene, sorter };
+      const { told } = payload, later = this.told.span && told.span ? this.laterIn(told) : 0;
+      this.run = { told, scene, sorter, later: later ?? 0 };
       sorter.sort(this.camera);
       $("other").querySelector("[value=run]")?.remove();
-      $("other").append(new Option(`run: ${payload.told.method}, ${payload.told.scene}`, "run"));
+      $("other").append(new Option(`run${later === null ? " by its own clock" : ""}: ${told.method}, ${told.scene}`, "run"));
       this.choose({ other: "run" });
+      if (later === null) this.say(OTHER_CLOCK);
     } catch (error) {
       this.say(`${file.name} cannot be opened: ${error.message}`);
     }
@@ -828,10 +849,12 @@ class Viewer {
   listen() {
     const canvas = $("canvas");
     const pointers = new Map();
-    let moved = 0, pinch = 0;
+    let moved = 0, pinch = 0, alone = true;
+    let clicks = [];  // the probes before each of the last two
     canvas.onpointerdown = (event) => {
       canvas.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, event);
+      alone = pointers.size === 1;
       moved = 0;
       this.dragging = true;
       this.keyboard = false;
@@ -856,7 +879,10 @@ class Viewer {
       const known = pointers.delete(event.pointerId);
       pinch = 0;
       this.dragging = pointers.size > 0;
-      if (known && moved <= 3 && event.type === "pointerup" && event.button === 0) this.pin(...this.pixelAt(event.clientX, event.clientY));
+      if (known && event.type === "pointerup" && event.button === 0) {
+        clicks = [...clicks.slice(-1), { probes: [...this.probes], numbered: this.numbered }];
+        if (alone && moved <= 3) this.pin(...this.pixelAt(event.clientX, event.clientY));
+      }
       this.request();
     };
     canvas.onpointerup = ended;
@@ -864,6 +890,8 @@ class Viewer {
     canvas.onpointerleave = () => { $("readout").hidden = true; };
     canvas.oncontextmenu = (event) => event.preventDefault();
     canvas.ondblclick = (event) => {
+      Object.assign(this, clicks[0]);  // its clicks pinned nothing
+      this.request();
       const [px, py] = this.pixelAt(event.clientX, event.clientY), pixel = this.splats.weightsAt(this.camera, px, py);
       if (pixel.left < 0.9) this.target = this.camera.point(px, py, pixel.depth);
     };
@@ -896,12 +924,16 @@ class Viewer {
     $("save").onclick = () => this.picturePage().toBlob((blob) => this.keep(`${this.stem}.png`, blob));
     $("curves").onclick = () => this.keep(`${this.stem}_probes.csv`, new Blob([this.curves()], { type: "text/csv" }));
     const ends = () => {
-      const of = (id) => this.attribute?.log ? Math.log10(Number($(id).value)) : Number($(id).value);
-      const [low, high] = [of("low"), of("high")];
+      const typed = ["low", "high"].map((id) => $(id).value), log = this.attribute?.log;
+      const [low, high] = typed.map((text) => log ? Math.log10(Number(text)) : Number(text));
+      this.request();
+      this.refused = true;  // the ends that hold are shown again
+      if (typed.includes("")) return;
+      if (![low, high].every(Number.isFinite)) return this.say("Both ends of logarithmic colours must be above 0.");
       if (!(low < high)) return this.say("The lower end of the colours must be below the upper one.");
+      this.refused = false;
       this.state.ranges[this.rangeName] = [low, high];
       this.byHand = true;
-      return this.request();
     };
     $("low").onchange = $("high").onchange = ends;
     $("time").oninput = () => this.setTime(Number($("time").value));
@@ -923,9 +955,9 @@ class Viewer {
   pressed(event) {
     const { target, key } = event;
     if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
-    const typing = target.matches("input[type=number], select");
-    const own = target.matches("input, button, select") ? new Set(["Enter", " ", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"]) : new Set();
-    if (typing || own.has(key)) return;
+    const moves = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"], presses = ["Enter", " "];
+    const own = target.matches("[type=range]") ? moves : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
+    if (target.matches("input[type=number], select") || own.includes(key)) return;
     const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
     const actions = {
       ArrowLeft: () => this.turn(turn, 0), ArrowRight: () => this.turn(-turn, 0),
