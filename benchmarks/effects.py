@@ -15,6 +15,7 @@ from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import trained
+from heatsplat.studies.options import filled, listed
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
 MOST_NAMED = 5  # effects that a cell of the table names
@@ -83,6 +84,7 @@ def run(
     overrides: Sequence[str],
     threads: int | None = None,
     clock: str = "train_seconds",
+    only: Sequence[str] | None = None,
 ) -> None:
     """Trains every selection on every preset, then without each effect that auto chose; writes effects.md and .png.
 
@@ -98,13 +100,19 @@ def run(
         overrides: of every run.
         threads: CPU threads of every run; None takes all cores.
         clock: the cost that counts as time, of CLOCKS.
+        only: names of presets; None for all.
 
     Raises:
-        SceneError: a run failed, its folder holds a run of other settings, or there is no such clock.
+        SceneError: a run failed, its folder holds a run of other settings, there is no such clock or preset, or there is none
+            of what makes a run.
     """
     check_option("study.clock", clock, CLOCKS, SceneError)
+    chosen = filled("study.presets", list(presets)) if only is None else filled("study.only", only)
+    for name in chosen:
+        check_option("each of study.only", name, presets, SceneError)
+    selections, seeds = filled("study.selections", selections), filled("study.seeds", seeds)
     folder = Path(output_dir).resolve()
-    common = [*([f"threads={threads}"] if threads else []), *overrides]
+    common = [*([f"threads={threads}"] if threads else []), *listed(overrides)]
     known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on
 
     def of(job: Job, expected: frozenset[str] | None) -> RunResults:
@@ -116,10 +124,10 @@ def run(
         return known.setdefault((job.preset, job.seed, _on(results)), results)
 
     rows = []
-    for preset, truth in presets.items():
+    for preset in chosen:
         for selection in selections:
             job = Job(preset, selection, 0)
-            expected = {"none": frozenset(), "oracle": frozenset(truth)}.get(selection)
+            expected = {"none": frozenset(), "oracle": frozenset(presets[preset])}.get(selection)
             whole = [of(replace(job, seed=seed), expected) for seed in seeds]
             rows.append(_row(job, whole, clock))
             if selection == "auto" and leave_one_out:

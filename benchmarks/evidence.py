@@ -25,6 +25,7 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
+from heatsplat.studies.options import filled, listed
 from heatsplat.training.machine import cores, prepare_machine
 
 log = logging.getLogger("heatsplat")
@@ -239,10 +240,16 @@ def run(
         document: file that is written besides, and in "pictures" beside it how verdicts go with the strength of effects; None
             for none.
         jobs: recordings that are worked on side by side, with one thread each; None: one for each core.
+
+    Raises:
+        SceneError: there is no size, or nothing to decide on.
     """
+    sizes, scenes, seeds, unseen = filled("study.sizes", sizes), listed(scenes), listed(seeds), listed(unseen)
     numbers = {name: range(first, first + count) for name, (first, count) in (drawn or {}).items()}
     cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
     cases += [(f"{DRAWN}{number}", sizes[0], number) for these in numbers.values() for number in these]
+    if not cases:
+        raise SceneError("study.scenes, study.seeds and study.drawn name no recording: give scenes and seeds")
     folder = Path(output_dir) / "verdicts"
     folder.mkdir(parents=True, exist_ok=True)
     known = {case: folder / f"{'_'.join(map(str, case))}.json" for case in cases}

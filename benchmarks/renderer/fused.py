@@ -15,9 +15,11 @@ from benchmarks.renderer.floors import Machine
 from benchmarks.renderer.report import training_table
 from benchmarks.renderer.scenes import Case, build
 from benchmarks.renderer.steps import training_rows
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels.peak import memory_rate, vector_rate
 from heatsplat.renderers import rasterization
+from heatsplat.studies.options import check_count, filled
 from heatsplat.training.optimisation import OnePassAdam
 
 MAPS = 3
@@ -44,7 +46,17 @@ def run(
         cases, steps, rounds, methods: see ``steps.training_rows``; ``rounds`` times ten for the pairs.
         threads: counts of threads; pairs take the first.
         views: counts of views that one update follows.
+
+    Raises:
+        SceneError: a list is empty, or a number counts nothing.
     """
+    cases, threads, views = filled("study.cases", cases), filled("study.threads", threads), filled("study.views", views)
+    filled("study.methods", list(methods))
+    for case in cases:
+        check_numbers("each of study.cases", case, 3, SceneError)
+    for key, counts in {"steps": [steps], "rounds": [rounds], "threads": threads, "views": views}.items():
+        for count in counts:
+            check_count(f"study.{key}", count)
     output_dir = Path(output_dir)
     output_dir.mkdir(parents=True, exist_ok=True)
     tables: dict[str, list[Row]] = {"training": [], "fused": []}

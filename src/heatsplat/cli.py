@@ -170,6 +170,10 @@ def _quoted(override: str) -> str:
     key, _, value = override.partition("=")
     if re.fullmatch(r"[+-]?\d+,\d+", value):
         return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+    if re.fullmatch(r"\[[^][{}'\"]*\]?", value):  # without its end where a shell took it apart at a space
+        words = [setting("", word.strip())[1:] for word in value.strip("[]").split(",") if word.strip()]
+        whole = ",".join([*words, *([] if value.endswith("]") else ["..."])])
+        return f"A list is one argument, and text with = or umlauts in it takes quotes: {typed(f'{key}=[{whole}]')}"
     if not value or value[0] in "[{'\"":
         return ""
     return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: {typed(setting(key, value))}"

@@ -92,6 +92,21 @@ def test_one_seed_has_no_spread_and_processor_seconds_are_a_clock(commands, tmp_
         study.run(tmp_path, **settings | {"clock": "hours"})
 
 
+def test_some_presets_run_and_nothing_is_refused(commands, tmp_path):
+    study.run(tmp_path, **SETTINGS | {"only": "static", "seeds": 1, "selections": "none"})
+    assert len(commands) == 1 and "data.scene=static" in commands[0]
+    for wrong, message in (
+        ({"presets": {}}, r"study.presets=\[\] has nothing in it"),
+        ({"only": []}, r"study.only=\[\] has nothing in it"),
+        ({"only": ["hot"]}, "each of study.only must be one of static, heated, sheets, got 'hot'"),
+        ({"selections": []}, r"study.selections=\[\] has nothing in it"),
+        ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            study.run(tmp_path, **SETTINGS | wrong)
+    assert len(commands) == 1
+
+
 def test_many_effects_are_counted(commands, tmp_path, monkeypatch):
     monkeypatch.setattr(study, "MOST_NAMED", 2)
     study.run(tmp_path, **SETTINGS | {"seeds": [0], "leave_one_out": False})

@@ -60,6 +60,19 @@ def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
     assert "## Verdicts compared with the truth, tiny, on recordings not used to set thresholds" in text
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sizes": []}, r"study.sizes=\[\] has nothing in it"),
+        ({"scenes": [], "drawn": None}, "study.scenes, study.seeds and study.drawn name no recording"),
+    ],
+)
+def test_nothing_to_decide_on_is_refused(wrong, message, tmp_path):
+    with pytest.raises(SceneError, match=message):
+        run(tmp_path, None, **{"scenes": ["static"]} | wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path, monkeypatch):
     nothing = {effect.name: Verdict(effect.name, False, None, None, "") for effect in CATALOGUE}
     monkeypatch.setattr(evidence, "decide", lambda scene: nothing)  # other tests decide

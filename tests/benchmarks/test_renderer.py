@@ -75,6 +75,24 @@ def test_the_study_of_cuda_times_steps_and_refuses_a_machine_without(tmp_path, m
         on_cuda.run(tmp_path, [(300, 32, 24)], 2, {})
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"cases": []}, r"study.cases=\[\] has nothing in it"),
+        ({"cases": [500, 64, 48]}, "each of study.cases must be a list of 3 numbers, got 500"),
+        ({"methods": {}}, r"study.methods=\[\] has nothing in it"),
+        ({"threads": []}, r"study.threads=\[\] has nothing in it"),
+        ({"rounds": 0}, "study.rounds must be a whole number, 1 or more, got 0"),
+        ({"steps": "abc"}, "study.steps must be a whole number, 1 or more, got abc"),
+        ({"views": [1, 0]}, "study.views must be a whole number, 1 or more, got 0"),
+    ],
+)
+def test_the_study_of_steps_refuses_what_times_nothing(wrong, message, tmp_path):
+    options = {"cases": [[500, 64, 48]], "steps": 8, "rounds": 1, "threads": [1], "methods": {"etgs": ["method=etgs"]}}
+    with pytest.raises(SceneError, match=message):
+        fused.run(tmp_path, **options | wrong)
+
+
 @pytest.mark.slow
 def test_the_study_of_steps_tells_ratios(tmp_path):
     overrides = ["study=steps", "study.cases=[[500,64,48]]", "study.steps=8", "study.rounds=1", "study.threads=[1]"]

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from hydra.core.utils import JobStatus
 from omegaconf import OmegaConf
 from running import run
 
+from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
 from heatsplat.training.machine import cores
 
@@ -129,6 +131,23 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     )
     done, failed = JobStatus.COMPLETED, JobStatus.FAILED
     assert launched(tmp_path, *jobs) == ([1, 2], [done, failed, failed])
+
+
+@pytest.mark.parametrize("launcher", ["joblib.Joblib", "ray.Ray"])
+def test_a_job_is_started_at_least_once(launcher):
+    module, _, name = launcher.partition(".")
+    made = getattr(import_module(f"hydra_plugins.heatsplat_launchers.{module}"), name)
+    with pytest.raises(ValueError, match="hydra.launcher.retries must be 0 or more, got -1"):
+        made(retries=-1)
+    assert made(retries=0).retries == 0
+
+
+def test_without_slurm_its_rehearsal_is_named(monkeypatch, tmp_path):
+    from hydra_plugins.heatsplat_launchers.submitit import Slurm
+
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SceneError, match=r"no srun.*launcher=submitit_local rehearses it here"):
+        Slurm().outcomes([])
 
 
 @pytest.mark.slow  # processes of their own load torch five times over; shares and going on: test_stop_and_go_on.py

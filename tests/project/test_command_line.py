@@ -9,6 +9,7 @@ import hydra
 import numpy as np
 import pytest
 from commands import succeeds
+from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
 from heatsplat import cli, composition
@@ -203,6 +204,21 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
 def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
     output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        ("study.overrides=[data.size=tiny, threads=1]", "\"study.overrides=['data.size=tiny','threads=1']\""),
+        ("study.overrides=[data.size=tiny,", "\"study.overrides=['data.size=tiny',...]\""),
+        ("study.scenes=[küche,flur]", "\"study.scenes=['küche',flur]\""),
+    ],
+)
+def test_a_list_is_told_its_quotes(wrong, meant):
+    assert cli._quoted(wrong).endswith(f" {meant}")
+    with pytest.raises(OverrideParseException):
+        composition.compose([wrong], "study")
+    assert cli._quoted("a=[x,[y=1]]") == cli._quoted("a=['b=c',d=e]") == ""
 
 
 def test_a_group_set_to_null_is_told_its_options(tmp_path):

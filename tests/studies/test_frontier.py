@@ -196,6 +196,31 @@ def test_runs_that_differ_in_more_than_their_seeds_are_recipes_of_their_own(tmp_
     assert names_by_panel(tmp_path) == {"cooling": names}
 
 
+def test_a_word_or_number_is_a_list_of_one():
+    knobs = {"dtype": "float64", "max_steps": 9}
+    ((place, overrides),) = asked_for("etgs", "heated", 0, knobs)
+    assert place == "etgs_heated_dtype=float64_max_steps=9_seed=0" and overrides[1] == "data.scene=heated"
+    assert asked_for({"etgs": knobs}, ["heated"], [0], None) == [(place, overrides)]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
+        ({"scenes": None}, "study.scenes=None has nothing in it"),
+        ({"knobs": {"dtype": []}}, r"study.knobs.dtype=\[\] has nothing in it"),
+        ({"methods": {"etgs": {"dtype": None}}}, "study.methods.etgs.dtype=None has nothing in it"),
+        ({"knobs": "dtype"}, r"study.knobs=dtype: give settings with their values, such as \{max_steps"),
+        ({"methods": {"etgs": 24}}, "study.methods.etgs=24: give settings with their values"),
+    ],
+)
+def test_what_would_train_nothing_is_refused(wrong, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(frontier, "trained", None)
+    options = {"methods": ["3dgs"], "scenes": ["heated"], "seeds": [0], "knobs": None} | wrong
+    with pytest.raises(SceneError, match=message):
+        run(tmp_path / "out", None, **LEVELS, **options)
+
+
 def test_a_knob_that_is_null_is_null_for_its_run():
     ((place, overrides),) = asked_for(["etgs"], ["heated"], [0], {"thermal.clip": [None]})
     assert overrides[-1] == "thermal.clip=null" and place.endswith("thermal.clip=null_seed=0")
@@ -269,6 +294,9 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
 
 def test_the_commands_in_the_configuration_make_runs_that_compose(tmp_path):
     text = CONFIG.read_text()
+    of_all = [shlex.split(typed)[0] for typed in re.findall(r'"study.overrides=[^"]+"', text)]
+    lists = [compose_run(tmp_path, "study=frontier", typed, config_name="study").study.overrides for typed in of_all]
+    assert lists == [["data=rhd", "data.root=/data/RHD"], ["data.size=tiny", "threads=1"]]
     (trains,) = re.findall(r"^# +python src/study.py (study=frontier study.methods.+)$", text, re.MULTILINE)
     (own,) = re.findall(r'^# +\.\.\. ("study.methods=.+")$', text, re.MULTILINE)
     same, other = shlex.split(trains), shlex.split(own)

@@ -23,6 +23,14 @@ def test_every_method_meets_every_scene_once_for_each_seed(tmp_path):
     assert board(tmp_path, train=False).jobs() == []
 
 
+def test_a_word_or_number_is_a_list_of_one(tmp_path):
+    root = protocol_folder(tmp_path / "root", "cooling", "coarse_camera")
+    theirs = str(submission(tmp_path / "theirs", 0.1))
+    found = board(root, methods="etgs", scenes="cooling", tracks="steps", seeds=0, submissions=theirs)
+    assert [found.methods, found.scenes, found.tracks, found.seeds] == [["etgs"], ["cooling"], ["steps"], [0]]
+    assert len(found.submissions) == 1
+
+
 def test_what_there_is_not_is_refused(tmp_path):
     with pytest.raises(SceneError, match="study=scenes study.target"):
         board(tmp_path)

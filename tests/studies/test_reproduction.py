@@ -12,10 +12,12 @@ import torch
 import yaml
 from commands import succeeds
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
+from heatsplat.io.results import RunResults
 from heatsplat.studies.finished import Runs
 from heatsplat.studies.published import Reproduction, Run, reproduction_of
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
@@ -124,6 +126,21 @@ def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
     )
 
 
+def test_folders_are_told_on_the_command_line_by_the_scenes_of_the_table(tmp_path):
+    root = put(tmp_path / "RHD", "sparse", "my_bench")
+    typed = "table.folders={cooling_bench: my_bench}"
+    table = OmegaConf.to_container(compose_run(tmp_path, "experiment=table_etgs_1", typed).table)
+    assert {(run.scene, run.folder) for run in reproduction_of(table, str(root), METHODS).runs} == {
+        ("cooling_bench", "my_bench")
+    }
+    for wrong, message in (
+        ({"bench": "my_bench"}, r"table.folders: bench is no scene of RHD \(ETGS\); there are cooling_checkboard, "),
+        ("my_bench", r"such as 'table.folders=\{cooling_checkboard: NAME\}'"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            reproduced("etgs_1", None, folders=wrong)
+
+
 def test_a_run_on_an_unseen_scene_comes_after_one_on_all_others(tmp_path):
     reproduction = reproduced("thermogs_2", put(tmp_path, "meta.json", "S1", "S2", "S3", "S4"))
     rows = ["ntr_gaussian_cross_time", "thermogs_cross_scene", "thermogs_cross_time"]
@@ -204,6 +221,10 @@ def test_what_is_asked_for_limits_the_runs_and_not_the_table(tmp_path):
     assert [(run.method, run.setting, run.scene) for run in reproduction.runs] == [("ti3dgs", "7k", "wall")]
     assert reproduction.runs[0].overrides == ("method=ti3dgs", "trainer.max_steps=7000", "data.scene='wall'")
     assert reproduction.absent["ti3dgs", "30k"] == "not asked for" and ("plenoxels", "") in reproduction.rows
+    assert reproduced("ti3dgs_i", root, methods="ti3dgs", settings="7k", scenes="wall").runs == reproduction.runs
+    assert [run.row for run in reproduced("ti3dgs_i", root, methods="etgs", settings="7k", scenes="wall").runs] == [
+        "etgs_7k"
+    ]
     grouped = reproduced("ti3dgs_iv", root, scenes=["ti_nsd_outdoor"])
     assert {run.scene for run in grouped.runs} == {"bridge"} and len(grouped.missing) == 6
 
@@ -336,8 +357,10 @@ def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
     found = results("apples", "3dgs", train_seconds=600.0, render_fps=10.0) | results(
         "wall", "3dgs", train_seconds=1200.0, render_fps=30.0
     )
-    line = next(line for line in compare(reproduction, found) if line.method == "3dgs")
-    assert line.ours == {"train_min": 15.0, "fps": 20.0} and line.label == "(scenes not named) (2 of 20)"
+    printed, line = (line for line in compare(reproduction, found) if line.method == "3dgs")
+    assert printed.label == "(scenes not named)" and printed.ours == {}
+    assert line.ours == {"train_min": 15.0, "fps": 20.0} and line.theirs == {}
+    assert line.label == "mean of the scenes that ran (2 of 20)"
     small = [run for run in reproduction.runs if run.method == "3dgs"]
     assert len(small) == 3 and small[0].overrides[:2] == ("method=3dgs", "data.degrade=lr4")
     tones = reproduced("supirgs_1", root)
@@ -346,9 +369,22 @@ def test_groups_and_unnamed_scenes_are_means_and_units_are_the_papers(tmp_path):
         | results("wall", "supirgs", psnr=32.0)
         | results("uav1", "supirgs", psnr=9.0)
     )
-    by_scene = {line.scene: line for line in compare(tones, found) if line.method == "supirgs"}
-    assert by_scene["ti_nsd_indoor"].ours["psnr"] == 31.0 and by_scene["ti_nsd_uav"].ours["psnr"] == 9.0
-    assert by_scene["ti_nsd_outdoor"].ours == {}
+    by_scene = {line.label: line for line in compare(tones, found) if line.method == "supirgs"}
+    indoor = by_scene["mean of the scenes that ran, ti_nsd_indoor (2 of 7)"]
+    assert indoor.ours["psnr"] == 31.0 and indoor.difference("psnr") is None
+    assert by_scene["mean of the scenes that ran, ti_nsd_uav (1 of 6)"].ours["psnr"] == 9.0
+    assert {by_scene[f"ti_nsd_{place}"].ours.get("psnr") for place in ("indoor", "outdoor", "uav")} == {None}
+
+
+def test_a_mean_over_some_scenes_is_not_compared_with_the_printed_mean_over_all(tmp_path):
+    reproduction = reproduced("etgs_4", everything(tmp_path, "etgs_4"))
+    scenes = list(reproduction.source.scenes)
+    found = {key: one for scene in scenes[:3] for key, one in results(scene, "etgs_K=24", psnr=15.0).items()}
+    text = markdown(reproduction, compare(reproduction, found))
+    assert "| average | etgs | K=24 | – / 40.68 |" in text and "average (3 of 10)" not in text
+    assert "| mean of the scenes that ran (3 of 10) | etgs | K=24 | 15.00 / – |" in text
+    found |= {key: one for scene in scenes[3:] for key, one in results(scene, "etgs_K=24", psnr=15.0).items()}
+    assert "| average | etgs | K=24 | 15.00 / 40.68 (-25.68) |" in markdown(reproduction, compare(reproduction, found))
 
 
 def write_fake(layout: str, root: Path, *scenes: str) -> Path:
@@ -465,13 +501,42 @@ def test_without_data_nothing_trains_and_dry_runs_tell_only(tmp_path):
     assert "choose among them with table.methods" in output and "Traceback" not in output
 
 
+def job(sweep: Path, method: str, scene: str, psnr: float | None) -> Path:
+    """A job's folder as a run leaves it; without a PSNR it has no results."""
+    folder = sweep / f"{method}_{scene}_"
+    (folder / ".hydra").mkdir(parents=True)
+    told = [f"method={method}", f"row='{method}'", f"data.scene='{scene}'"]
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(told))
+    (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump({"data": {"scene": scene}}))
+    if psnr is not None:
+        RunResults(run={"scene": scene, "method": method}, test={"psnr": psnr}).write(folder / "metrics.json")
+    return folder
+
+
+def test_a_table_that_is_filled_piece_by_piece_keeps_what_it_has(tmp_path):
+    """Each command asks for one scene or method; the comparison is of all that is in the folder."""
+    root, sweep = put(tmp_path / "RHD", "sparse", "cooling_bench", "my_bike"), tmp_path / "sweep"
+    told = {"cooling_ebike": "my_bike"}
+    pieces = (("etgs", "cooling_bench", {}), ("energy_balance", "cooling_bench", {}), ("3dgs", "my_bike", told))
+    for method, folder, folders in pieces:
+        scene = "cooling_ebike" if folders else folder
+        reproduction = reproduced("etgs_1", root, methods=[method], scenes=[scene], folders=folders)
+        (run,) = reproduction.runs
+        job(sweep, run.method, run.folder, 30.0)
+        write_comparison(sweep, reproduction)
+    text = (sweep / "comparison.md").read_text()
+    for line in ("cooling_bench | etgs", "cooling_bench | energy_balance", "cooling_ebike | 3dgs"):
+        assert f"| {line} | 30.00 / " in text
+    assert "- The paper's figures only: ntr_gaussian (not asked for)" in text
+    with open(sweep / "comparison.csv", newline="") as file:
+        ours = {(row["scene"], row["method"]) for row in csv.DictReader(file) if row["ours"]}
+    assert {("cooling_bench", "etgs"), ("cooling_bench", "energy_balance"), ("cooling_ebike", "3dgs")} <= ours
+
+
 def test_a_run_that_failed_is_named_in_the_comparison(tmp_path):
     reproduction = reproduced("etgs_1", put(tmp_path / "RHD", "sparse", "cooling_bench"))
-    job = tmp_path / "sweep" / "etgs_cooling_bench_" / ".hydra"
-    job.mkdir(parents=True)
-    (job / "overrides.yaml").write_text(yaml.safe_dump(["row='etgs'", "data.scene='cooling_bench'"]))
-    (job / "config.yaml").write_text(yaml.safe_dump({"data": {"scene": "cooling_bench"}}))
-    (job.parent / "FAILED").write_text("Traceback\nSceneError: no points\n")
+    failed = job(tmp_path / "sweep", "etgs", "cooling_bench", None)
+    (failed / "FAILED").write_text("Traceback\nSceneError: no points\n")
     write_comparison(tmp_path / "sweep", reproduction)
     text = (tmp_path / "sweep" / "comparison.md").read_text()
     assert "## Jobs without a result\n\n- etgs on cooling_bench: SceneError: no points" in text

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import succeeds
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat.io.results import METRICS_FILE, RunResults
@@ -307,15 +310,41 @@ def test_what_is_quoted_of_several_scenes_stands_side_by_side():
     assert quoted("ti3dgs", "IV", "no_tif", ["ti_nsd_indoor", "nowhere"]) == {}
 
 
-def test_an_ablation_says_whose_parts_it_takes_away(tmp_path):
-    command = [TRAIN, "ablation=etgs_frequencies", "method=3dgs", f"hydra.sweep.dir={tmp_path}"]
-    assert "parts of method=etgs, and method=3dgs lacks some" in succeeds(command, code=1)
+def test_an_ablation_refuses_another_method_before_any_job(tmp_path):
+    """Rows such as thermal=static compose with it, and are not what they are called."""
+    short = ("data.size=tiny", "debug=fast", "seed=0")
+    command = [TRAIN, "ablation=ti3dgs_medium", "method=3dgs", *short, f"hydra.sweep.dir={tmp_path}/sweep"]
+    told = succeeds(command, code=1)
+    assert "parts of method=ti3dgs, not of method=3dgs: leave method out" in told and "Traceback" not in told
+    assert not (tmp_path / "sweep").exists()
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
 def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
-    assert compose_run(tmp_path, f"ablation={path.stem}").name == path.stem.partition("_")[0]
-    assert compose_run(tmp_path, f"ablation={path.stem}", "method=3dgs").name == "3dgs"
+    own = compose_run(tmp_path, f"ablation={path.stem}").name
+    of = HydraConfig.get().sweeper.of
+    assert own == path.stem.partition("_")[0] == (of if isinstance(of, str) else of[0])
+    from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
+
+    def jobs(*arguments: str) -> list[list[str]]:
+        sweeper = RowSweeper(rows={"a": {"set": ["max_steps=5"]}}, of=of)
+        sweeper.config = OmegaConf.create({"hydra": {"runtime": {"choices": {"method": own}}}})
+        (found,) = sweeper.split_arguments(OverridesParser.create().parse_overrides(list(arguments)), None)
+        return found
+
+    assert jobs("seed=0") == [["seed=0", "max_steps=5", "row='a'"]] and jobs(f"method={own}")
+    for others in ("method=3dgs", f"method={own},3dgs"):
+        with pytest.raises(ValueError, match=rf"parts of method={own}.*, not of method=3dgs"):
+            jobs(others)
+
+
+def test_an_ablation_may_be_of_several_methods(tmp_path):
+    """The authors' code of ETGS has numbers of frequencies too."""
+    compose_run(tmp_path, "ablation=etgs_frequencies", "method=etgs_released")
+    sweeper = HydraConfig.get().sweeper
+    assert "etgs_released" in sweeper.of
+    for row in sweeper.rows.values():
+        assert compose_run(tmp_path, "method=etgs_released", *row.set).name == "etgs_released"
 
 
 def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(tmp_path):

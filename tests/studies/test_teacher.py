@@ -9,6 +9,7 @@ from heatsplat.contracts import Camera, Frame, SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.losses.swinir import SwinIR
 from heatsplat.losses.teacher import load_teacher
+from heatsplat.studies import teacher
 from heatsplat.studies.teacher import images_of, made_small, patches, run, train
 
 OPTIONS = {
@@ -21,10 +22,10 @@ DATA = partial(Synthetic, size="tiny", frames=3)
 def test_its_file_is_a_teacher(tmp_path):
     file = run(tmp_path, DATA, ["room_0", "room_1"], ["room_2"], **OPTIONS)
     assert file.name == "teacher_x2.pth"
-    teacher = load_teacher(str(file), cache=None)
+    loaded = load_teacher(str(file), cache=None)
     image = DATA(scene="room_2").scene.train[0].thermal
     frame = Frame("0.png", 0, Camera(torch.eye(4), torch.eye(3), image.shape[1], image.shape[0]))
-    assert teacher(image, frame, 2).shape == (2 * image.shape[0], 2 * image.shape[1], 1)
+    assert loaded(image, frame, 2).shape == (2 * image.shape[0], 2 * image.shape[1], 1)
     page = (tmp_path / "teacher.md").read_text()
     assert "6 images of 2 scenes" in page and "teacher_x2.pth" in page
     assert {"bicubic", "lanczos", "network"} <= set(page.replace("|", " ").split())
@@ -60,6 +61,23 @@ def test_training_lowers_the_error():
     before = error()
     train(model, fine, coarse, steps=40, batch=4, patch=8, rate=5e-3, seed=0)
     assert error() < 0.4 * before
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"scenes": []}, r"study.scenes=\[\] has nothing in it"),
+        ({"held_out": []}, r"study.held_out=\[\] has nothing in it"),
+        ({"held_out": ["no_room"]}, "no_room"),
+        ({"steps": 0}, "study.steps must be a whole number, 1 or more, got 0"),
+        ({"batch": "abc"}, "study.batch must be a whole number, 1 or more, got abc"),
+        ({"factor": 0}, "study.factor must be a whole number"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_learned(wrong, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(teacher, "train", None)
+    with pytest.raises(ValueError, match=message):
+        run(tmp_path, DATA, **{"scenes": ["room_0"], "held_out": "room_1"} | OPTIONS | wrong)
 
 
 def test_scenes_that_tell_are_not_learned_from(tmp_path):

@@ -93,7 +93,7 @@ def test_a_recipe_that_is_nothing_is_left_out(runs, tmp_path):
 
 def test_the_standard_schedule_in_the_same_time_lies_between_its_runs(runs, tmp_path):
     """20 s are half way between 10 and 40 over log seconds."""
-    (panel,) = run(tmp_path / "out", str(runs), REFERENCE, RECIPES)
+    (panel,) = run(tmp_path / "out", str(runs), *REFERENCE, {"quick": "preset=fast"})  # words are lists of one
     row = by_recipe(tmp_path / "out")["standard in the time of quick"]
     assert float(row["psnr"]) == pytest.approx(37.0) and float(row["mae_c"]) == pytest.approx(1.3)
     assert float(row["steps"]) == 250 and float(row["seconds"]) == 20.0
@@ -155,11 +155,21 @@ def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path):
         ({"reference": ["max_steps=9"]}, r"there is no finished run of the reference \(max_steps=9\)"),
         ({"reference": ["density=adaptive"]}, "give its length too"),
         ({"clock": "wall"}, "study.clock=wall: give one of train_seconds, cpu_seconds"),
+        ({"cases": {"a": ["method=etgs"]}, "seeds": []}, r"study.seeds=\[\] has nothing in it"),
+        ({"cases": {"a": ["method=etgs"]}, "lengths": ["long"]}, "study.lengths must be a whole number"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(wrong, message, runs, tmp_path):
     with pytest.raises(SceneError, match=message):
         run(**{"output_dir": tmp_path / "out", "runs": str(runs), "reference": REFERENCE, "recipes": RECIPES} | wrong)
+
+
+def test_a_word_or_number_is_a_list_of_one():
+    found = time_to_accuracy.asked_for({"a": "method=etgs"}, ["max_steps=9"], 5, {}, 0)
+    assert found == [
+        ("a_reference_0", ["method=etgs", "max_steps=9", "seed=0"]),
+        ("a_standard_5_0", ["method=etgs", "max_steps=5", "seed=0"]),
+    ]
 
 
 def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monkeypatch):

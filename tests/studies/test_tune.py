@@ -38,7 +38,9 @@ def world(monkeypatch):
             return RunResults.read(place / METRICS_FILE)
         settings = dict(text.split("=", 1) for text in overrides)
         started.append(settings)
-        if float(settings.get("thermal.lr_source", 0)) > 0.9:
+        last = study / "tune.md"
+        settings["report"] = last.read_text() if last.exists() else ""
+        if float(settings.get("thermal.lr_source", 0)) > 0.9 or settings.get("fragile") == settings["seed"]:
             place.mkdir(parents=True, exist_ok=True)
             (place / FAILED).write_text("Traceback\nSceneError: the loss is NaN\n")
             raise SceneError("a run of the study failed")
@@ -84,6 +86,26 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(world, tmp_path):
     assert check.verdict == "better" and "failed: SceneError: the loss is NaN" in (tmp_path / "tune.md").read_text()
 
 
+def test_a_best_setting_that_fails_on_another_seed_is_told(world, tmp_path):
+    cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": {"among": [0.3]}, "fragile": {"among": [2]}}}}
+    (check,) = tune.run(tmp_path, cases, trials=1)
+    assert check.verdict == "failed: SceneError: the loss is NaN" and check.gains == []
+    assert [len(several) for several in (check.default, check.best)] == [3, 2]
+    rows = [line for line in (tmp_path / "tune.md").read_text().splitlines() if "thermal.lr_source=0.3" in line]
+    assert rows[0].endswith("|  | failed: SceneError: the loss is NaN |") and "| 2 |" in rows[0]
+
+
+def test_what_a_search_found_is_written_before_it_is_compared(world, tmp_path):
+    """A default that fails with another seed ends the study, and not what it has found."""
+    cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": {"among": [0.3]}}}}
+    with pytest.raises(SceneError):
+        tune.run(tmp_path, cases, trials=1, seeds=[1, 3], overrides=["fragile=3"])
+    assert "| 0.3 |" in (tmp_path / "tune.md").read_text()
+    tune.run(tmp_path / "other", cases, trials=1, check_steps=[1500, 7000])
+    first = next(run for run in world if run["max_steps"] == "7000")
+    assert "| etgs | 1500 | default | 3 |" in first["report"] and "7000" not in first["report"]
+
+
 def test_no_trial_begins_when_the_seconds_are_spent(world, tmp_path):
     tune.run(tmp_path, CASES, trials=9, seconds=12)
     assert [run["seed"] for run in world].count("0") == 1 + 3  # 5 s each
@@ -100,6 +122,14 @@ def test_lengths_are_checked_one_by_one_and_methods_chosen(world, tmp_path):
     found = tune.run(tmp_path, cases, methods=["3dgs"], check_steps=[1500, 7000], trials=8)
     assert [(check.method, check.steps) for check in found] == [("3dgs", 1500), ("3dgs", 7000)]
     assert {run["method"] for run in world} == {"3dgs"}
+
+
+def test_a_word_or_number_is_a_list_of_one(world, tmp_path):
+    case = {"scene": "data.scene=heated", "knobs": {"thermal.lr_source": {"among": 0.3}, "b": {"among": "xx"}}}
+    options = {"methods": "etgs", "check_steps": 1500, "seeds": 1, "overrides": "logger=none"}
+    (check,) = tune.run(tmp_path, {"etgs": case, "3dgs": case}, trials=1, **options)
+    assert (check.method, check.steps, len(check.best)) == ("etgs", 1500, 1)
+    assert world[1]["data.scene"] == "heated" and world[1]["b"] == "xx" and world[1]["logger"] == "none"
 
 
 @pytest.mark.parametrize(
@@ -124,7 +154,16 @@ def test_better_is_what_all_seeds_say_by_more_than_they_differ(default, best, ve
     ("changed", "message"),
     [
         ({"score": "speed"}, "study.score=speed"),
-        ({"trials": 0}, "study.trials"),
+        ({"trials": 0}, "study.trials must be a whole number, 1 or more, got 0"),
+        ({"trials": "abc"}, "study.trials must be a whole number, 1 or more, got abc"),
+        ({"search_steps": 0}, "study.search_steps must be a whole number"),
+        ({"check_steps": [1500, "long"]}, "study.check_steps must be a whole number, 1 or more, got long"),
+        ({"seconds": "long"}, "study.seconds must be a number, got long"),
+        ({"seeds": []}, "study.seeds=.* give at least one value"),
+        ({"seeds": [1, "a"]}, "study.seeds must be a whole number, 0 or more, got a"),
+        ({"seeds": [1, 0]}, r"study.seeds=\[1, 0\]: .* not 0, with which the settings were found"),
+        ({"seeds": [1, 2, 1]}, r"study.seeds=\[1, 2, 1\]: give every seed once"),
+        ({"cases": {"etgs": None}}, "study.cases.etgs has the keys scene and knobs"),
         ({"methods": ["mine"]}, r"mine has no case.*\+study.cases=\{mine:\{scene"),
         ({"cases": {"etgs": {"scene": []}}}, "keys scene and knobs"),
         ({"cases": {"etgs": {"scene": [], "knobs": {"a": [2, 1]}}}}, r"knobs.a=\[2, 1\]: give \[lowest"),

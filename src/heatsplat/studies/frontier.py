@@ -23,6 +23,7 @@ from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import spelled, trained
 from heatsplat.studies.frontier_report import markdown, page, picture, records
 from heatsplat.studies.frontier_runs import Recipe, find_runs, group
+from heatsplat.studies.options import filled, listed
 
 log = logging.getLogger("heatsplat")
 
@@ -56,7 +57,8 @@ def run(
         outputs: where runs lie.
 
     Raises:
-        SceneError: there is no finished run in them, one of the study's failed, or levels are not positive numbers.
+        SceneError: there is no finished run in them, one of the study's failed, levels are not positive numbers, or what is to
+            be trained has no scene, seed or value of a knob.
     """
     output_dir = Path(output_dir)
     levels = {
@@ -65,9 +67,9 @@ def run(
     }
     if runs is None:
         runs = [] if methods else outputs
-    folders = [Path(text).expanduser() for text in ([runs] if isinstance(runs, str) else runs)]
-    for place, wanted in asked_for(methods or (), scenes, seeds, knobs or {}):
-        trained(output_dir / "runs" / place, train, [*overrides, *wanted], output_dir)
+    folders = [Path(text).expanduser() for text in listed(runs)]
+    for place, wanted in asked_for(methods, scenes, seeds, knobs):
+        trained(output_dir / "runs" / place, train, [*listed(overrides), *wanted], output_dir)
         folders = [*folders, output_dir / "runs" / place]
     found = find_runs(folders)
     if found.empty:
@@ -98,20 +100,30 @@ def run(
 
 
 def asked_for(
-    methods: Sequence[str] | Mapping[str, Mapping[str, Sequence[Any]]],
+    methods: Sequence[str] | Mapping[str, Mapping[str, Sequence[Any]]] | None,
     scenes: Sequence[str],
     seeds: Sequence[int],
-    knobs: Mapping[str, Sequence[Any]],
+    knobs: Mapping[str, Sequence[Any]] | None,
 ) -> list[tuple[str, list[str]]]:
-    """Folder and overrides of every run that ``run`` trains."""
-    jobs = []
-    for method in methods:
-        grid = {**knobs, **(methods[method] or {} if isinstance(methods, Mapping) else {})}
+    """Folder and overrides of every run that ``run`` trains. Raises SceneError where it is said of nothing."""
+    if not methods:
+        return []
+    jobs, scenes, seeds = [], filled("study.scenes", scenes), filled("study.seeds", seeds)
+    own = methods if isinstance(methods, Mapping) else dict.fromkeys(listed(methods))
+    for method in own:
+        grid = {**_grid("study.knobs", knobs), **_grid(f"study.methods.{method}", own[method])}
         for scene, seed, *values in itertools.product(scenes, seeds, *grid.values()):
             settings = [f"{key}={spelled(value)}" for key, value in zip(grid, values, strict=True)]
             place = "_".join([method, scene, *(text.replace("/", "-") for text in settings), f"seed={seed}"])
             jobs.append((place, [f"method={method}", f"data.scene={scene}", f"seed={seed}", *settings]))
     return jobs
+
+
+def _grid(key: str, knobs: Any) -> dict[str, list[Any]]:
+    """Knobs and their values; none for null. Raises SceneError where one has no value."""
+    if not isinstance(knobs, Mapping | None):
+        raise SceneError(f"{key}={knobs}: give settings with their values, such as {{max_steps: [1000, 3000]}}")
+    return {name: filled(f"{key}.{name}", values) for name, values in (knobs or {}).items()}
 
 
 def checked_levels(name: str, levels: Any) -> list[float]:

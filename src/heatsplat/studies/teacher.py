@@ -21,6 +21,7 @@ from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.losses.swinir import SwinIR
 from heatsplat.metrics.psnr import psnr
+from heatsplat.studies.options import check_count, filled
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")
@@ -58,13 +59,17 @@ def run(
         seed: of the network's start and of what is cut out.
 
     Raises:
-        SceneError: a scene is in both lists, or its images are smaller than a patch.
+        SceneError: a list has no scene, a scene is in both, its images are smaller than a patch, or a number counts nothing.
     """
     output_dir = Path(output_dir)
+    scenes, held_out = filled("study.scenes", scenes), filled("study.held_out", held_out)
+    for key, value in {"factor": factor, "steps": steps, "batch": batch, "patch": patch}.items():
+        check_count(f"study.{key}", value)
     if both := sorted(set(scenes) & set(held_out)):
         raise SceneError(f"study.held_out names scenes that the network learns from: {', '.join(both)}")
     log.info("rendering %d scenes", len(scenes) + len(held_out))
     fine = torch.cat([images_of(data(scene=name), factor) for name in tqdm(scenes, desc="scenes")])
+    shown = torch.cat([images_of(data(scene=name), factor) for name in tqdm(held_out, desc="held out")])
     if min(fine.shape[2:]) < factor * patch:
         raise SceneError(
             f"images of {fine.shape[3]} x {fine.shape[2]} pixels are smaller than a patch of {factor * patch} fine ones: "
@@ -82,7 +87,6 @@ def run(
     torch.save(model.state_dict(), stored)
     write_atomically(file, stored.getvalue())
 
-    shown = torch.cat([images_of(data(scene=name), factor) for name in held_out])
     scores, guesses = measured(model, shown, factor)
     best = max(INTERPOLATIONS, key=scores.__getitem__)
     rows = [(name, f"{score:.2f}") for name, score in scores.items()]

@@ -20,6 +20,7 @@ from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import trained
 from heatsplat.studies.finished import settings_of
 from heatsplat.studies.frontier_runs import find_runs
+from heatsplat.studies.options import check_count, filled, listed
 from heatsplat.studies.time_to_accuracy_report import markdown, picture, records
 from heatsplat.studies.time_to_accuracy_runs import Panel, panels_of, parsed, without_length
 
@@ -65,24 +66,25 @@ def run(
         outputs: where runs lie.
 
     Raises:
-        SceneError: the reference has no length, the clock is none, a run of the study failed, or there is no finished
-            reference.
+        SceneError: the reference has no length, the clock is none, a length is no number of steps, there are cases and no
+            seed, a run of the study failed, or there is no finished reference.
     """
-    output_dir = Path(output_dir)
-    recipes = {name: given for name, given in recipes.items() if given is not None}
+    output_dir, reference, overrides = Path(output_dir), listed(reference), listed(overrides)
+    recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
     if clock not in CLOCKS:
         raise SceneError(f"study.clock={clock}: give one of {', '.join(CLOCKS)}")
     if "max_steps" not in parsed(reference):
-        raise SceneError(f"study.reference={list(reference)}: give its length too, such as max_steps=30000")
+        raise SceneError(f"study.reference={reference}: give its length too, such as max_steps=30000")
     if runs is None:
         runs = [] if cases else outputs
-    folders = [Path(text).expanduser() for text in ([runs] if isinstance(runs, str) else runs)]
+    folders = [Path(text).expanduser() for text in listed(runs)]
+    wanted = asked_for(cases, reference, lengths, recipes, seeds)
     known = find_runs(folders, clock)
     common = set(settings_of(parsed(overrides)))
     there = {_identity(found, common) for found in known["overrides"]} if len(known) else set()
-    for place, wanted in asked_for(cases or {}, reference, lengths, recipes, seeds):
-        if _identity(parsed(wanted), common) not in there:
-            trained(output_dir / "runs" / place, train, [*overrides, *wanted], output_dir)
+    for place, own in wanted:
+        if _identity(parsed(own), common) not in there:
+            trained(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
             folders = [*folders, output_dir / "runs" / place]
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
     panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common)
@@ -101,17 +103,22 @@ def run(
 
 
 def asked_for(
-    cases: Mapping[str, Sequence[str]],
+    cases: Mapping[str, Sequence[str]] | None,
     reference: Sequence[str],
     lengths: Sequence[int],
     recipes: Mapping[str, Sequence[str]],
     seeds: Sequence[int],
 ) -> list[tuple[str, list[str]]]:
-    """Folder and overrides of every run that the study needs."""
+    """Folder and overrides of every run that the study needs. Raises SceneError as ``run`` does."""
+    if not cases:
+        return []
+    lengths, seeds = listed(lengths), filled("study.seeds", seeds)
+    for length in lengths:
+        check_count("study.lengths", length)
     shorter = {f"standard_{length}": [*without_length(reference), f"max_steps={length}"] for length in lengths}
     wanted = {"reference": list(reference), **shorter, **recipes}
     return [
-        (f"{case}_{name}_{seed}", [*cases[case], *wanted[name], f"seed={seed}"])
+        (f"{case}_{name}_{seed}", [*listed(cases[case]), *wanted[name], f"seed={seed}"])
         for case, name, seed in itertools.product(cases, wanted, seeds)
     ]
 

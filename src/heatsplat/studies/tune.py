@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.studies.child_runs import spelled, trained
 from heatsplat.studies.finished import reason_of
+from heatsplat.studies.options import check_count, filled, listed
 
 log = logging.getLogger("heatsplat")
 
@@ -31,7 +32,7 @@ SEARCH_SEED = 0
 
 @dataclass(frozen=True)
 class Trial:
-    """A run of the search.
+    """A run with settings that may be unfit to train with.
 
     Args:
         method: whose.
@@ -69,13 +70,13 @@ class MethodRuns:
         wanted = [*self.common, f"max_steps={steps}", f"seed={seed}", *_words(settings)]
         return trained(self._place(name, steps, seed), self.train, wanted, self.folder)
 
-    def attempt(self, name: str, settings: Mapping[str, Any], steps: int) -> Trial:
-        """A run of the search, which may fail: a rate may be too high to train with."""
+    def attempt(self, name: str, settings: Mapping[str, Any], steps: int, seed: int = SEARCH_SEED) -> Trial:
+        """A run that may fail: a rate may be too high to train with."""
         try:
-            return Trial(self.method, name, settings, self.result(name, settings, steps, SEARCH_SEED))
+            return Trial(self.method, name, settings, self.result(name, settings, steps, seed))
         except SceneError as error:
             log.warning("%s, %s failed: %s", self.method, " ".join(_words(settings)), error)
-            return Trial(self.method, name, settings, None, reason_of(self._place(name, steps, SEARCH_SEED)))
+            return Trial(self.method, name, settings, None, reason_of(self._place(name, steps, seed)))
 
     def _place(self, name: str, steps: int, seed: int) -> Path:
         return self.folder / "runs" / f"{self.method}_{steps}_{name}_{seed}"
@@ -88,8 +89,9 @@ class Check:
     Args:
         method: whose.
         steps: length of the runs.
-        default, best: results with each seed.
+        default, best: results with each seed; of the best those that there are, where runs failed.
         score: by which they are compared.
+        failed: why a run of the best failed; empty where none did.
     """
 
     method: str
@@ -97,10 +99,13 @@ class Check:
     default: Sequence[RunResults]
     best: Sequence[RunResults]
     score: str
+    failed: str = ""
 
     @property
     def gains(self) -> list[float]:
-        """How much better the best is than the default with each seed; negative where it is worse."""
+        """How much better the best is than the default with each seed; negative where it is worse, none where it failed."""
+        if self.failed:
+            return []
         sign = 1.0 if SCORES[self.score] == "maximize" else -1.0
         return [
             sign * (now.test[self.score] - before.test[self.score])
@@ -109,7 +114,12 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """What all seeds say by more than the default's spread: "better" or "worse"; else "within the spread"."""
+        """What all seeds say by more than the default's spread: "better" or "worse"; else "within the spread".
+
+        "failed: " and the reason where a run of the best failed.
+        """
+        if self.failed:
+            return f"failed: {self.failed}"
         gains, mean = self.gains, statistics.fmean(self.gains)
         spread = _spread([one.test[self.score] for one in self.default]) or 0.0
         if len(gains) < 2 or abs(mean) <= spread or min(gains) <= 0 <= max(gains):
@@ -130,18 +140,18 @@ def run(
     overrides: Sequence[str] = (),
     train: str | None = None,
 ) -> list[Check]:
-    """What became of each method; writes tune.md and tune.csv after every method.
+    """What became of each method; writes tune.md and tune.csv after every search and every comparison.
 
     Args:
         output_dir: folder of the results and of the runs.
         cases: method -> {"scene": overrides that choose it, "knobs": setting -> [lowest, highest], or {"among": values}}.
             A range of whole numbers gives whole numbers; one above 0 is searched by its logarithm.
         methods: which of the cases; None: all.
-        trials: settings that are tried for each method, beside its default.
+        trials: settings that are tried for each method, beside its default; at least 1.
         seconds: of the trials' runs of a method, after which no other begins; None: no limit.
         search_steps: length of the runs of the search, whose seed is 0.
         check_steps: lengths at which the best is compared with the default.
-        seeds: of those comparisons.
+        seeds: of those comparisons; 0 is the search's.
         score: what makes a setting better: "psnr" or "mae_c", of the test views.
         overrides: of all runs.
         train: path of train.py; None: the installed heatsplat-train.
@@ -150,8 +160,13 @@ def run(
         SceneError: a case or an option is not as it should be, or a run with the default settings failed.
         ImportError: optuna is not installed.
     """
-    output_dir = Path(output_dir)
-    chosen = _checked(cases, methods, trials, seeds, score)
+    output_dir, overrides, seeds, check_steps = Path(output_dir), listed(overrides), listed(seeds), listed(check_steps)
+    chosen = _checked(cases, listed(methods), trials, seeds, score)
+    for key, steps in (("search_steps", [search_steps]), ("check_steps", check_steps)):
+        for count in steps:
+            check_count(f"study.{key}", count)
+    if seconds is not None:
+        check_numbers("study.seconds", seconds, error=SceneError)
     done: list[Trial] = []
     checks: list[Check] = []
     for method, case in chosen.items():
@@ -160,44 +175,56 @@ def run(
         tried = [default, *_search(runs, case["knobs"], trials, seconds, search_steps, score)]
         done += tried
         best = _best(tried, score)
-        for steps in check_steps if best is not default else ():
-            both = [[runs.result(one.name, one.settings, steps, seed) for seed in seeds] for one in (default, best)]
-            checks.append(Check(method, steps, *both, score))
-            log.info("%s at %d steps: %s", method, steps, checks[-1].verdict)
         _write(output_dir, chosen, done, checks, search_steps, score)
+        for steps in check_steps if best is not default else ():
+            checks.append(_check(runs, best, steps, seeds, score))
+            log.info("%s at %d steps: %s", method, steps, checks[-1].verdict)
+            _write(output_dir, chosen, done, checks, search_steps, score)
     log.info("%s", (output_dir / "tune.md").read_text(encoding="utf-8"))
     return checks
 
 
+def _check(runs: MethodRuns, best: Trial, steps: int, seeds: Sequence[int], score: str) -> Check:
+    """The best beside the default, which must not fail."""
+    default = [runs.result("default", {}, steps, seed) for seed in seeds]
+    tried = [runs.attempt(best.name, best.settings, steps, seed) for seed in seeds]
+    failed = next((one.why for one in tried if one.results is None), "")
+    return Check(runs.method, steps, default, [one.results for one in tried if one.results], score, failed)
+
+
 def _checked(
-    cases: Mapping[str, Mapping[str, Any]], methods: Sequence[str] | None, trials: int, seeds: Sequence[int], score: str
+    cases: Mapping[str, Mapping[str, Any]], methods: Sequence[str], trials: int, seeds: Sequence[int], score: str
 ) -> dict[str, Mapping[str, Any]]:
     """The cases asked for."""
     if score not in SCORES:
         raise SceneError(f"study.score={score}: give one of {', '.join(SCORES)}")
-    if trials < 1 or not seeds:
+    check_count("study.trials", trials)
+    for seed in filled("study.seeds", seeds):
+        check_count("study.seeds", seed, least=0)
+    if SEARCH_SEED in seeds or len({*seeds}) < len(seeds):
         raise SceneError(
-            f"study.trials and the number of study.seeds must be at least 1, got {trials} and {len(seeds)}"
+            f"study.seeds={seeds}: give every seed once, and not {SEARCH_SEED}, with which the settings were found"
         )
-    if unknown := [name for name in methods or () if name not in cases]:
+    if unknown := [name for name in methods if name not in cases]:
         raise SceneError(
             f"study.methods: {', '.join(unknown)} has no case; there are {', '.join(cases)}. Give one: "
             f"\"+study.cases={{{unknown[0]}:{{scene:['data.scene=cooling'],knobs:{{thermal.lr:[1e-4,1e-2]}}}}}}\""
         )
     chosen = {name: cases[name] for name in methods or cases}
     for name, case in chosen.items():
-        if set(case) != CASE or not case["knobs"]:
-            raise SceneError(f"study.cases.{name} has the keys scene and knobs, both filled, got {dict(case)}")
+        good = isinstance(case, Mapping) and set(case) == CASE and isinstance(case["knobs"], Mapping)
+        if not good or not case["knobs"]:
+            raise SceneError(f"study.cases.{name} has the keys scene and knobs, both filled, got {case}")
         for key, values in case["knobs"].items():
             _distribution(name, key, values)
-    return chosen
+    return {name: {"scene": listed(case["scene"]), "knobs": case["knobs"]} for name, case in chosen.items()}
 
 
 def _distribution(method: str, key: str, values: Any) -> Any:
     """What optuna draws a knob from."""
     distributions = _optuna().distributions
-    if isinstance(values, Mapping) and list(values) == ["among"] and values["among"]:
-        return distributions.CategoricalDistribution(list(values["among"]))
+    if isinstance(values, Mapping) and list(values) == ["among"] and listed(values["among"]):
+        return distributions.CategoricalDistribution(listed(values["among"]))
     if isinstance(values, list | tuple) and len(values) == 2 and all(_is_number(value) for value in values):
         low, high = values
         if low < high:
@@ -321,7 +348,7 @@ def markdown(
     rows = []
     for check in checks:
         best = _best([trial for trial in tried if trial.method == check.method], score)
-        gain = number(statistics.fmean(check.gains), 3, _spread(check.gains))
+        gain = number(statistics.fmean(check.gains), 3, _spread(check.gains)) if check.gains else ""
         rows.append([check.method, check.steps, "default", *_cells(check.default), "", ""])
         rows.append(["", "", ", ".join(_words(best.settings)), *_cells(check.best), gain, check.verdict])
     lines += markdown_table(head, rows, "lrlrrrrrrl")

@@ -95,6 +95,13 @@ def planned(context: HydraContext, config: DictConfig, number: int, overrides: S
         HydraConfig.instance().cfg = before
 
 
+def checked_retries(retries: int) -> int:
+    """How often a job starts again by itself. Raises ValueError for less than never."""
+    if retries < 0:
+        raise ValueError(f"hydra.launcher.retries must be 0 or more, got {retries}")
+    return retries
+
+
 def python_path() -> str:
     """PYTHONPATH with which other processes import what this one did, installed or not."""
     return os.pathsep.join(filter(None, [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]))

@@ -12,7 +12,15 @@ from threading import Thread
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
 
-from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute_contained, log
+from hydra_plugins.heatsplat_launchers._jobs import (
+    DiedError,
+    Job,
+    JobLauncher,
+    attempt,
+    checked_retries,
+    execute_contained,
+    log,
+)
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -60,7 +68,7 @@ class Joblib(JobLauncher):
     def __init__(self, n_jobs: int = -1, retries: int = 1) -> None:
         if n_jobs < 1 and n_jobs != -1:
             raise ValueError(f"hydra.launcher.n_jobs must be 1 or more, or -1 for one per core, got {n_jobs}")
-        self.n_jobs, self.retries = n_jobs, retries
+        self.n_jobs, self.retries = n_jobs, checked_retries(retries)
 
     def outcomes(self, jobs: Sequence[Job]) -> Iterator[JobReturn | Exception]:
         try:

@@ -6,7 +6,15 @@ from dataclasses import dataclass
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
 
-from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute_contained, python_path
+from hydra_plugins.heatsplat_launchers._jobs import (
+    DiedError,
+    Job,
+    JobLauncher,
+    attempt,
+    checked_retries,
+    execute_contained,
+    python_path,
+)
 
 
 @dataclass
@@ -35,7 +43,7 @@ class Ray(JobLauncher):
     """
 
     def __init__(self, address: str = "auto", num_cpus: int = 1, num_gpus: float = 0, retries: int = 2) -> None:
-        self.address, self.num_cpus, self.num_gpus, self.retries = address, num_cpus, num_gpus, retries
+        self.address, self.num_cpus, self.num_gpus, self.retries = address, num_cpus, num_gpus, checked_retries(retries)
 
     def outcomes(self, jobs: Sequence[Job]) -> Iterator[JobReturn | Exception]:
         try:

@@ -85,6 +85,17 @@ class Slurm(SubmititLauncher):
 
     cluster = "slurm"
 
+    def outcomes(self, jobs: Sequence[Job]) -> Iterator[JobReturn | Exception]:
+        """As of any launcher. Raises SceneError on a machine that is not of a cluster."""
+        from heatsplat.contracts import SceneError
+
+        if shutil.which("srun") is None:
+            raise SceneError(
+                "launcher=slurm: SLURM is not on this machine (no srun). Start the sweep on one that can submit jobs; "
+                "launcher=submitit_local rehearses it here"
+            )
+        return super().outcomes(jobs)
+
     def wait(self, job: Any) -> JobReturn:
         """As above. A job that is neither in the queue nor has a result has died.
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn
-from hydra.errors import ConfigCompositionException
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
@@ -88,6 +87,7 @@ class RowSweeper(BasicSweeper):
         params: the grid: key -> values with commas, as on the command line.
         paper: the paper's table that the rows are beside: {"of": paper, "table": label, "scenes": whose figures}; None without.
         rows: name of a row -> {"set": overrides of the row, "printed": its setting in that table}; None for a grid alone.
+        of: the method whose parts the rows are, or several; another is refused. None for any.
     """
 
     def __init__(
@@ -96,6 +96,7 @@ class RowSweeper(BasicSweeper):
         params: Mapping[str, str] | None = None,
         paper: Mapping[str, Any] | None = None,
         rows: Mapping[str, Mapping[str, Any]] | None = None,
+        of: str | Sequence[str] | None = None,
     ) -> None:
         if max_batch_size is not None and max_batch_size < 1:
             raise ValueError(f"hydra.sweeper.max_batch_size must be 1 or more, or null for all, got {max_batch_size}")
@@ -104,6 +105,7 @@ class RowSweeper(BasicSweeper):
         self.batch = max_batch_size
         self.paper = paper
         self.rows = rows
+        self.of = of
         self.reproduction: Reproduction | None = None
         self.board: Board | None = None
 
@@ -113,15 +115,35 @@ class RowSweeper(BasicSweeper):
             self.launcher = Batches(self.launcher, self.batch)
 
     def split_arguments(self, overrides: list[Override], max_batch_size: int | None) -> list[list[list[str]]]:
-        """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins."""
+        """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins.
+
+        Raises:
+            SceneError: rows are parts of another method than a job's.
+        """
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
         if self.reproduction is not None:
             jobs = self._of_table(self.reproduction, jobs)
         elif self.board is not None:
             jobs = [run for given in jobs for run in self.board.jobs(given)]
         elif self.rows:
+            self._check_methods(jobs)
             jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
         return [jobs]
+
+    def _check_methods(self, jobs: Sequence[Sequence[str]]) -> None:
+        """Raises SceneError where the rows would not be what they are called, for they are parts of another method."""
+        from heatsplat.contracts import SceneError
+        from heatsplat.studies.options import listed
+
+        if not (own := listed(self.of)):
+            return
+        chosen = self.config.hydra.runtime.choices.method
+        asked = {dict(text.partition("=")[::2] for text in job).get("method", chosen).strip("'\"") for job in jobs}
+        if others := sorted(asked - {*own}):
+            raise SceneError(
+                f"the rows of this ablation are parts of method={' or '.join(own)}, not of method={', '.join(others)}: leave "
+                "method out, or choose an ablation of that method"
+            )
 
     def _of_table(self, reproduction: Reproduction, grid: Sequence[Sequence[str]]) -> list[list[str]]:
         """The jobs of a table: those that others come after stand at the beginning, once each, and end before these start."""
@@ -151,13 +173,6 @@ class RowSweeper(BasicSweeper):
         idle = (self.reproduction is not None and not self.reproduction.runs) or (self.board and not self.board.jobs())
         try:
             return None if idle else super().sweep(list(arguments))
-        except ConfigCompositionException as error:
-            of, chosen = (self.paper or {}).get("of"), self.config.hydra.runtime.choices.method
-            if of in (None, chosen):
-                raise
-            raise ConfigCompositionException(
-                f"The rows of this ablation are parts of method={of}, and method={chosen} lacks some: {error}"
-            ) from error
         except BaseException:
             if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
                 log.warning(

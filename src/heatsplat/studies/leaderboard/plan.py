@@ -13,6 +13,7 @@ from heatsplat.io.command_lines import setting
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.earlier import read_page
+from heatsplat.studies.options import listed
 from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission
 
 DECIDED = {
@@ -157,7 +158,7 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[s
         "tracks": list(protocol["tracks"]),
     }
     chosen = {
-        key: list(asked[key] or (protocol.get(key) if key == "methods" else None) or choices[key]) for key in choices
+        key: listed(asked[key]) or (protocol.get(key) if key == "methods" else None) or choices[key] for key in choices
     }
     for key, names in chosen.items():
         if unknown := [name for name in names if name not in choices[key]]:
@@ -169,10 +170,10 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[s
         return None if text is None else Path(text).expanduser()
 
     board = Board(
-        protocol, root, **chosen, seeds=list(asked["seeds"] or protocol["seeds"]), clock=asked["clock"],
+        protocol, root, **chosen, seeds=listed(asked["seeds"]) or protocol["seeds"], clock=asked["clock"],
         document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
     )  # fmt: skip
-    submissions = [_submission(Path(text).expanduser(), board, known) for text in asked["submissions"]]
+    submissions = [_submission(Path(text).expanduser(), board, known) for text in listed(asked["submissions"])]
     earlier = path(asked["earlier"])
     return replace(board, submissions=submissions, earlier=None if earlier is None else read_page(earlier, board))
 

@@ -25,7 +25,7 @@ class Line:
     """One line of the comparison.
 
     Args:
-        scene, method, setting: of the table; ``scene`` may be ``THAT_RAN``.
+        scene, method, setting: of the table; ``scene`` may begin with ``THAT_RAN``.
         members: the scenes that its figures are means of.
         have: those of them that have results.
         ours: metric -> our mean, in the table's unit.
@@ -64,8 +64,12 @@ class Line:
 
 
 def write_comparison(folder: Path, reproduction: Reproduction) -> list[Path]:
-    """Writes comparison.md and comparison.csv into the folder of a sweep, and returns their paths."""
+    """Writes comparison.md and comparison.csv into the folder of a sweep, and returns their paths.
+
+    All runs in the folder count, those of earlier commands too, which may have asked for other scenes and methods.
+    """
     found = collect(folder)
+    reproduction = _with_all_rows(reproduction, found)
     lines = compare_all(reproduction, found)
     failed = [f"{row.label} on {row.scene}: {reason}" for row in found for reason in row.failed]
     results = [one for row in found for one in row.table["results"].dropna()]
@@ -74,10 +78,25 @@ def write_comparison(folder: Path, reproduction: Reproduction) -> list[Path]:
     return [folder / COMPARISON_FILE, folder / COMPARISON_CSV]
 
 
+def _with_all_rows(reproduction: Reproduction, found: Sequence[Runs]) -> Reproduction:
+    """The table with every row that has results; none of them is absent."""
+    have = {row.name: row for row in found if row.count and reproduction.scene_of(row.scene)}
+    settings = dict.fromkeys(setting for _, setting in reproduction.rows)
+    of_runs = [
+        (method, setting)
+        for name, row in have.items()
+        for method in row.table["method"].unique()
+        for setting in settings
+        if row_name(method, setting) == name
+    ]
+    absent = {row: why for row, why in reproduction.absent.items() if row_name(*row) not in have}
+    return replace(reproduction, rows=tuple(dict.fromkeys([*reproduction.rows, *of_runs])), absent=absent)
+
+
 def compare_all(reproduction: Reproduction, found: Sequence[Runs]) -> list[Line]:
     """The lines of the comparison; a row that ran with several settings (``Runs.other``) has a line for each of them."""
-    key_of = {run.folder: run.scene for run in reproduction.runs}
-    known = [row for row in found if row.scene in key_of]
+    key_of = {row.scene: reproduction.scene_of(row.scene) for row in found}
+    known = [row for row in found if key_of[row.scene] is not None]
     lines = [
         replace(line, other=other)
         for other in dict.fromkeys(row.other for row in known) or [""]
@@ -93,6 +112,9 @@ def compare_all(reproduction: Reproduction, found: Sequence[Runs]) -> list[Line]
 def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs]) -> list[Line]:
     """The lines of the comparison, scene by scene in the order of the table.
 
+    A printed mean of several scenes has a value of ours where all of them have results. Else ours stands in a line
+    ``THAT_RAN``, beside the mean of what is printed for the same scenes, where that is.
+
     Args:
         reproduction: the table.
         results: (name of the row, scene) -> its runs.
@@ -106,7 +128,6 @@ def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs])
     lines, incomplete = [], []
     for scene in scenes:
         members = reproduction.members(scene)
-        single = [member for member in members if member in scenes]
         for method, setting in rows:
             figures = printed.get((scene, method, setting), {})
             if not figures and (method, setting) in of_paper:
@@ -114,7 +135,7 @@ def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs])
             line = Line(scene, method, setting, members, printed=figures)
             line.theirs = {name: figure.value for name, figure in figures.items() if figure.value is not None}
             have = tuple(member for member in members if _of(results, method, setting, member))
-            if len(members) > 1 and len(have) < len(members) and single:
+            if len(have) < len(members) > 1:
                 incomplete.append((line, have))  # the printed mean is of other scenes; see below
             else:
                 _fill(reproduction, line, have, results)
@@ -122,7 +143,8 @@ def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs])
     for line, have in incomplete:
         if not have:
             continue
-        part = Line(THAT_RAN, line.method, line.setting, line.members)
+        name = f"{THAT_RAN}, {line.scene}" if line.scene in reproduction.source.groups else THAT_RAN
+        part = Line(name, line.method, line.setting, line.members)
         _fill(reproduction, part, have, results)
         per_scene = [printed.get((scene, line.method, line.setting), {}) for scene in have]
         for metric in line.printed:

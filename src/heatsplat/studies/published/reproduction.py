@@ -9,6 +9,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.metrics.lpips import LpipsUnavailable, find_backbone
+from heatsplat.studies.options import listed
 from heatsplat.studies.published.figures import METRICS, TITLES, Figure, doubts, figures
 from heatsplat.studies.published.sources import Source, source
 
@@ -79,6 +80,7 @@ class Reproduction:
         metrics: printed metric -> score in metrics.json, where the paper's definition is another than usual.
         unnamed: the group of scenes that stands for "the paper does not say which"; empty for none.
         notes: what else a reader must know.
+        folders: key of a scene -> name of its folder, where it is called otherwise.
     """
 
     paper: str
@@ -94,6 +96,7 @@ class Reproduction:
     metrics: Mapping[str, str] = field(default_factory=dict)
     unnamed: str = ""
     notes: tuple[str, ...] = ()
+    folders: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def title(self) -> str:
@@ -107,6 +110,10 @@ class Reproduction:
     def members(self, scene: str) -> tuple[str, ...]:
         """The scenes of which a printed figure is."""
         return self.source.members(scene or self.unnamed) if self.source else ()
+
+    def scene_of(self, folder: str) -> str | None:
+        """Key of the scene whose folder has this name, among all of the data set; None for none."""
+        return self.source.scene_of(folder, self.folders) if self.source else None
 
     def summary(self, lpips_net: str | None = "alex", lpips_weights: str | None = None) -> str:
         """What runs, what has the paper's figures only and why, what is missing and where it is got: one message.
@@ -234,6 +241,7 @@ def reproduction_of(
         dict(config["metrics"]),
         config["unnamed"],
         (*config["notes"], *doubts(paper, table)),
+        config["folders"] or {},
     )
 
 
@@ -242,7 +250,7 @@ def _rows(
 ) -> tuple[list[tuple[str, str]], set[tuple[str, str]]]:
     """(method, setting) of every row, those asked for beyond the paper last; and which of them are asked for."""
     rows = list(dict.fromkeys((figure.method, figure.setting) for figure in printed if figure.method))
-    extra = [name for name in config["methods"] or () if name not in {method for method, _ in rows}]
+    extra = [name for name in listed(config["methods"]) if name not in {method for method, _ in rows}]
     if unknown := [name for name in extra if name not in methods]:
         raise SceneError(
             f"table.methods: {', '.join(unknown)} is neither in the table ({_listed(m for m, _ in rows)}) nor in "
@@ -284,7 +292,7 @@ def _wanted(config: Mapping[str, Any], data: Source, printed: Sequence[Figure]) 
     """Keys of the scenes whose figures are printed, those that are asked for."""
     named = dict.fromkeys(figure.scene or config["unnamed"] for figure in printed)
     wanted = list(dict.fromkeys(key for scene in named for key in data.members(scene)))
-    asked = {key for scene in config["scenes"] or () for key in data.members(scene) or (scene,)}
+    asked = {key for scene in listed(config["scenes"]) for key in data.members(scene) or (scene,)}
     return _chosen(wanted, wanted, sorted(asked), "scenes")
 
 
@@ -307,13 +315,13 @@ def _protocol(config: Mapping[str, Any], setting: str, ablation: Mapping[str, Ma
     )
 
 
-def _chosen(items: Sequence[Any], keys: Sequence[str], asked: Sequence[str] | None, what: str) -> list[Any]:
+def _chosen(items: Sequence[Any], keys: Sequence[str], asked: Any, what: str) -> list[Any]:
     """The items whose keys are asked for, all where nothing is.
 
     Raises:
         SceneError: something is asked for that no item has.
     """
-    if not asked:
+    if not (asked := listed(asked)):
         return list(items)
     if unknown := [str(name) for name in asked if name not in keys]:
         raise SceneError(f"table.{what}: {', '.join(unknown)} is not in the table; there are {_listed(keys)}")

@@ -47,18 +47,37 @@ class Source:
         Args:
             root: folder of the data set, or None.
             told: key -> folder, for folders that are called otherwise.
+
+        Raises:
+            SceneError: ``told`` is of no scene.
         """
+        names = self._names(told)
         if root is None or not root.is_dir():
             return {}
-        told = told or {}
         folders = sorted(
             path for path in root.iterdir() if path.is_dir() and any((path / p).exists() for p in self.any)
         )
         by_name = {_plain(path.name): path.name for path in folders}
+        found = {key: next((by_name[name] for name in of if name in by_name), None) for key, of in names.items()}
+        return {key: folder for key, folder in found.items() if folder}
+
+    def scene_of(self, folder: str, told: Mapping[str, str] | None = None) -> str | None:
+        """Key of the scene whose folder has this name, whether it is on disk or not; None for none."""
+        return next((key for key, names in self._names(told).items() if _plain(folder) in names), None)
+
+    def _names(self, told: Mapping[str, str] | None) -> dict[str, list[str]]:
+        """Key of each scene -> what its folder may be called, without case and punctuation."""
+        told = {} if told is None else told
+        if not isinstance(told, Mapping):
+            one = next(iter(self.scenes))
+            raise SceneError(f"table.folders={told}: give folders by scene, such as 'table.folders={{{one}: NAME}}'")
+        if unknown := [str(key) for key in told if key not in self.scenes]:
+            raise SceneError(
+                f"table.folders: {', '.join(unknown)} is no scene of {self.name}; there are {', '.join(self.scenes)}"
+            )
         # In a data set with numbered copies the told name wins over any likeness.
         names = {key: [told[key]] if key in told else [key, *others] for key, others in self.scenes.items()}
-        found = {key: next((by_name[_plain(n)] for n in of if _plain(n) in by_name), None) for key, of in names.items()}
-        return {key: folder for key, folder in found.items() if folder}
+        return {key: [_plain(str(name)) for name in of] for key, of in names.items()}
 
 
 def source(key: str) -> Source:

@@ -1,0 +1,36 @@
+"""Options of studies as they are typed on a command line: lists of any length, and numbers that count."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from heatsplat.contracts import SceneError
+
+
+def listed(value: Any) -> list[Any]:
+    """The values of an option: those of a list, a word or number that stands alone, none for null."""
+    if value is None:
+        return []
+    return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+
+
+def filled(key: str, value: Any) -> list[Any]:
+    """``listed``, where nothing can be done without a value.
+
+    Args:
+        key: of the option, such as "study.seeds".
+        value: of it.
+
+    Raises:
+        SceneError: there is none.
+    """
+    if not (found := listed(value)):
+        raise SceneError(f"{key}={value} has nothing in it: give at least one value")
+    return found
+
+
+def check_count(key: str, value: Any, least: int = 1) -> None:
+    """Raises SceneError where an option is no whole number, or less than ``least``."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise SceneError(f"{key} must be a whole number, {least} or more, got {value}")
