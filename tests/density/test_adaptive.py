@@ -1,11 +1,15 @@
 """The standard strategy: who grows, who goes, when, and never beyond the cap."""
 
+import json
+
 import pytest
 import torch
 
 from heatsplat.contracts import Camera, RenderOutput
 from heatsplat.density.adaptive import Adaptive
+from heatsplat.density.budget import Budget
 from heatsplat.density.fixed import Fixed
+from heatsplat.density.multiview_gate import MultiviewGate
 from heatsplat.density.ops import Cloud
 from heatsplat.splats import Splats
 
@@ -101,6 +105,19 @@ def test_without_resets_opacities_and_large_gaussians_stay():
         Adaptive(multiple=0)
 
 
+@pytest.mark.parametrize("wrong", [0, 1, -1])
+def test_opacities_are_not_reset_to_none_or_all(wrong):
+    """Either has no finite logit."""
+    with pytest.raises(ValueError, match=rf"density.reset_opacity must lie in \(0, 1\), got {wrong}"):
+        Adaptive(reset_opacity=wrong)
+
+
+@pytest.mark.parametrize("name", ["start", "stop", "grad_threshold", "duplicate_scale", "prune_opacity", "prune_scale"])
+def test_steps_and_thresholds_below_zero_are_refused(name):
+    with pytest.raises(ValueError, match=f"density.*{name}.* must not be negative, got .*-0.5"):
+        Adaptive(**{name: -0.5})
+
+
 def test_nothing_before_start_between_refinements_or_after_stop():
     policy = Adaptive(start=50, stop=100, every=10)
     cloud = make_cloud(policy, [0.001] * 3, [0.5] * 3)
@@ -138,3 +155,21 @@ def test_fixed_keeps_no_statistic_and_changes_nothing():
     cloud = make_cloud(Adaptive(), [0.01] * 2, [0.001] * 2)
     assert policy.refine(cloud, 99, 1.0, torch.Generator()) is None
     assert len(cloud) == 2
+
+
+def test_the_rest_of_a_plan_is_moved_and_what_is_past_stays():
+    density = Adaptive(start=100, stop=1000, every=100, reset_every=None)
+    density.retime(200, 0.5)
+    assert (density.start, density.stop, density.every, density.reset_every) == (100, 600, 50, None)
+    density.retime(300, 1.01)  # of 600 and 50, not of what was rounded before
+    density.retime(300, 1.01)
+    assert density.stop == round(300 + 1.01**2 * 300) and density.every == 51
+    again = Adaptive(start=100, stop=1000, every=100, reset_every=None)
+    again.load_times(json.loads(json.dumps(density.times())))
+    assert vars(again) == vars(density)
+    removing = Budget(stop=800, remove_at=[100, 800])
+    removing.retime(200, 0.5)
+    assert removing.remove_at == (100, 500) and Adaptive().times() == {}
+    gated = MultiviewGate(views=10, gate_views=2, every=40, late_every=40)
+    gated.retime(0, 0.1)
+    assert gated.every == gated.late_every == 20  # its views have to fit twice

@@ -109,3 +109,6 @@ def test_a_scene_without_any_anchor_left_and_wrong_options_are_refused():
         refined(rule, cloud)
     with pytest.raises(ValueError, match="finer at least 2"):
         Anchors(finer=1)
+    for name in ("start", "grow_from", "stop", "seen", "grad_threshold", "prune_opacity"):
+        with pytest.raises(ValueError, match=f"density.*{name}.* must not be negative, got .*-0.5"):
+            Anchors(**{name: -0.5})

@@ -289,7 +289,18 @@ def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
 
 
 @pytest.mark.parametrize(
-    "options", [{"every": 0}, {"keep": 0.0}, {"floor": -1.0}, {"curve": "steep"}, {"score": "luck"}]
+    "options",
+    [
+        {"every": 0},
+        {"keep": 0.0},
+        {"floor": -1.0},
+        {"curve": "steep"},
+        {"score": "luck"},
+        {"start": -1},
+        {"stop": -1},
+        {"prune_opacity": -0.1},
+        {"remove_at": [9, -1]},
+    ],
 )
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):

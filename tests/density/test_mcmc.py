@@ -173,5 +173,6 @@ def test_frozen_centres_do_not_wander():
 def test_a_dead_cloud_is_an_error_that_says_why():
     with pytest.raises(RuntimeError, match="finds all 2 Gaussians dead at step 9"):
         refine(policy(), cloud_of([0.001, 0.002]))
-    with pytest.raises(ValueError, match="growth and noise at least 0"):
-        MCMC(growth=-1.0)
+    for name in ("start", "stop", "dead_opacity", "growth", "noise"):
+        with pytest.raises(ValueError, match=f"{name}.* at least 0, got .*-0.5"):
+            MCMC(**{name: -0.5})

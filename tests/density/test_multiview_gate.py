@@ -160,6 +160,11 @@ def test_options_out_of_range_are_refused():
         control(every=10)
     with pytest.raises(ValueError, match="grad_quantile lies in"):
         control(grad_quantile=1.0)
+    absent = {"gate_pixels": None, "late_opacity": None, "late_blame": None}
+    control(**absent)
+    for name in ("late_stop", *absent):
+        with pytest.raises(ValueError, match=f"{name}.* must not be negative, got .*-0.5"):
+            control(**{name: -0.5})
 
 
 def test_under_the_cap_those_that_pass_the_gate_grow_and_not_those_that_pull_most():

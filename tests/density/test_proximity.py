@@ -203,6 +203,10 @@ def test_unknown_radiance_is_an_error_that_lists_what_there_is():
         ({"neighbours": 0}, "neighbours and insert_every must be at least 1, got 0"),
         ({"edge_share": 1.0}, r"edge_share in \(0, 1\), got 0.9, 1.0"),
         ({"radiance": {}}, "density.radiance names no tensor"),
+        ({"attenuation": -0.1}, "attenuation, .* must not be negative, got -0.1"),
+        ({"insert_growth": -0.1}, "insert_growth, .* must not be negative"),
+        ({"threshold": -0.1}, "threshold and distance must not be negative"),
+        ({"reset_opacity": 0.0}, "density.reset_opacity must lie in"),
     ],
 )
 def test_options_out_of_range(options, message):

@@ -34,7 +34,12 @@ class Adaptive(DensityControl):
         cap_max: never more Gaussians than this, infinity for no limit; the strongest gradients grow first.
         multiple: nor more than so many times the Gaussians of the start; None: ``cap_max`` alone.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
+
+    Raises:
+        ValueError: an option is out of its range.
     """
+
+    moments, intervals = ("start", "stop"), ("every", "reset_every")
 
     def __init__(
         self,
@@ -57,6 +62,13 @@ class Adaptive(DensityControl):
             )
         if multiple is not None and not multiple > 0:
             raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
+        if not 0 < reset_opacity < 1:
+            raise ValueError(f"density.reset_opacity must lie in (0, 1), got {reset_opacity}")
+        if min(start, stop, grad_threshold, duplicate_scale, prune_opacity, prune_scale) < 0:
+            raise ValueError(
+                "density.start, stop, grad_threshold, duplicate_scale, prune_opacity and prune_scale must not be negative, got "
+                f"{start}, {stop}, {grad_threshold}, {duplicate_scale}, {prune_opacity} and {prune_scale}"
+            )
         self.start, self.stop, self.every = start, stop, every
         self.grad_threshold, self.duplicate_scale = grad_threshold, duplicate_scale
         self.prune_opacity, self.prune_scale = prune_opacity, prune_scale

@@ -41,6 +41,7 @@ class Anchors(DensityControl):
     """
 
     rows = frozenset({ANCHORS})
+    moments, intervals = ("start", "grow_from", "stop"), ("every",)
 
     def __init__(
         self,
@@ -61,6 +62,11 @@ class Anchors(DensityControl):
             raise ValueError(
                 "density.every, levels, coarsest and cap_max must be at least 1, finer at least 2 and voxel positive, got "
                 f"{every}, {levels}, {coarsest}, {cap_max}, {finer} and {voxel}"
+            )
+        if min(start, grow_from, stop, seen, grad_threshold, prune_opacity) < 0:
+            raise ValueError(
+                "density.start, grow_from, stop, seen, grad_threshold and prune_opacity must not be negative, got "
+                f"{start}, {grow_from}, {stop}, {seen}, {grad_threshold} and {prune_opacity}"
             )
         self.start, self.grow_from, self.stop, self.every, self.seen = start, grow_from, stop, every, seen
         self.grad_threshold, self.prune_opacity = grad_threshold, prune_opacity

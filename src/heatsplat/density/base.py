@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,11 +32,17 @@ class DensityControl:
         absgrad: whether ``observe`` wants absolute per-pixel gradients.
         rows: what rows of the splats may be that it counts on (``heatsplat.splats``).
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
+        moments, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
+        shortest: what an interval has at least.
     """
 
     absgrad: bool = False
     rows: frozenset[str] = frozenset({GAUSSIANS})
     cap_max: float | None = None
+    moments: tuple[str, ...] = ()
+    intervals: tuple[str, ...] = ()
+    shortest: int = 1
+    _times: dict[str, Any] = {}  # of those attributes, not rounded, once they were moved
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """Per-Gaussian statistics before the first step, each [count, ...]."""
@@ -75,9 +82,41 @@ class DensityControl:
         """
         return None
 
+    def retime(self, step: int, factor: float) -> None:
+        """Moves the rest of its plan: what was to come n steps after ``step`` comes ``factor`` times n after it."""
+
+        def moved(moment: Any) -> Any:
+            if moment is None:
+                return None
+            if isinstance(moment, list | tuple):
+                return [moved(one) for one in moment]
+            return moment if moment <= step else step + factor * (moment - step)
+
+        now = {name: self._times.get(name, getattr(self, name)) for name in (*self.moments, *self.intervals)}
+        known = {name: now[name] for name in self.intervals if now[name] is not None}
+        times = {name: moved(now[name]) for name in self.moments}
+        self.load_times(times | {name: factor * interval for name, interval in known.items()})
+
+    def times(self) -> dict[str, Any]:
+        """Plain numbers for a checkpoint, from which ``load_times`` restores a plan that was moved; empty if it was not."""
+        return dict(self._times)
+
+    def load_times(self, times: Mapping[str, Any]) -> None:
+        """Goes on with the plan of ``times``."""
+        self._times = dict(times)
+        for name, value in times.items():
+            least = self.shortest if name in self.intervals else 0
+            setattr(self, name, _rounded(value, least))
+
     def settled(self, step: int) -> bool:
         """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of opacities."""
         return True
+
+
+def _rounded(value: Any, least: int) -> Any:
+    if isinstance(value, list):
+        return tuple(_rounded(one, least) for one in value)
+    return None if value is None else max(round(value), least)
 
 
 class Merging:

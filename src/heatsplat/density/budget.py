@@ -74,6 +74,8 @@ class Budget(DensityControl):
         ValueError: an option is out of its range.
     """
 
+    moments, intervals = ("start", "stop", "remove_at"), ("every",)
+
     def __init__(
         self,
         start: int = 600,
@@ -105,6 +107,11 @@ class Budget(DensityControl):
             raise ValueError(
                 "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
                 f"got {keep}, {floor}, {noise} and {least_pixels}"
+            )
+        if min(start, stop, prune_opacity, *remove_at) < 0:
+            raise ValueError(
+                "density.start, stop, prune_opacity and remove_at must not be negative, "
+                f"got {start}, {stop}, {prune_opacity} and {list(remove_at)}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
         self.multiple, self.least, self.wanted = multiple, least, math.inf

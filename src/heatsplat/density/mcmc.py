@@ -46,6 +46,8 @@ class MCMC(DensityControl):
     Source: Kheradmand et al. 2024, 3D Gaussian Splatting as Markov Chain Monte Carlo, Eq. 8-10.
     """
 
+    moments, intervals = ("start", "stop"), ("every",)
+
     def __init__(
         self,
         start: int = 500,
@@ -56,10 +58,10 @@ class MCMC(DensityControl):
         dead_opacity: float = 0.005,
         noise: float = 5e5,
     ) -> None:
-        if every < 1 or cap_max < 1 or growth < 0 or noise < 0:
+        if every < 1 or cap_max < 1 or min(start, stop, growth, dead_opacity, noise) < 0:
             raise ValueError(
-                f"density.every and cap_max must be at least 1, growth and noise at least 0, got {every}, {cap_max}, "
-                f"{growth}, {noise}"
+                "density.every and cap_max must be at least 1, start, stop, dead_opacity, growth and noise at least 0, got "
+                f"{every}, {cap_max}, {start}, {stop}, {dead_opacity}, {growth}, {noise}"
             )
         if not math.isfinite(cap_max):
             raise ValueError(

@@ -54,6 +54,8 @@ class MultiviewGate(Adaptive):
     Source: FastGS (CVPR 2026), multi-view consistent densification and pruning.
     """
 
+    moments, intervals = (*Adaptive.moments, "late_stop"), (*Adaptive.intervals, "late_every")
+
     def __init__(
         self,
         views: int = 10,
@@ -77,8 +79,14 @@ class MultiviewGate(Adaptive):
             raise ValueError(
                 f"density.grad_quantile lies in (0, 1) and late_share in [0, 1], got {grad_quantile}, {late_share}"
             )
+        given = [number for number in (gate_pixels, late_opacity, late_blame) if number is not None]
+        if min((late_stop, *given)) < 0:
+            raise ValueError(
+                "density.late_stop, gate_pixels, late_opacity and late_blame must not be negative, got "
+                f"{late_stop}, {gate_pixels}, {late_opacity} and {late_blame}"
+            )
         self.views, self.gate_pixels, self.gate_views = views, gate_pixels, gate_views
-        self.grad_quantile = grad_quantile
+        self.grad_quantile, self.shortest = grad_quantile, 2 * views
         self.late_every, self.late_stop = late_every, late_stop
         self.late_opacity, self.late_blame, self.late_share = late_opacity, late_blame, late_share
         self.noise = 0.0

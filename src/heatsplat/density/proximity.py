@@ -48,6 +48,8 @@ class Proximity(Adaptive):
         ValueError: an option is out of its range.
     """
 
+    moments, intervals = (*Adaptive.moments, "insert_stop"), (*Adaptive.intervals, "insert_every")
+
     def __init__(
         self,
         radiance: Mapping[str, float],
@@ -70,6 +72,12 @@ class Proximity(Adaptive):
             )
         if not 0 <= quantile <= 1 or not 0 < edge_share < 1:
             raise ValueError(f"density.quantile lies in [0, 1] and edge_share in (0, 1), got {quantile}, {edge_share}")
+        given = [number for number in (threshold, distance) if number is not None]
+        if min(attenuation, min_opacity, insert_stop, insert_growth, *given) < 0:
+            raise ValueError(
+                "density.attenuation, min_opacity, insert_stop, insert_growth, threshold and distance must not be negative, got "
+                f"{attenuation}, {min_opacity}, {insert_stop}, {insert_growth}, {threshold} and {distance}"
+            )
         if not radiance:
             raise ValueError(
                 "density.radiance names no tensor; give those that hold radiance, such as {sh0: 1.7724539}"

@@ -152,6 +152,7 @@ class Plan:
         settings: other overrides, such as ("schedule=coarse_to_fine",).
         points: Gaussians of the start.
         gaussian_us: microseconds that one Gaussian more adds to a step, by the calibration.
+        gaussians: mean over the run.
     """
 
     asked_s: float
@@ -170,6 +171,7 @@ class Plan:
     settings: tuple[str, ...] = ()
     points: int = 0
     gaussian_us: float = 0.0
+    gaussians: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in a checkpoint."""
@@ -210,12 +212,16 @@ class Prices:
     pace: Pace
     cap_max: int | None
 
+    def gaussians(self, choice: Choice, steps: float) -> float:
+        """Mean number of Gaussians of a run."""
+        points = self.pace.points
+        if self.cap_max is None:
+            return points
+        return min(points * self.outlook.mean_growth(choice, steps), max(self.cap_max, points))
+
     def cost(self, choice: Choice, steps: float) -> float:
         """Seconds of a run."""
-        gaussians = self.pace.points
-        if self.cap_max is not None:
-            gaussians = min(gaussians * self.outlook.mean_growth(choice, steps), max(self.cap_max, gaussians))
-        return steps * self.pace.step_s(gaussians) * self.outlook.cost(choice, steps)
+        return steps * self.pace.step_s(self.gaussians(choice, steps)) * self.outlook.cost(choice, steps)
 
     def affordable(self, choice: Choice, seconds: float) -> float:
         """Steps that take so many seconds; the cost rises with the steps."""
@@ -295,6 +301,7 @@ def plan(
         settings=chosen.settings,
         points=pace.points,
         gaussian_us=round(1e6 * pace.per_gaussian_s, 6),
+        gaussians=round(prices.gaussians(chosen, steps), 1),
     )
 
 

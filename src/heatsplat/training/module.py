@@ -218,7 +218,10 @@ class SplatTraining(pl.LightningModule):
         for name, parameter in self.thermal.named_parameters():
             rate = self.thermal.rate_of(name)
             lr = rate.lr * (self.optim.pace if rate.paced else 1.0)
-            groups.append({"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": rate.lr_end})
+            held = self.optim.held(rate.held)
+            groups.append(
+                {"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": rate.lr_end, "held": held}
+            )
         groups += [
             {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
             for name, part in self.sensor.parts.items()
@@ -545,6 +548,7 @@ class SplatTraining(pl.LightningModule):
             "config": self.config,
             "scales": scales_of(self.scene),
             "schedule": self.schedule.state_dict(),
+            "density_times": self.density.times(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
         if self.global_step > 0 and not self._updates(self.global_step - 1):
@@ -561,7 +565,8 @@ class SplatTraining(pl.LightningModule):
                 owner, _, leaf = name.rpartition(".")
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
         own = checkpoint[CHECKPOINT_KEY]
-        self.schedule.load_state_dict(own["schedule"])
+        if self.schedule.load_state_dict(own["schedule"]):
+            self.density.load_times(own.get("density_times", {}))
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}

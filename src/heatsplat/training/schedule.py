@@ -82,7 +82,9 @@ class Schedule:
         """Where the end is, as plain numbers."""
         return {"steps": self.steps, "start": self._start, "planned": self._planned, "end": self._end}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Puts the end where it was; a run of another length than that which wrote the state keeps its own."""
-        if state["steps"] == self.steps:
+    def load_state_dict(self, state: dict[str, Any]) -> bool:
+        """Puts the end where it was; a run of another length than that which wrote the state keeps its own. Whether it did."""
+        same = state["steps"] == self.steps
+        if same:
             self._start, self._planned, self._end = state["start"], state["planned"], state["end"]
+        return same
