@@ -104,7 +104,7 @@ class Probe(ThermalModel):
         return {"needle": partial(self.without, "needle")}
 
     def rate_of(self, name):
-        return {"own": Rate(0.123, 0.456, paced=True)}[name]
+        return {"own": Rate(0.123, 0.456, paced=True, held=0.7)}[name]
 
     def effects(self):
         return {"probing": {"how": "deep"}}
@@ -172,7 +172,7 @@ def test_all_wrappers_are_tried():
 def test_no_hook_of_a_model_is_left_out():
     """A new hook of models must come to the wrapper and to the probe, too."""
     hooks = {name for kind in (Heat, ThermalModel) for name in vars(kind) if not name.startswith("_")}
-    own = {"lr", "lr_end", "paced"}  # of the wrapper's own parameters; see rate_of
+    own = {"lr", "lr_end", "paced", "held"}  # of the wrapper's own parameters; see rate_of
     made = {
         "modality",
         "companions",
@@ -267,7 +267,7 @@ def test_tensors_and_parameters_keep_their_rates_and_penalties(wrapped):
     first = 1 if isinstance(wrapped.model, Radiative) else 0  # colours come after heat
     assert torch.equal(item.initial, wrapped.values[:, first : first + item.initial.shape[1]])
     (own,) = (name for name in names if name.endswith(".own"))
-    assert wrapped.model.rate_of(own) == Rate(0.123, 0.456, paced=True)
+    assert wrapped.model.rate_of(own) == Rate(0.123, 0.456, paced=True, held=0.7)
     assert all(isinstance(wrapped.model.rate_of(name), Rate) for name in names)
 
 
@@ -275,7 +275,7 @@ def test_a_learned_ambient_keeps_its_rate_in_a_field():
     model = ImagingField(NewtonHarmonic(ambient="learned"))
     model.prepare(make_scene())
     assert model.rate_of("emission.ambient") == Rate(1e-3, 0.1)
-    assert model.rate_of("head.weight") == Rate(8e-4, 2e-3, paced=True)
+    assert model.rate_of("head.weight") == Rate(8e-4, 2e-3, paced=True, held=0.7)
 
 
 def test_a_scene_that_the_model_inside_cannot_do_with_is_refused(wrapped):

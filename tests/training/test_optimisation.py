@@ -125,8 +125,22 @@ def test_a_run_goes_through_a_share_of_the_decay(decay, end):
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
     assert rates["means"] == pytest.approx(end * 1.6e-4 * 2.0)
     assert rates["quats"] == 1e-3
-    with pytest.raises(ValueError, match="optim.decay must not be negative, got -1"):
-        Optimisation(decay=-1)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"decay": -1}, "optim.means_end and decay must not be negative, got 0.01 and -1"),
+        ({"means_end": -1}, "optim.means_end and decay must not be negative, got -1 and 1.0"),
+        ({"betas": []}, r"optim.betas must be a list of 2 numbers, got \[\]"),
+        ({"betas": [0.9, 1.0]}, r"optim.betas must lie in \[0, 1\)"),
+        ({"eps": -1}, "optim.eps above 0, got .* and -1"),
+        ({"decoupled": -1}, "optim.decoupled must be the settings of optim=adamw, or null, got -1"),
+    ],
+)
+def test_settings_that_no_optimiser_has_are_refused_by_name(options, told):
+    with pytest.raises(ValueError, match=told):
+        Optimisation(**options)
 
 
 def test_gradients_of_several_views_wait_for_one_update():
@@ -165,3 +179,24 @@ def test_shorter_runs_learn_faster_as_a_power_of_their_length():
         rates = {group["name"]: group["lr"] for group in settings.geometry_groups(cloud, 2.0)}
         expected = {name: lr * (1.0 if name == "opacity_logits" else pace) for name, lr in papers.items()}
         assert settings.pace == pytest.approx(pace) and rates == pytest.approx(expected)
+
+
+def test_a_rate_that_is_held_falls_in_the_rest_of_a_short_run_and_from_the_start_on_in_one_as_long_as_the_papers():
+    shares = [Optimisation(length_power=0.5, steps=steps).held(0.8) for steps in (1000, 7500, 30_000, 60_000)]
+    assert shares == pytest.approx([0.8 * 0.96, 0.8 * 0.75, 0.0, 0.0])
+    assert Optimisation(steps=1000).held(0.8) == 0.0  # rates of any length are the papers'
+    weights = [torch.nn.Parameter(torch.zeros(2)) for _ in range(2)]
+    groups = [
+        {"params": [x], "name": str(held), "lr": 1.0, "lr_end": 0.01, "held": held}
+        for x, held in zip(weights, (0.0, 0.6), strict=True)
+    ]
+    optimizer, scheduler = Optimisation().build(groups, Schedule(100).round_progress)
+    rates = []
+    for _ in range(101):
+        rates.append([group["lr"] for group in optimizer.param_groups])
+        optimizer.step()
+        scheduler.step()
+    falls, held = torch.tensor(rates, dtype=torch.float64).T
+    torch.testing.assert_close(falls, 0.01 ** (torch.arange(101) / 100).double())
+    assert (held[:61] == 1.0).all()
+    torch.testing.assert_close(held[60:], 0.01 ** (torch.arange(41) / 40).double())

@@ -47,9 +47,10 @@ class AtmosphericField(Wrapper):
             so that the factor may exceed 1, too.
         exponent_max: bound of |(μ_a + μ_s) d|, approached smoothly; None leaves it unbounded, as published.
         lr, lr_end: learning rate of the network and the factor on it at the end of the run.
+        lr_held: share of a short run in which that rate stays before it falls (``Rate.held``).
 
     Raises:
-        ValueError: an option is unknown, or a size is not positive.
+        ValueError: an option is unknown or out of its range, or a size is not positive.
     """
 
     paced = True
@@ -71,6 +72,7 @@ class AtmosphericField(Wrapper):
         exponent_max: float | None = 4.0,
         lr: float = 8e-4,
         lr_end: float = 2e-3,
+        lr_held: float = 0.7,
     ) -> None:
         super().__init__({"emission": emission}, needs={"time"} if time == "seconds" else ())
         check_option("time", time, TIMES)
@@ -90,7 +92,9 @@ class AtmosphericField(Wrapper):
         self.positions = positions
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         self.frames_per_cycle = frames_per_cycle
-        self.time, self.lr, self.lr_end = time, lr, lr_end
+        if not 0 <= lr_held < 1:
+            raise ValueError(f"lr_held is a share of a run and must lie in [0, 1), got {lr_held}")
+        self.time, self.lr, self.lr_end, self.held = time, lr, lr_end, lr_held
         codes = 6 * position_frequencies
         inputs = [codes if i == 0 else width + codes if i == skip else width for i in range(depth)]
         self.layers = nn.ModuleList(nn.Linear(count, width) for count in inputs)

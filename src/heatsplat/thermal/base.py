@@ -127,11 +127,13 @@ class Rate(NamedTuple):
         lr: learning rate.
         lr_end: factor on it at the last step of the run, log-linear in between.
         paced: whether it learns faster in shorter runs (``Optimisation.length_power``), as the weights of a network do.
+        held: share of a short run in which the rate stays as it is, and falls in the rest (``Optimisation.held``).
     """
 
     lr: float
     lr_end: float = 1.0
     paced: bool = False
+    held: float = 0.0
 
 
 def surface_normals(seeds: Seeds) -> dict[str, PerGaussian]:
@@ -148,7 +150,7 @@ class Heat(nn.Module, ABC):
     Class attributes:
         needs: metadata it cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
-        lr, lr_end, paced: the ``Rate`` of its own parameters (those that are not per Gaussian).
+        lr, lr_end, paced, held: the ``Rate`` of its own parameters (those that are not per Gaussian).
         inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
@@ -161,6 +163,7 @@ class Heat(nn.Module, ABC):
     lr: float = 1e-3
     lr_end: float = 1.0
     paced: bool = False
+    held: float = 0.0
 
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs`` or its range
@@ -224,7 +227,7 @@ class Heat(nn.Module, ABC):
 
     def rate_of(self, name: str) -> Rate:
         """That of its own parameter of that name."""
-        return Rate(self.lr, self.lr_end, self.paced)
+        return Rate(self.lr, self.lr_end, self.paced, self.held)
 
     def effects(self) -> dict[str, dict[str, Any]]:
         """The physical effects that it simulates: catalogue name -> settings (for metrics.json)."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import check_option
+from heatsplat.physics.same_bits import mean, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import AtmosphericField
 from heatsplat.thermal.base import ThermalModel
@@ -33,7 +34,7 @@ class ImagingField(AtmosphericField):
         field: further options of ``AtmosphericField``.
 
     Raises:
-        ValueError: an option is unknown, or a size is not positive.
+        ValueError: an option is unknown, a size is not positive, or the gauge is negative.
     """
 
     factor_name = "imaging_factor"
@@ -49,6 +50,8 @@ class ImagingField(AtmosphericField):
         **field: Any,
     ) -> None:
         check_option("applies_to", applies_to, TARGETS)
+        if gauge < 0:
+            raise ValueError(f"gauge is a weight and must not be negative, got {gauge}")
         super().__init__(emission, exponent=exponent, frames_per_cycle=frames_per_cycle, **field)
         self.on_radiance, self.gauge = applies_to == "radiance", gauge
         self._sensitivity: Tensor | None = None
@@ -57,12 +60,12 @@ class ImagingField(AtmosphericField):
         """The emission's, and "sensitivity_gauge" of the Gaussians that were last evaluated with a gradient."""
         terms = super().regularisers(splats)
         if self._sensitivity is not None and self.gauge > 0:
-            terms = terms | {"sensitivity_gauge": self.gauge * (self._sensitivity.mean() - 1.0).square()}
+            terms = terms | {"sensitivity_gauge": self.gauge * (mean(self._sensitivity) - 1.0).square()}
         self._sensitivity = None
         return terms
 
     def _factor_of(self, raw: Tensor) -> Tensor:
-        sensitivity = 2.0 * raw[:, 3].sigmoid() if self.positive else 1.0 + raw[:, 3]
+        sensitivity = 2.0 * sigmoid(raw[:, 3]) if self.positive else 1.0 + raw[:, 3]
         if torch.is_grad_enabled():
             self._sensitivity = sensitivity if len(sensitivity) else None  # a mean over no Gaussian in view is NaN
         return sensitivity * super()._factor_of(raw)
