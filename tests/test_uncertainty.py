@@ -10,10 +10,11 @@ import torch
 from running import TINY, run
 from weathered import CAMERA
 
+from heatsplat import uncertainty
 from heatsplat.composition import build
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
-from heatsplat.uncertainty import Uncertainty, _pixels, _shares, evidence, redundancy
+from heatsplat.uncertainty import WITHIN, Uncertainty, _calibrated, _pixels, _shares, evidence, redundancy
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
 
@@ -79,7 +80,7 @@ def test_images_of_another_weather_tell_nothing():
         Uncertainty(SimpleNamespace(scene=scene))
 
 
-def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path):
+def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path, monkeypatch, caplog):
     settings = ("method=3dgs", "data.scene=static", "max_steps=300", "test=false", *TINY)
     module, trainer = run(tmp_path, *settings)
     told = Uncertainty(module)
@@ -101,6 +102,49 @@ def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path):
     )
     turned = replace(module.scene.train.frames[0], camera=replace(module.scene.train.frames[0].camera, viewmat=behind))
     assert told.deviation(turned).median() > max(5 * seen, 0.9 * told.prior * told.unit)
+    assert "is hidden" not in caplog.text
+    monkeypatch.setattr(uncertainty, "noise_of_views", lambda views, modality: 5.0 * told.prior)
+    hidden = Uncertainty(module)
+    assert "is hidden in the camera's noise" in caplog.text
+    assert told.usual < hidden.usual < hidden.noise * hidden.unit
+
+
+def recorded(noise, error=0.10, count=40_000):
+    """Rows of pixels that are off by ``error`` beside a ``noise``, with variances that vary from place to place; the errors."""
+    generator = torch.Generator().manual_seed(0)
+    wide = 2 * error**2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) + 1e-4
+    errors = error * torch.randn(count, generator=generator, dtype=torch.float64)
+    squares = (errors + noise * torch.randn(count, generator=generator, dtype=torch.float64)).square()
+    return torch.cat([squares[:, None], wide, torch.full_like(wide, noise**2), 3 * wide], dim=1), errors
+
+
+@pytest.mark.parametrize("too_much", [0.02, 0.05, 0.1])
+def test_errors_that_the_noise_hides_are_not_taken_for_none(too_much):
+    """What is left of the squared residuals is nothing, or less, where the noise is held for more than it is."""
+    rows, errors = recorded(noise=0.5)
+    shares, told = _calibrated(rows.chunk(8), 0.5 * (1 + too_much))
+    deviations = (rows[:, 1:] @ shares).sqrt()
+    assert not told
+    assert 0.6 < (errors.abs() <= deviations).double().mean() < 0.95 and deviations.median() < 0.25
+
+
+def test_errors_that_stand_out_of_the_noise_are_found_as_they_are():
+    rows, errors = recorded(noise=0.05)
+    shares, told = _calibrated(rows.chunk(8), 0.05)
+    plain, _ = _shares(rows, 0.05)
+    assert told
+    torch.testing.assert_close(shares, plain * ((rows[:, 0] - 0.05**2) / (rows[:, 1:] @ plain)).quantile(WITHIN))
+    assert (errors.abs() <= (rows[:, 1:] @ shares).sqrt()).double().mean() == pytest.approx(WITHIN, abs=0.02)
+
+
+def test_pixels_that_err_together_tell_no_more_than_one_of_them(monkeypatch):
+    monkeypatch.setattr(uncertainty, "NOISE_ERROR", 0.0)
+    rows, _ = recorded(noise=0.5, error=0.01, count=2000)
+    least = [
+        (each[:, 1:] @ _calibrated([each], 0.5)[0]).median().item()
+        for each in (rows, rows.repeat_interleave(20, 0), recorded(noise=0.5, error=0.01)[0])
+    ]
+    assert least[1] == pytest.approx(least[0], rel=0.3) and least[2] < 0.5 * least[0]
 
 
 @contextmanager

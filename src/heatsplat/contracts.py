@@ -291,7 +291,7 @@ class View:
         Raises:
             SceneError: the view has none.
         """
-        image = self.thermal if modality == "clean" and self.clean is None else getattr(self, modality)
+        image = self.thermal if modality == "clean" and self.clean is None else getattr(self, modality, None)
         if image is None:
             raise SceneError(f"view {self.frame.name} has no {modality} image; choose a method or data set that fits")
         return image

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from heatsplat.losses import schedules
-from heatsplat.losses.compose import Loss, LossInputs, Weighted
+from heatsplat.losses.compose import During, Loss, LossInputs, Weighted
 
 
 def at(step):
@@ -31,6 +31,16 @@ def test_names_join_term_and_part():
 
 def test_a_term_that_is_none_is_absent():
     assert list(Loss({"plain": mean, "edge": None})(at(0))) == ["plain"]
+
+
+def test_steps_at_which_nothing_is_compared_are_refused():
+    Loss({"first": During(mean, stop=0), "second": During(mean, start=0, stop=9)})
+    Loss({"first": During(mean, stop=0), "second": mean})
+    for stop in (0, 4):
+        with pytest.raises(ValueError, match=f"counts at step {stop}; .* first from 0 to {stop}, second from 5 to inf"):
+            Loss({"first": During(mean, stop=stop), "second": During(mean, start=5)})
+    with pytest.raises(ValueError, match=r"the loss has no term: give one of loss.terms \(plain\) that is not null"):
+        Loss({"plain": None})
 
 
 def test_weight_and_schedule_multiply():

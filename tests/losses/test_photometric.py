@@ -123,6 +123,35 @@ def test_faint_contrast_on_a_bright_image_keeps_its_gradient():
     assert relative(gradient, expected) < 1e-3
 
 
+@pytest.mark.parametrize("off", [1.0, -10.0, 40.0, 1000.0])
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_prediction_that_is_far_off_keeps_its_gradient(off, masked):
+    """As at the start of a run, or where a sensor adds a level: the pull back must have the right direction."""
+    prediction, target = images(90, 110, 1)
+    prediction, target = (prediction + off).float(), target.float()
+    mask = torch.rand(90, 110, generator=torch.Generator().manual_seed(2)) > 0.02 if masked else None
+    expected_value, expected = loss_and_gradient(Photometric(1.0), prediction.double(), target.double(), mask)
+    value, gradient = loss_and_gradient(Photometric(1.0), prediction, target, mask)
+    assert value["dssim"] == pytest.approx(expected_value["dssim"], abs=1e-6)
+    assert relative(gradient, expected) < 2e-5
+    seen = prediction.clone().requires_grad_()
+    counts = torch.ones(90, 110, dtype=torch.bool) if mask is None else mask
+    (1 - ssim_map(seen, target, mask)[counts]).mean().backward()
+    assert relative(seen.grad, expected) < 2e-5
+
+
+def test_a_variance_that_rounding_makes_negative_counts_as_none():
+    """Flat parts far from the mean of their image: rounding outweighs the stabiliser, which a denominator must not fall below."""
+    target = torch.zeros(60, 60, 1)
+    prediction = target.clone()
+    prediction[:, 30:] = 2000.0
+    value, gradient = loss_and_gradient(Photometric(1.0), prediction, target)
+    similarity = ssim_map(prediction, target)
+    for found in (1 - value["dssim"], similarity.min(), similarity.max()):
+        assert -1.001 <= float(found) <= 1.001
+    assert gradient.isfinite().all() and gradient.abs().max() < 1.0
+
+
 def test_saturated_and_out_of_range_predictions_stay_finite():
     _, target = images(20, 20, 1, dtype=torch.float32)
     for level in (-1e3, 0.0, 1.0, 1e3):

@@ -139,6 +139,50 @@ def test_values_out_of_range_are_refused_by_name(override, told):
         checked(heatsplat.compose(["method=etgs", override]))
 
 
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("density.start=abc", "density.start must be a whole number, got abc"),
+        ("density.stop=null", "density.stop must be a whole number, got None"),
+        ("density.every=2.5", "density.every must be a whole number, got 2.5"),
+        ("density.cap_max=nan", "density.cap_max must be a whole number, got nan"),
+        ("density.multiple=abc", "density.multiple must be a number or null, got abc"),
+        ("density.floor=nan", "density.floor must be a number, got nan"),
+        ("thermal.lr_rate=null", "thermal.lr_rate must be a number, got None"),
+        ("optim.length_power=true", "optim.length_power must be a number, got True"),
+        ("init.separate=abc", "init.separate must be true or false, got abc"),
+    ],
+)
+def test_settings_of_another_kind_than_their_class_declares_are_refused_by_name(override, told):
+    with pytest.raises(SceneError, match=told):
+        checked(heatsplat.compose(["method=etgs", override]))
+
+
+def test_settings_of_bases_functions_and_parts_in_others_are_of_their_kind_too():
+    for method, override, told in (
+        ("ti3dgs", "density.start=abc", "density.start must be a whole number"),
+        ("ti3dgs", "thermal.emission.floor=abc", "thermal.emission.floor must be true or false"),
+        ("auto", "effects.parts.reflection.degree=abc", "effects.parts.reflection.degree must be a whole number"),
+        ("supirgs", "loss.terms.high_frequency.schedule.start=abc", "high_frequency.schedule.start must be a number"),
+    ):
+        with pytest.raises(SceneError, match=told):
+            checked(heatsplat.compose([f"method={method}", override]))
+
+
+def test_no_limit_whole_numbers_with_a_point_and_one_for_true_pass():
+    checked(heatsplat.compose(["method=etgs", "density.cap_max=inf", "density.every=1e2", "init.separate=0"]))
+
+
+@pytest.mark.parametrize("method", ["thermogs", "ntr_gaussian"])
+def test_a_first_stage_of_two_lengths_is_refused(method):
+    """Frozen geometry and a network that is not used yet leave nothing to train."""
+    with pytest.raises(
+        SceneError, match="thermal.first_steps=18, but .* follow first_steps=9: set first_steps=18 instead"
+    ):
+        checked(heatsplat.compose([f"method={method}", "thermal.first_steps=18", "max_steps=30"]))
+    checked(heatsplat.compose([f"method={method}", "first_steps=18", "max_steps=30"]))
+
+
 def test_what_the_machine_lacks_is_told_before_data_are_read(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SceneError, match="trainer.accelerator=cuda: PyTorch sees no CUDA device"):

@@ -59,3 +59,5 @@ def test_opacities_of_their_own_on_request_and_no_image_twice():
     assert Static(shared_opacity=False).opacity_channels == Static().opacity_channels == (1,)
     with pytest.raises(ValueError, match="leave rgb out of them"):
         Static(channels=3, modality="rgb", companions={"rgb": 3})
+    with pytest.raises(ValueError, match="companions must be one of thermal, rgb, got 'depth'"):
+        Static(companions={"depth": 1})

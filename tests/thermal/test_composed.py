@@ -11,11 +11,12 @@ from torch.profiler import ProfilerActivity, profile
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
+from heatsplat.thermal import conduction
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.common_source import CommonSource
 from heatsplat.thermal.composed import Composed
-from heatsplat.thermal.conduction import Conducting, laplacian
+from heatsplat.thermal.conduction import Conducting, _ImplicitStep, laplacian
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.reflection import Reflection
 from heatsplat.thermal.static import Static
@@ -431,6 +432,43 @@ def test_gradients_of_conduction_are_those_of_the_dense_system():
     assert model.log_flow.grad.item() == pytest.approx(flow.grad.item(), rel=1e-3)
     for name in ("initial_state", "log_rate", "source_gains"):
         assert torch.allclose(splats[name].grad, twin[name].grad, rtol=1e-3, atol=1e-5)
+
+
+def grid(side):
+    """Laplacian of the graph that joins the nodes of a square grid with the next ones, and their places [n, 2] in [0, 1]."""
+    nodes = torch.arange(side * side).view(side, side)
+    pairs = [torch.stack([nodes[:, :-1], nodes[:, 1:]]), torch.stack([nodes[:-1], nodes[1:]])]
+    places = torch.stack([nodes // side, nodes % side], dim=-1).flatten(0, 1) / (side - 1)
+    return laplacian(torch.cat([pair.flatten(1) for pair in pairs], dim=1), side * side), places
+
+
+@pytest.mark.parametrize("amount", [33.0, 330.0, 3300.0, 33000.0])
+def test_much_flow_is_solved_as_closely_as_little(amount):
+    """Far beyond the record: heat crosses the whole plane, which takes hundreds of steps."""
+    matrix, places = grid(40)
+    values, weights = (places[:, :1] > 0.37).float(), places[:, 1:] * places[:, :1]
+    system = torch.eye(len(places), dtype=torch.float64) + amount * matrix.to_dense().double()
+    expected, by_values = (torch.linalg.solve(system, columns.double()) for columns in (values, weights))
+    by_amount = -(by_values * (matrix.to_dense().double() @ expected)).sum()
+    given = values.requires_grad_(), torch.tensor(amount, requires_grad=True)
+    found = _ImplicitStep.apply(*given, matrix)
+    assert (found - expected).abs().max() < 5e-6
+    gradients = torch.autograd.grad((found * weights).sum(), given)
+    assert (gradients[0] - by_values).abs().max() < 5e-6
+    assert gradients[1].item() == pytest.approx(by_amount.item(), rel=1e-3)
+
+
+def test_flow_that_is_not_solved_is_told_once(monkeypatch, caplog):
+    matrix, places = grid(40)
+    values = (places[:, :1] > 0.37).float()
+    conduction._warn_of_error.cache_clear()
+    _ImplicitStep.apply(values, torch.tensor(3300.0), matrix)
+    assert not caplog.messages
+    monkeypatch.setattr(conduction, "SOLVER_STEPS", 1)
+    for _ in range(2):
+        _ImplicitStep.apply(values, torch.tensor(3300.0), matrix)
+    assert len(caplog.messages) == 1 and "was not solved to 1e-06" in caplog.messages[0]
+    conduction._warn_of_error.cache_clear()
 
 
 def test_nothing_has_flowed_at_the_start_and_hardly_anything_differs_after_very_much():

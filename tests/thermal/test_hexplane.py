@@ -254,6 +254,9 @@ def test_what_cannot_be_is_refused():
         HexPlane(Static(), heads=[])
     with pytest.raises(ValueError, match="resolutions must be at least 2"):
         HexPlane(Static(), resolution=1)
+    for name in ("first_steps", "smooth_space", "smooth_time", "sparse_time"):
+        with pytest.raises(ValueError, match=f"{name}.* must not be negative, got .*-1"):
+            HexPlane(Static(), **{name: -1})
     with pytest.raises(SceneError, match="HexPlane needs time, which scene 'yard'"):
         HexPlane(Static()).check(make_scene((None, None)))
     model, splats = make()

@@ -306,6 +306,7 @@ def test_cost_counts_the_multiply_adds_of_the_layers():
         ({"width": 0}, "must be at least 1, got 0, 2, 10, 10"),
         ({"skip": 2}, "skip must name a hidden layer from 1 to 1, or be null, got 2"),
         ({"exponent_max": 0.0}, "exponent_max must be positive or null, got 0.0"),
+        ({"gauge": -1e-3}, "gauge is a weight and must not be negative, got -0.001"),
     ],
 )
 def test_unknown_options_are_named(options, message):

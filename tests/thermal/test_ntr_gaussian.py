@@ -145,6 +145,9 @@ def test_cost_and_effects_are_told():
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="nodes must be at least 2"):
         NtrGaussian(nodes=1)
+    for name in ("first_steps", "consistency", "environment", "variation", "integral"):
+        with pytest.raises(ValueError, match=f"{name}.* must not be negative, got .*-1"):
+            NtrGaussian(**{name: -1})
     with pytest.raises(SceneError, match="NtrGaussian needs time, which scene"):
         NtrGaussian().check(make_scene(times=(None, None, None)))
 

@@ -98,7 +98,10 @@ def test_values_far_outside_the_range_stay_finite_and_come_back():
     assert torch.isfinite(seen).all() and torch.isfinite(gradient).all() and (gradient > 0).all()
 
 
-@pytest.mark.parametrize("bad", [{"emissivity": 1.2}, {"bounds": (0.96, 0.99)}, {"clip": "soft"}])
+@pytest.mark.parametrize(
+    "bad",
+    [{"emissivity": 1.2}, {"bounds": (0.96, 0.99)}, {"clip": "soft"}, {"band": []}, {"band": [7.5]}, {"bounds": []}],
+)
 def test_what_cannot_be_is_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         RadiativeTransfer(Static(), **bad)

@@ -198,3 +198,9 @@ def test_the_recipe_is_the_released_one():
     photometric = config["loss"]["terms"]["photometric"]
     assert (photometric["dssim_weight"], photometric["dssim_half"]) == (0.2, False)
     assert config["optim"]["opacity_logits"] == 0.025
+
+
+@pytest.mark.parametrize("name", ["time_constant_s", "source_scale"])
+def test_bodies_that_start_without_time_or_source_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}.* must be above 0, got .*-1"):
+        ReleasedHarmonic(**{name: -1})

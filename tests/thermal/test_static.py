@@ -198,3 +198,15 @@ def test_errors():
     model = Static(sh_degree=1)
     with pytest.raises(ValueError, match="depends on the view: give a camera"):
         model.features(splats_of(model, seeds()), Query())
+    with pytest.raises(ValueError, match="modality must be one of thermal, rgb, got 'visible'"):
+        Static(modality="visible")
+    with pytest.raises(ValueError, match="sh_degree_interval must be a number of steps, or 0, got -1"):
+        Static(sh_degree_interval=-1)
+
+
+@pytest.mark.parametrize("wrong", [-1, 0, "abc", None, 1.5])
+def test_channels_that_no_image_has_are_refused(wrong):
+    with pytest.raises(ValueError, match=f"^channels must be a whole number, 1 or more, got {wrong}"):
+        Static(channels=wrong)
+    with pytest.raises(ValueError, match=f"^companions.rgb must be a whole number, 1 or more, got {wrong}"):
+        Static(companions={"rgb": wrong})

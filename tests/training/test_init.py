@@ -8,7 +8,7 @@ import torch
 from running import TINY
 
 from heatsplat.composition import build, compose
-from heatsplat.training.init import Initialisation, neighbour_distances
+from heatsplat.training.init import Initialisation, Voxels, neighbour_distances
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +41,19 @@ def test_no_more_start_than_density_control_allows(parts, source, caplog):
     assert len(first) == 100 and torch.equal(first["means"], second["means"])
     if source == "sfm":
         assert (first["means"].detach()[:, None] == scene.points.float()).all(-1).any(1).all()
+
+
+@pytest.mark.parametrize("source", ["sfm", "random"])
+@pytest.mark.parametrize(("options", "told"), [({"count": -5}, "got 1.0 and -5"), ({"count": 0}, "init.count at least 1"),
+                                               ({"scale": 0.0}, "init.scale must be above 0")])  # fmt: skip
+def test_no_gaussians_and_no_size_are_refused(source, options, told):
+    with pytest.raises(ValueError, match=told):
+        Initialisation(source, **options)
+
+
+def test_cubes_without_an_edge_are_refused():
+    with pytest.raises(ValueError, match="init.voxel must be above 0, or null, got 0"):
+        Voxels(0)
 
 
 def test_clouds_of_their_own_share_the_cap(parts):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -153,10 +154,21 @@ class Loss:
 
     Args:
         terms: name -> term, or None for a term that is absent.
+
+    Raises:
+        ValueError: there is no term, or none counts at some steps before others do.
     """
 
     def __init__(self, terms: Mapping[str, LossTerm | None]) -> None:
         self.terms = {name: term for name, term in terms.items() if term is not None}
+        if not self.terms:
+            raise ValueError(f"the loss has no term: give one of loss.terms ({', '.join(terms)}) that is not null")
+        spans = {name: _span(term) for name, term in self.terms.items()}
+        last = max(stop for _, stop in spans.values())
+        for step in sorted({0, *(stop for _, stop in spans.values() if stop < last)}):
+            if not any(start <= step < stop for start, stop in spans.values()):
+                told = ", ".join(f"{name} from {start} to {stop}" for name, (start, stop) in spans.items())
+                raise ValueError(f"no term of the loss counts at step {step}; change start or stop: {told}")
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Lets terms check and compute what they need of a scene; what the report should say of them, by name."""
@@ -172,6 +184,13 @@ class Loss:
             for part, value in _named(term(inputs)).items():
                 scalars[f"{name}/{part}" if part else name] = value
         return scalars
+
+
+def _span(term: LossTerm) -> tuple[float, float]:
+    """First step at which a term counts, and the step before which it ends."""
+    if not isinstance(term, During):
+        return 0, math.inf
+    return term.start, math.inf if term.stop is None else term.stop
 
 
 def prepare(term: LossTerm, scene: SceneData, modality: str) -> dict[str, str]:

@@ -42,8 +42,10 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
     do masked ones: a masked pixel is one that lies outside. (Libraries that reflect or crop the border differ within 5
     pixels of it.)
 
-    Variances are those of images from which the target's mean was taken away. Exact arithmetic would not notice (the
-    missing part of the window is accounted for), float32 does: E[x²] - E[x]² of a bright flat image is all rounding.
+    Variances are those of images from which the target's mean was taken away, and of a prediction that is far off its own.
+    Exact arithmetic would not notice (the missing part of the window is accounted for), float32 does: E[x²] - E[x]² of a
+    bright flat image is all rounding. It still is of flat parts that lie far from the mean of their image: at a distance of
+    d, a variance is known to 1e-7 d². What rounding leaves below zero counts as zero and has no slope.
 
     Args:
         prediction, target: [H, W, C], floating point. Differentiable in both.
@@ -51,8 +53,10 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
     """
     channels = prediction.shape[-1]
     counts = torch.ones_like(target[..., :1], dtype=torch.bool) if mask is None else mask[..., None]
-    shift = _mean(target.detach(), mask).mean()
-    x, y = (_padded(torch.where(counts, image - shift, 0.0), 0.0) for image in (prediction, target))
+    y_shift = _mean(target.detach(), mask).mean()
+    x_shift = _mean(prediction.detach(), mask).mean()
+    x_shift = torch.where((x_shift - y_shift).abs() < kernel.NEAR, y_shift, x_shift)
+    x, y = (_padded(torch.where(counts, image, 0.0), 0.0) for image in (prediction - x_shift, target - y_shift))
     beyond = _padded(1.0 - counts.expand_as(target).to(target), 1.0)
     taps = window(prediction.dtype, prediction.device).expand(channels, 1, 1, WINDOW)
     blurred = functional.conv2d(torch.cat((x, y, x * x, y * y, x * y, beyond)), taps, groups=channels)
@@ -61,13 +65,13 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
         0, 2, 3, 1
     )  # outside: share of the window that does not count
 
-    x_mean, y_mean = x_mean - shift * outside, y_mean - shift * outside
-    x_variance = xx + shift**2 * outside - x_mean**2
-    y_variance = yy + shift**2 * outside - y_mean**2
-    covariance = xy + shift**2 * outside - x_mean * y_mean
-    x_mean, y_mean = x_mean + shift, y_mean + shift
+    x_mean, y_mean = x_mean - x_shift * outside, y_mean - y_shift * outside
+    x_variance = xx + x_shift**2 * outside - x_mean**2
+    y_variance = yy + y_shift**2 * outside - y_mean**2
+    covariance = xy + x_shift * y_shift * outside - x_mean * y_mean
+    x_mean, y_mean = x_mean + x_shift, y_mean + y_shift
     luminance = (2 * x_mean * y_mean + C1) / (x_mean**2 + y_mean**2 + C1)
-    return luminance * (2 * covariance + C2) / (x_variance + y_variance + C2)
+    return luminance * (2 * covariance + C2) / ((x_variance + y_variance).clamp(min=0.0) + C2)
 
 
 class Photometric:
@@ -193,7 +197,8 @@ class _FusedOnCuda(torch.autograd.Function):
         prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
         height, width, channels = prediction.shape
         line, device = width * channels, prediction.device
-        shift = target.mean() if mask is None else _mean(target, mask).mean()
+        means = (image.mean() if mask is None else _mean(image, mask).mean() for image in (prediction, target))
+        means = torch.stack(tuple(means))
         if mask is None:
             taps, valid, outside = _everywhere_on(device, height, width, channels)
             weights = _numbers(device, *(weight / max(prediction.numel(), 1) for weight in weights))
@@ -205,13 +210,13 @@ class _FusedOnCuda(torch.autograd.Function):
         sums = prediction.new_empty(2, height * blocks)
         block, numbers = on_cuda.BLOCK, height * line
         on_cuda.moments_of_rows[height, blocks](
-            prediction, target, valid, shift, taps, moments, line, numbers, CHANNELS=channels, BLOCK=block
+            prediction, target, valid, means, taps, moments, line, numbers, CHANNELS=channels, BLOCK=block
         )
         on_cuda.similarity[height, blocks](
-            prediction, target, valid, outside, shift, taps, moments, slopes, sums, line, height, numbers, blocks,
+            prediction, target, valid, outside, means, taps, moments, slopes, sums, line, height, numbers, blocks,
             BLOCK=block,
         )  # fmt: skip
-        ctx.save_for_backward(prediction, target, valid, shift, taps, moments, slopes, weights)
+        ctx.save_for_backward(prediction, target, valid, means, taps, moments, slopes, weights)
         return (weights * sums.sum(1)).unbind()
 
     @staticmethod
@@ -219,7 +224,7 @@ class _FusedOnCuda(torch.autograd.Function):
     def backward(ctx, v_difference, v_dissimilarity):
         from heatsplat.kernels.gpu import ssim as on_cuda
 
-        prediction, target, valid, shift, taps, moments, slopes, weights = ctx.saved_tensors
+        prediction, target, valid, means, taps, moments, slopes, weights = ctx.saved_tensors
         height, width, channels = prediction.shape
         line = width * channels
         blocks, numbers = -(-line // on_cuda.BLOCK), height * line
@@ -227,7 +232,7 @@ class _FusedOnCuda(torch.autograd.Function):
         blurred, v_prediction = moments[:3], torch.empty_like(prediction)  # nobody reads the moments any more
         on_cuda.slopes_of_rows[height, blocks](slopes, taps, blurred, line, numbers, CHANNELS=channels, BLOCK=block)
         on_cuda.gradient[height, blocks](
-            prediction, target, valid, shift, taps, blurred, weights, v_difference, v_dissimilarity, v_prediction, line,
+            prediction, target, valid, means, taps, blurred, weights, v_difference, v_dissimilarity, v_prediction, line,
             height, numbers, BLOCK=block,
         )  # fmt: skip
         return v_prediction, None, None, None, None

@@ -7,6 +7,7 @@ from torch import Tensor
 from heatsplat.contracts import check_option
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.losses.compose import LossInputs
+from heatsplat.physics.same_bits import sigmoid
 
 OF = ("activated", "coefficients")
 REDUCTIONS = ("sum", "mean")
@@ -59,7 +60,7 @@ class PhysicalPrior:
         emissivity, reflectance = (inputs.splats[name] for name in self.names)
         excess = 0.0
         if self.activated:
-            emissivity, reflectance = ((C0 * values).sigmoid() for values in (emissivity, reflectance))
+            emissivity, reflectance = (sigmoid(C0 * values) for values in (emissivity, reflectance))
         else:
             excess = outside(emissivity).square() + outside(reflectance).square()
         terms = excess + kirchhoff_excess(emissivity, reflectance, self.tolerance).square()

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
+from heatsplat.physics.same_bits import everywhere, sigmoid
 from heatsplat.sensors.per_frame import PerFrame
-from heatsplat.sensors.sums import everywhere
 
 EPSILON = 1e-4  # images are kept this far from 0 and 1 under the logit, which bounds its slope by 1e4
 
@@ -61,7 +61,7 @@ class GainControl(PerFrame):
         log_stretch, shift = self.at(self.settings(), frame)
         logits = torch.logit(image.clamp(EPSILON, 1 - EPSILON))
         stretch, shift = everywhere(log_stretch.exp(), image), everywhere(shift, image)
-        return image + (torch.sigmoid(stretch * logits + shift) - torch.sigmoid(logits))
+        return image + (sigmoid(stretch * logits + shift) - sigmoid(logits))
 
     def settings(self) -> Tensor:
         """log s and t of the training images in order of time, [F, 2], each with mean zero."""

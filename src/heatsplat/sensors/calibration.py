@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.geometry.resampling import resampled
+from heatsplat.physics.same_bits import everywhere
 from heatsplat.sensors.base import SensorPart
-from heatsplat.sensors.sums import everywhere
 
 
 class Calibration(SensorPart):

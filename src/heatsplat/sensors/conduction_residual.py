@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData, check_option
+from heatsplat.physics.same_bits import to_one
 from heatsplat.sensors.base import SensorPart
 
 NORMS = ("image", "columns", "none")
@@ -75,7 +76,8 @@ class ConductionResidual(SensorPart):
         values = torch.stack((brightness, zoom**2 * curvature(brightness)), 2)
         for layer in self.layers:
             values = self._normalised(layer(values), zoom).relu()
-        return image + self.bound * torch.tanh(self.last(values) / self.bound)
+        found = to_one(values, self.last.weight, self.last.bias)
+        return image + self.bound * torch.tanh(found / self.bound)
 
     def _normalised(self, values: Tensor, zoom: float) -> Tensor:
         """Answers [H, W, width] of a layer over their size, for an image so many times as fine as the training images."""

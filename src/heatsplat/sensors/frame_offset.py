@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SHARE_OF_RANGE, Course, Frame, SceneData
+from heatsplat.physics.same_bits import everywhere
 from heatsplat.sensors.per_frame import PerFrame
-from heatsplat.sensors.sums import everywhere
 
 
 class FrameOffset(PerFrame):

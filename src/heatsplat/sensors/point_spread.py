@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from heatsplat.contracts import Frame, SceneData
+from heatsplat.physics.same_bits import total
 from heatsplat.sensors.base import SensorPart
-from heatsplat.sensors.sums import total
 
 REACH = 3.5  # standard deviations that the kernel reaches at its widest; beyond lie 5e-4 of its weight
 

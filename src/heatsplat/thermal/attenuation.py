@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Course, SceneData
 from heatsplat.physics.curves import cubic_rows, resampled_values
+from heatsplat.physics.same_bits import everywhere
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.coordinates import Clock
@@ -77,7 +78,8 @@ class Attenuation(HeatPart):
             self.clock.prepare(scene)
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
-        return self.level + (values - self.level) * self.transmission(splats, query)
+        level = everywhere(self.level, values)
+        return level + (values - level) * self.transmission(splats, query)
 
     def transmission(self, splats: Splats, query: Query) -> Tensor:
         """e^{-β d}, [n, 1]."""
@@ -85,7 +87,7 @@ class Attenuation(HeatPart):
             raise ValueError("how much air lies in between depends on the view: give a camera")
         means = query.rows(splats.means).detach()
         distances = (means - query.camera.center.to(means)).norm(dim=1, keepdim=True)
-        return torch.exp(-self.extinction(query.time_s) * distances)
+        return torch.exp(-everywhere(self.extinction(query.time_s), distances) * distances)
 
     def extinction(self, time_s: float | None = None) -> Tensor:
         """β at a time, [] in 1 per world unit."""

@@ -18,6 +18,7 @@ from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, Surface, power_excess
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
+from heatsplat.physics.same_bits import sigmoid, variance
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
 from heatsplat.physics.wetness import rained_on, wetted
@@ -313,7 +314,7 @@ class EnergyBalance(ThermalModel):
         shares = [splats[name] for name in SHARES if name in splats]
         if self.share_prior == 0 or not shares or len(splats) == 0:
             return {}
-        return {"share_prior": self.share_prior * sum(share.var(correction=0) for share in shares)}
+        return {"share_prior": self.share_prior * sum(map(variance, shares))}
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of
@@ -419,7 +420,7 @@ class EnergyBalance(ThermalModel):
 
     def _surface(self, splats: Splats, query: Query) -> Surface:
         def bounded(name: str, low: float, high: float) -> Tensor:
-            return low + (high - low) * query.rows(splats[name]).sigmoid()
+            return low + (high - low) * sigmoid(query.rows(splats[name]))
 
         def state(name: str) -> Tensor:
             return self.range.bounds.to_celsius(query.rows(splats[name])) - celsius(self.reference_k).item()

@@ -12,8 +12,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_option
+from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_numbers, check_option
 from heatsplat.physics.ellipsoids import SMALLEST_AXIS_M
+from heatsplat.physics.same_bits import mean, sigmoid
 from heatsplat.physics.units import DAY_S
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
@@ -173,16 +174,28 @@ class EnergyNetwork(ThermalModel):
         check_option("attributes", attributes, MATERIALS)
         check_option("collocation", collocation, COLLOCATIONS)
         check_option("body", body, BODIES)
+        past_h = tuple(past_h)
+        check_numbers("past_h", past_h, len(past_h))
+        if min((depth_m, *past_h)) <= 0 or smallest_axis_m < 0:
+            raise ValueError(
+                f"depth_m and past_h must be above 0 and smallest_axis_m not negative, got {depth_m}, {list(past_h)} and "
+                f"{smallest_axis_m}"
+            )
         self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
         if body == "surface":
             self.balance = SurfaceBalance(sky, depth_m)
-        self.collocation, self.past_h = collocation, tuple(past_h)
+        self.collocation, self.past_h = collocation, past_h
         if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
             raise ValueError(
                 "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
                 f"ramp_steps at least 0, got {width}, {blocks}, {time_frequencies}, {sampled}, {position_frequencies}, "
                 f"{first_steps} and {ramp_steps}"
             )
+        if features in ("learned", "given") and feature_size < 1:
+            raise ValueError(
+                f"feature_size must be at least 1 where features are {features}, got {feature_size}; without: features=none"
+            )
+        check_numbers("interval_s", interval_s, 2)
         shortest, longest = interval_s
         if not 0 < shortest <= longest or margin < 0:
             raise ValueError(
@@ -321,9 +334,9 @@ class EnergyNetwork(ThermalModel):
         if self.features_from == "learned":
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
             spread = value.std(correction=0).clamp(min=1e-3)  # of a single Gaussian it is 0
-            feature[:, 0] = (value - value.mean()) / spread  # warm and cold differ from the start
+            feature[:, 0] = (value - mean(value)) / spread  # warm and cold differ from the start
             tensors["feature"] = PerGaussian(feature, self.lr_feature)
-        self.network.heads["temperature"].bias.fill_(self._raw_of(value.mean()))
+        self.network.heads["temperature"].bias.fill_(self._raw_of(mean(value)))
         if self._stored is not None:
             own = self.state_dict()
             for name, stored in self._stored.items():
@@ -479,7 +492,7 @@ class EnergyNetwork(ThermalModel):
 
     def _units(self, hidden: Tensor) -> Tensor:
         """Temperatures between T_min (0) and T_max (1), [n]."""
-        return self.network.heads["temperature"](hidden)[:, 0].sigmoid()
+        return sigmoid(self.network.heads["temperature"](hidden)[:, 0])
 
     def _image_values(self, units: Tensor) -> Tensor:
         lower, width = self.range.lowest_k, self.range.bounds.span_k
@@ -502,7 +515,7 @@ class EnergyNetwork(ThermalModel):
         if self.constant:
             hidden = self.network(base, torch.zeros_like(self.network.shared.weight[0]))
         if self.inferred:
-            values = self.lowest + (self.highest - self.lowest) * self.network.heads["attributes"](hidden).sigmoid()
+            values = self.lowest + (self.highest - self.lowest) * sigmoid(self.network.heads["attributes"](hidden))
         else:
             values = reference(Query(ids).rows(splats["label"].detach()).long())
         return dict(zip(ATTRIBUTES, values.unbind(1), strict=True))

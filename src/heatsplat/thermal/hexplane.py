@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from heatsplat.contracts import SceneData
+from heatsplat.physics.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Clock, ImageRange
-from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.layers import Head, draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
 
 # Head -> numbers that it gives and the bound of each, which is approached smoothly: a moved mean in half edges of the box,
@@ -65,7 +66,7 @@ class HexPlane(Wrapper):
         lr_end: factor on both at the end of the run.
 
     Raises:
-        ValueError: a head is unknown, there is none, or a size is not positive.
+        ValueError: a head is unknown, there is none, or a number is out of its range.
     """
 
     inseparable = "opacities, and sizes if asked for, change in time with the place of each"
@@ -98,6 +99,11 @@ class HexPlane(Wrapper):
                 "resolutions must be at least 2, scales, channels and width at least 1, got "
                 f"{resolution}, {time_resolution}, {list(scales)}, {channels}, {width}"
             )
+        if min(first_steps, smooth_space, smooth_time, sparse_time) < 0:
+            raise ValueError(
+                "first_steps and the weights smooth_space, smooth_time and sparse_time must not be negative, got "
+                f"{first_steps}, {smooth_space}, {smooth_time} and {sparse_time}"
+            )
         self.scales, self.time_resolution, self.first_steps = tuple(scales), time_resolution, first_steps
         self.weights = {"smooth_space": smooth_space, "smooth_time": smooth_time, "sparse_time": sparse_time}
         self.lr, self.lr_planes, self.lr_end = lr, lr_planes, lr_end
@@ -109,7 +115,7 @@ class HexPlane(Wrapper):
         self.heads = nn.ModuleDict(
             {
                 name: nn.Sequential(
-                    nn.LeakyReLU(leak), nn.Linear(width, width), nn.LeakyReLU(leak), nn.Linear(width, HEADS[name][0])
+                    nn.LeakyReLU(leak), nn.Linear(width, width), nn.LeakyReLU(leak), Head(width, HEADS[name][0])
                 )
                 for name in HEADS
                 if name in heads
@@ -162,7 +168,7 @@ class HexPlane(Wrapper):
             means + self.reach * change["means"] if "means" in change else means,
             quats + change["rotations"] if "rotations" in change else quats,
             (log_scales + change["scales"]).exp() if "scales" in change else splats.scales,
-            (logits + change["opacity"]).sigmoid().T if "opacity" in change else splats.opacities,
+            sigmoid(logits + change["opacity"]).T if "opacity" in change else splats.opacities,
             hidden,
         )
 

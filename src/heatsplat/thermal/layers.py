@@ -1,4 +1,4 @@
-"""Random starts of networks from the run's own generator, so that a run is the same whatever ran before it."""
+"""Layers of networks: the last one, and random starts from the run's own generator, whatever ran before the run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,16 @@ import math
 from collections.abc import Iterable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+
+from heatsplat.physics.same_bits import to_one
+
+
+class Head(nn.Linear):
+    """A last layer, [..., inputs] to [..., outputs], which learns the same bits with any number of threads."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        return super().forward(values) if self.out_features > 1 else to_one(values, self.weight, self.bias)
 
 
 @torch.no_grad()

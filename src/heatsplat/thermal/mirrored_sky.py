@@ -12,6 +12,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics import sky
+from heatsplat.physics.same_bits import sigmoid
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import SKY_SEEN, PerGaussian, Query, Seeds, surface_normals
@@ -68,9 +69,9 @@ class MirroredSky(HeatPart):
         if query.camera is None:
             raise ValueError("what a surface mirrors depends on the view: give a camera")
         own = self.range.kelvin(values) / 100.0  # of which powers are of order 100
-        share = query.rows(splats["sky_reflectance_logit"]).sigmoid()[:, None]
-        mirrored = (1 - share) * own**4 + share * self._radiance(splats, query)[:, None]
-        shown = 100.0 * mirrored.clamp(min=1e-3) ** 0.25
+        share = sigmoid(query.rows(splats["sky_reflectance_logit"]))[:, None]
+        mirrored = (1 - share) * own.square().square() + share * self._radiance(splats, query)[:, None]
+        shown = 100.0 * mirrored.clamp(min=1e-3).sqrt().sqrt()
         return (shown - self.range.lowest_k) / self.range.bounds.span_k
 
     def _radiance(self, splats: Splats, query: Query) -> Tensor:
@@ -100,7 +101,7 @@ class MirroredSky(HeatPart):
         return float(air_k), sky.optical_depth(emissivity)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return {"sky_reflectance": query.rows(splats["sky_reflectance_logit"]).sigmoid()}
+        return {"sky_reflectance": sigmoid(query.rows(splats["sky_reflectance_logit"]))}
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"mirrored_sky": {"law": self.law} | ({"clouds": "recorded"} if self.clouds else {})}

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm, softplus
 
 from heatsplat.contracts import SceneData, check_option
+from heatsplat.physics.same_bits import sigmoid
 from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Rate, Seeds, ThermalModel
@@ -20,7 +21,7 @@ from heatsplat.thermal.coordinates import (
     sees_hours,
     slow_octaves,
 )
-from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.layers import Head, draw_uniform
 
 TIMES = ("scene", "record", "day")
 EXCHANGE = 10.0  # W/m²/K, unit of the exchange coefficient
@@ -61,6 +62,9 @@ class NtrGaussian(ThermalModel):
         lr, lr_end: learning rate of the networks and the factor on it at the end of the run.
         lr_attributes: learning rate of the attribute networks.
         lr_feature, lr_first: learning rates of features and of the first stage's value.
+
+    Raises:
+        ValueError: an option is unknown or out of its range.
     """
 
     needs = frozenset({"time", "thermal_range"})
@@ -96,6 +100,11 @@ class NtrGaussian(ThermalModel):
                 "width and nodes must be at least 2, the encodings and feature_size at least 1 and window_s positive, got "
                 f"{width}, {nodes}, {position_frequencies}, {time_frequencies}, {feature_size}, {window_s}"
             )
+        if min(first_steps, consistency, environment, variation, integral) < 0:
+            raise ValueError(
+                "first_steps and the weights consistency, environment, variation and integral must not be negative, got "
+                f"{first_steps}, {consistency}, {environment}, {variation} and {integral}"
+            )
         check_option("time", time, TIMES)
         check_frames_per_cycle(frames_per_cycle)
         self.nodes, self.window_s, self.time, self.frames_per_cycle = nodes, window_s, time, frames_per_cycle
@@ -112,7 +121,7 @@ class NtrGaussian(ThermalModel):
         places, times = 6 * position_frequencies, 2 * time_frequencies
         # Layers see a Gaussian's place and feature once per view and the time once per node; their sums meet here.
         self.place, self.moment = nn.Linear(places, width), nn.Linear(times, width, bias=False)
-        self.hidden, self.temperature_head = nn.Linear(width, width), nn.Linear(width, 1)
+        self.hidden, self.temperature_head = nn.Linear(width, width), Head(width, 1)
         self.env = nn.Sequential(
             nn.Linear(times, width), nn.ReLU(), nn.Linear(width, half), nn.ReLU(), nn.Linear(half, 2)
         )
@@ -219,7 +228,7 @@ class NtrGaussian(ThermalModel):
     def _network(self, place: Tensor, moments: Tensor) -> Tensor:
         """T_net in image units at all nodes, [n, nodes]."""
         hidden = (place[:, None] + self.moment(moments)[None]).relu()
-        return self.temperature_head(self.hidden(hidden).relu())[..., 0].sigmoid()
+        return sigmoid(self.temperature_head(self.hidden(hidden).relu())[..., 0])
 
     def _rates(
         self, units: Tensor, env: Tensor, wind: Tensor, moments: Tensor, feature: Tensor, code: Tensor
@@ -236,7 +245,7 @@ class NtrGaussian(ThermalModel):
             gain, bias = self.attribute_norm
             hidden = gain * layer_norm(hidden, hidden.shape[-1:]) + bias
         raw = (hidden.relu() * self.attribute_heads).sum(-1)
-        emissivity, exchange = raw[..., 0].sigmoid(), EXCHANGE * softplus(raw[..., 1])
+        emissivity, exchange = sigmoid(raw[..., 0]), EXCHANGE * softplus(raw[..., 1])
         storage = self._storage * (softplus(raw[..., 2]) + 0.05)  # 5 kJ/m²/K at least: a sheet of metal
         span = self.range.bounds.span_k
         flux = emissivity * STEFAN_BOLTZMANN * self.range.kelvin(units).square().square() + exchange * span * (

@@ -13,6 +13,7 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics.grey_body import radiance, temperature_of
+from heatsplat.physics.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.band_scale import DEGREE, BandScale
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
@@ -190,8 +191,8 @@ class Radiative(Wrapper):
         if self.band is None:
             temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings)
         else:
-            others = (1.0 - emissivity) * self.band.root_of(self.surroundings) ** 4
-            own = (self.band.root_of(grey) ** 4 - others) / emissivity
+            others = (1.0 - emissivity) * self._of_black(self.surroundings)
+            own = (self._of_black(grey) - others) / emissivity
             temperature = self.band.value_of(own.clamp(min=0.0).sqrt().sqrt())
         temperature = temperature.clamp(*START)
         values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
@@ -240,14 +241,20 @@ class Radiative(Wrapper):
             return (self._sum(splats, query, "radiance") + 0.5).clamp(min=0.0)
         body = self._body(splats, query)
         if self.band is not None:
-            own, others = (self.band.root_of(values) ** 4 for values in (body["temperature"], self.surroundings))
-            return self.band.value_of(torch.lerp(others.to(own), own, body["emissivity"]).sqrt().sqrt())
-        sent = radiance(body["emissivity"], body["temperature"], self.gain, body["reflectance"], self.surroundings)
+            own, others = (self._of_black(values) for values in (body["temperature"], self.surroundings))
+            sent = torch.lerp(everywhere(others.to(own), own), own, body["emissivity"])
+            return self.band.value_of(sent.sqrt().sqrt())
+        gain, surroundings = (everywhere(number, body["emissivity"]) for number in (self.gain, self.surroundings))
+        sent = radiance(body["emissivity"], body["temperature"], gain, body["reflectance"], surroundings)
         return clipped(sent, self.clip)
+
+    def _of_black(self, values: Tensor) -> Tensor:
+        """Radiance in the band of black bodies that look like ``values``, over that of white."""
+        return self.band.root_of(values).square().square()
 
     def _body(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """ε, T and ρ in the direction of view, each [n, 1]."""
-        body = {name: self._sum(splats, query, name).sigmoid() for name in self.degrees}
+        body = {name: sigmoid(self._sum(splats, query, name)) for name in self.degrees}
         return body | {"reflectance": 1.0 - body["emissivity"]} if self.kirchhoff else body
 
     def _sum(self, splats: Splats, query: Query, name: str) -> Tensor:

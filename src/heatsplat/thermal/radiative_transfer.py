@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, check_option
+from heatsplat.contracts import SceneData, check_numbers, check_option
+from heatsplat.physics.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.band_scale import DEGREE, BandScale
@@ -66,6 +67,8 @@ class RadiativeTransfer(Wrapper):
         check_option("clip", clip, CLIPS)
         if state.modality_channels != (1,):
             raise ValueError(f"the state must explain one channel, got {state.modality_channels}")
+        check_numbers("band", band, 2)
+        check_numbers("bounds", bounds, 2)
         least, most = bounds
         if not 0 < least < emissivity < most <= 1 or not 0 <= surroundings_quantile <= 1:
             raise ValueError(
@@ -103,7 +106,8 @@ class RadiativeTransfer(Wrapper):
         emissivity, surroundings = self._surface(splats, query)
         sent = torch.lerp(self._radiance(surroundings), self._radiance(values), emissivity)
         if self.air is not None:
-            sent = torch.lerp(self._radiance(self.air.level), sent, self.air.transmission(splats, query))
+            of_air = everywhere(self._radiance(self.air.level), sent)
+            sent = torch.lerp(of_air, sent, self.air.transmission(splats, query))
         return clipped(self.scale.value_of(sent.sqrt().sqrt()), self.clip)
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
@@ -129,8 +133,8 @@ class RadiativeTransfer(Wrapper):
         """ε and E of the Gaussians in view, each [n, 1]; E in image units."""
         offset = query.rows(splats["emissivity_offset"])[:, None]
         surroundings = self.level + query.rows(splats["surroundings_offset"])[:, None]
-        return self.least + self.span * (self.start + offset).sigmoid(), surroundings
+        return self.least + self.span * sigmoid(self.start + offset), surroundings
 
     def _radiance(self, values: Tensor) -> Tensor:
         """Of black bodies that look like ``values``, over that of white."""
-        return self.scale.root_of(self.scale.within(values)) ** 4
+        return self.scale.root_of(self.scale.within(values)).square().square()

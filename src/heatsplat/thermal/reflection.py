@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
+from heatsplat.physics.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.part import HeatPart
@@ -62,13 +63,13 @@ class Reflection(HeatPart):
         return own | surface_normals(seeds) if self.degree > 0 else own
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
-        share = query.rows(splats["reflectance_logit"]).sigmoid()[:, None]
-        return values + share * (self._radiance(splats, query) - values)
+        share = sigmoid(query.rows(splats["reflectance_logit"]))[:, None]
+        return values + share * (self._radiance(values, splats, query) - values)
 
-    def _radiance(self, splats: Splats, query: Query) -> Tensor:
-        """L where the Gaussians mirror it, [n, 1], or [1, 1] where it is the same all round."""
+    def _radiance(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
+        """L where Gaussians with these values [n, 1] mirror it, [n, 1]."""
         if self.degree == 0:
-            return spherical_harmonics.C0 * self.surroundings[None]
+            return everywhere(spherical_harmonics.C0 * self.surroundings, values)
         if query.camera is None:
             raise ValueError("what a surface mirrors depends on the view: give a camera")
         means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
@@ -78,7 +79,7 @@ class Reflection(HeatPart):
         return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        return {"reflectance": query.rows(splats["reflectance_logit"]).sigmoid()}
+        return {"reflectance": sigmoid(query.rows(splats["reflectance_logit"]))}
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"reflection": {"degree": self.degree}}

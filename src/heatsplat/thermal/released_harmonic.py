@@ -42,7 +42,7 @@ class ReleasedHarmonic(NewtonHarmonic):
         lr_end: factor on all of them at the last step, log-linear in between.
 
     Raises:
-        ValueError: an option is unknown.
+        ValueError: an option is unknown or out of its range.
     """
 
     def __init__(
@@ -76,6 +76,10 @@ class ReleasedHarmonic(NewtonHarmonic):
             lr_ambient=lr_ambient,
             lr_end=lr_end,
         )
+        if min(time_constant_s, source_scale) <= 0:
+            raise ValueError(
+                f"time_constant_s and source_scale must be above 0, got {time_constant_s} and {source_scale}"
+            )
         self.param = "released"
         self.time_constant_s, self.source_scale = time_constant_s, source_scale
         self.lr_initial_c, self.lr_time_constant_s = lr_initial_c, lr_time_constant_s

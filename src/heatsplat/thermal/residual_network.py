@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.layers import Head, draw_uniform
 
 
 class ResidualNetwork(nn.Module):
@@ -31,7 +31,7 @@ class ResidualNetwork(nn.Module):
         self.blocks = nn.ModuleList(
             nn.ModuleList((nn.Linear(width, width), nn.Linear(width, width))) for _ in range(blocks)
         )
-        self.heads = nn.ModuleDict({name: nn.Linear(width, len(start)) for name, start in heads.items()})
+        self.heads = nn.ModuleDict({name: Head(width, len(start)) for name, start in heads.items()})
         with torch.no_grad():
             for name, start in heads.items():
                 self.heads[name].weight.zero_()

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.harmonics import harmonics
+
+MODALITIES = ("thermal", "rgb")
 
 
 class Static(ThermalModel):
@@ -32,7 +34,7 @@ class Static(ThermalModel):
         prefix: before the names of its tensors, for a model beside another whose tensors are called the same.
 
     Raises:
-        ValueError: the degree is not 0 to 3, or the image is a companion of itself.
+        ValueError: an option is unknown or out of its range, or the image is a companion of itself.
     """
 
     beyond_record = "every Gaussian emits what it emits at all times"
@@ -56,6 +58,15 @@ class Static(ThermalModel):
         companions = dict(companions or {})
         if modality in companions:
             raise ValueError(f"companions are images beside the {modality} one; leave {modality} out of them")
+        check_option("modality", modality, MODALITIES)
+        for name in companions:
+            check_option("companions", name, MODALITIES)
+        counts = {"channels": channels} | {f"companions.{name}": count for name, count in companions.items()}
+        for key, count in counts.items():
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"{key} must be a whole number, 1 or more, got {count}")
+        if sh_degree_interval < 0:
+            raise ValueError(f"sh_degree_interval must be a number of steps, or 0, got {sh_degree_interval}")
         self.modality, self.companions = modality, tuple(companions)
         self.modality_channels = (channels, *companions.values())
         self.shared_opacity = shared_opacity

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, check_option
+from heatsplat.physics.same_bits import everywhere
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Query, ThermalModel
@@ -40,7 +41,8 @@ class ThroughAir(Wrapper):
         self.range.prepare(scene)
 
     def changed(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
-        near = self.air.level + (values - self.air.level) * self._gain(query.time_s)
+        level, gain = (everywhere(number, values) for number in (self.air.level, self._gain(query.time_s)))
+        near = level + (values - level) * gain
         return clipped(self.air(near, splats, query), self.clip)
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:

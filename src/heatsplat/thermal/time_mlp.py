@@ -9,7 +9,7 @@ from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Clock, ImageRange, octaves
-from heatsplat.thermal.layers import draw_uniform
+from heatsplat.thermal.layers import Head, draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
 
 ENCODER = ("moment", "code")  # parameters of the time encoder begin so
@@ -67,7 +67,7 @@ class TimeMlp(Wrapper):
         self.moment, self.code = nn.Linear(1 + 2 * time_frequencies, code_size), nn.Linear(code_size, code_size)
         # The first layer sees the code of a time once for all Gaussians and their features apart.
         self.of_code, self.of_feature = nn.Linear(code_size, width, bias=False), nn.Linear(feature_size, width)
-        self.hidden, self.head = nn.Linear(width, width), nn.Linear(width, 1)
+        self.hidden, self.head = nn.Linear(width, width), Head(width, 1)
         with torch.no_grad():
             self.head.weight.zero_()
             self.head.bias.zero_()

@@ -34,9 +34,12 @@ class Initialisation:
         count: number of Gaussians drawn by "random"; for "sfm", points beyond this many are left out by a seeded
             draw. None takes all points.
         opacity: initial opacity in (0, 1).
-        scale: factor on the initial size.
+        scale: factor on the initial size, above 0.
         separate: each modality starts with Gaussians of its own, which the others do not see and never will: their
             opacity there is ``ABSENT``. Needs a thermal model whose images have opacities of their own.
+
+    Raises:
+        ValueError: an option is unknown or out of its range.
     """
 
     rows = frozenset({GAUSSIANS, ANCHORS})
@@ -53,6 +56,8 @@ class Initialisation:
             raise ValueError(f"init.source must be 'sfm' or 'random', got '{source}'")
         if not 0 < opacity < 1:
             raise ValueError(f"init.opacity must lie in (0, 1), got {opacity}")
+        if scale <= 0 or (count is not None and count < 1):
+            raise ValueError(f"init.scale must be above 0 and init.count at least 1, or null, got {scale} and {count}")
         self.source, self.count, self.opacity, self.scale = source, count, opacity, scale
         self.separate = separate
 
@@ -124,11 +129,14 @@ class Voxels(Initialisation):
         opacity, scale: as for ``Initialisation``.
 
     Raises:
+        ValueError: an option is out of its range.
         SceneError: the points lie on one another, so that they tell no size of cubes.
     """
 
     def __init__(self, voxel: float | None = None, opacity: float = 0.1, scale: float = 1.0) -> None:
         super().__init__("sfm", None, opacity, scale)
+        if voxel is not None and voxel <= 0:
+            raise ValueError(f"init.voxel must be above 0, or null, got {voxel}")
         self.voxel = voxel
 
     def _means(self, scene: SceneData, generator: torch.Generator, most: float | None) -> Tensor:

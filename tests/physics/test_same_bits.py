@@ -1,0 +1,70 @@
+"""Sums and functions of many numbers: right, and the same bits for any number of threads."""
+
+import pytest
+import torch
+from threads import with_threads
+
+from heatsplat.physics.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total, variance
+
+NUMBERS = 3 * PIECE + 12_345  # more than torch leaves to one thread; shares of threads end inside vectors
+
+
+def random(*shape, seed=0):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("count", [0, 1, ROW - 1, ROW, 20 * ROW + 7])
+def test_a_total_is_the_sum(count):
+    values = random(count).double()
+    assert total(values).item() == pytest.approx(values.sum().item(), rel=1e-14)
+    assert total(values.reshape(1, -1, 1)).shape == ()
+
+
+def test_a_total_has_the_same_bits_for_any_number_of_threads():
+    values = random(301, 403, 3)
+    assert len({total(values.transpose(0, 1)).item() for _ in range(3)}) == 1
+    assert len(set(with_threads((1, 2, 3, 7), lambda: total(values).item()))) == 1
+
+
+def test_mean_and_variance_are_torchs_with_the_gradients_of_torchs():
+    for ours, theirs in ((mean, torch.mean), (variance, lambda values: values.var(correction=0))):
+        values = random(NUMBERS).double().requires_grad_()
+        found, expected = ours(values), theirs(values)
+        torch.testing.assert_close(found, expected, rtol=1e-13, atol=0)
+        torch.testing.assert_close(
+            *(torch.autograd.grad(one, values)[0] for one in (found, expected)), rtol=1e-12, atol=1e-20
+        )
+
+
+def test_a_variance_pulls_with_the_same_bits_for_any_number_of_threads():
+    values = random(NUMBERS).requires_grad_()
+    one, *others = with_threads((1, 2, 3, 7), lambda: torch.autograd.grad(variance(values), values)[0])
+    assert all(torch.equal(one, other) for other in others)
+
+
+@pytest.mark.parametrize("shape", [(), (1,)])
+def test_a_number_everywhere_has_the_gradient_of_one_that_is_broadcast(shape):
+    image = random(301, 403, 1).double()
+    gradients = []
+    for spread in (everywhere, lambda value, image: value):
+        value = torch.full(shape, 0.3, dtype=torch.float64, requires_grad=True)
+        (image * spread(value, image)).sin().sum().backward()
+        gradients.append(value.grad)
+    torch.testing.assert_close(*gradients, rtol=1e-13, atol=0)
+    assert everywhere(torch.full(shape, 2.0), image).shape == image.shape
+
+
+@pytest.mark.parametrize("shape", [(PIECE,), (NUMBERS, 1), (20_001, 3)])
+def test_a_sigmoid_is_torchs_on_one_thread_and_the_same_on_others(shape):
+    values = (12.0 * random(*shape) - 6.0).requires_grad_()
+    pull = random(*shape, seed=1)
+
+    def results(function):
+        found = function(values)
+        return found.detach(), torch.autograd.grad(found, values, pull)[0]
+
+    (expected,) = with_threads((1,), lambda: results(torch.sigmoid))
+    for found in with_threads((1, 2, 3, 7), lambda: results(sigmoid)):
+        assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+    apart = values.detach().double()[::2]
+    torch.testing.assert_close(sigmoid(apart), apart.sigmoid(), rtol=1e-15, atol=0)
