@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.frontier_runs import Recipe, dominated
 
@@ -140,14 +141,14 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
                     edge = "black" if recipe.on_front.get(name) else color
                     axes.errorbar(
                         x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
-                        linestyle="", label=recipe.name,
+                        linestyle="", label=literal(recipe.name),
                     )  # fmt: skip
             sign = 1.0 if name == "psnr" else -1.0
             every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
             front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
             if len(front) > 1:
                 axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
-            axes.set(xlabel="seconds of training", ylabel=label, title=scene, xscale="log")
+            axes.set(xlabel="seconds of training", ylabel=label, title=literal(scene), xscale="log")
             if name == "mae_c":
                 axes.set_yscale("log")
                 axes.yaxis.set_major_formatter("{x:g}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.pictures import figure_picture, literal, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
@@ -144,7 +144,7 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
         for j, row in enumerate(rows):
             x, y = row.mean("train_seconds"), row.mean(name)
             if x is not None and y is not None:
-                label = f"{row.label}, {row.scene}" if several else row.label
+                label = literal(f"{row.label}, {row.scene}" if several else row.label)
                 axes.errorbar(
                     x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, "os^Dv"[j // 10 % 5], color=f"C{j % 10}",
                     capsize=2, markersize=6, label=label,

@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from heatsplat.io.pictures import literal
 from heatsplat.io.tables import NONE, markdown_table, number
 from heatsplat.studies.time_to_accuracy_runs import Outcome, Panel
 
@@ -145,9 +146,8 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
                 y = [one.scores[score] for one in own]
                 spread = [statistics.stdev(values) if len(own) > 1 else 0.0 for values in (y, x)]
                 end = (statistics.fmean(x), statistics.fmean(y))
-                axes.errorbar(
-                    *end, *spread, color=color, marker=mark, capsize=2, linestyle="", label=named(panel, own[0])
-                )
+                name = literal(named(panel, own[0]))
+                axes.errorbar(*end, *spread, color=color, marker=mark, capsize=2, linestyle="", label=name)
                 if own[0].recipe is None:
                     standard.append(end)
             if len(standard) > 1:
@@ -156,7 +156,7 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
             axes.axhline(last, color="black", linewidth=0.8, linestyle="--")
             axes.axhline(panel.level(score, last), color="black", linewidth=0.8, linestyle=":")
             label, unit, _ = LABELS[score]
-            axes.set(xlabel=CLOCK_LABELS[clock], ylabel=f"{label} ({unit})", title=panel.title, xscale="log")
+            axes.set(xlabel=CLOCK_LABELS[clock], ylabel=f"{label} ({unit})", title=literal(panel.title), xscale="log")
             _near(axes, panel, score)
             axes.xaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.25, which="both")
