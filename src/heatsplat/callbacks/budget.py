@@ -149,4 +149,4 @@ class BudgetClock(pl.Callback):
         return {"moved": self._moved}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._moved = state["moved"]
+        self._moved = state.get("moved")  # older states know other numbers
