@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from heatsplat.same_bits import sigmoid
+
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")
 # What a row may be to the thermal model: a Gaussian; an anchor, from which the model makes several for every view; or there
 # are no rows, because the model is a field that has no Gaussians at all.
@@ -74,7 +76,7 @@ class Splats(nn.Module):
     @property
     def opacities(self) -> Tensor:
         """Opacity in (0, 1), [M, N]."""
-        return self.raw["opacity_logits"].sigmoid().T
+        return sigmoid(self.raw["opacity_logits"]).T
 
     def places(self, name: str) -> Tensor | None:
         """Row of a sparse tensor that belongs to each Gaussian, [N] int64, -1 for none; None where each has its own."""

@@ -170,7 +170,8 @@ def test_settings_of_bases_functions_and_parts_in_others_are_of_their_kind_too()
 
 
 def test_no_limit_whole_numbers_with_a_point_and_one_for_true_pass():
-    checked(heatsplat.compose(["method=etgs", "density.cap_max=inf", "density.every=1e2", "init.separate=0"]))
+    config = heatsplat.compose(["method=etgs", "density.cap_max=inf", "density.every=1e2", "init.separate=0"])
+    assert checked(config) == config
 
 
 @pytest.mark.parametrize("method", ["thermogs", "ntr_gaussian"])

@@ -10,6 +10,7 @@ from torch import Tensor
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.same_bits import sigmoid
 
 SHARPNESS = 100.0  # per opacity: how fast noise fades above ``dead_opacity`` (authors' code)
 STILL = 1e-6  # Gaussians whose noise has faded to this share are left alone (ours): those of opacities above 0.143
@@ -105,7 +106,7 @@ class MCMC(DensityControl):
     def _stack(self, cloud: Cloud, ids: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """Rows of ``counts`` [n] Gaussians in the place of each of ``ids`` [n]."""
         rows = cloud.rows(ids)
-        opacities = rows["opacity_logits"].double().sigmoid().clamp(max=OPAQUE)
+        opacities = sigmoid(rows["opacity_logits"].double()).clamp(max=OPAQUE)
         several, _ = stacked(opacities, counts[:, None])
         _, shrink = stacked(opacities.amax(dim=1), counts)
         rows["log_scales"] += shrink.log()[:, None].to(rows["log_scales"])
@@ -115,7 +116,7 @@ class MCMC(DensityControl):
     def _wander(self, cloud: Cloud, extent: float, generator: torch.Generator) -> None:
         splats = cloud.splats
         rate = next(group["lr"] for group in cloud.optimizer.param_groups if group["name"] == "means")
-        share = torch.sigmoid(SHARPNESS * (self.dead_opacity - splats.opacities.amax(dim=0)))
+        share = sigmoid(SHARPNESS * (self.dead_opacity - splats.opacities.amax(dim=0)))
         ids = (share > STILL).nonzero().squeeze(1)
         draw = torch.randn((len(ids), 3), generator=generator, dtype=splats.means.dtype).to(splats.means.device)
         axes = quats_to_matrices(splats.quats[ids])

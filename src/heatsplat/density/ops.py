@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.geometry.rotations import quats_to_matrices
+from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 
 THINNER = 0.99  # largest shortest semi-axis of a child, of that along which its parent was split
@@ -143,7 +144,7 @@ class Cloud:
         scales += torch.full_like(scales, math.log(how.across)).scatter_(1, longest, math.log(how.along))
         own, limit = scales.gather(1, shortest), scales.gather(1, longest) + math.log(THINNER)
         scales.scatter_(1, shortest, torch.where(shortest == longest, own, own.minimum(limit)))
-        rows["opacity_logits"] = torch.logit(how.fade * rows["opacity_logits"].sigmoid())
+        rows["opacity_logits"] = torch.logit(how.fade * sigmoid(rows["opacity_logits"]))
         for name in ("log_scales", "opacity_logits"):
             self.splats[name][ids] = rows[name]
         self.splats["means"][ids] = rows["means"] + aside

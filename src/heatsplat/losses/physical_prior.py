@@ -7,7 +7,7 @@ from torch import Tensor
 from heatsplat.contracts import check_option
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.losses.compose import LossInputs
-from heatsplat.physics.same_bits import sigmoid
+from heatsplat.same_bits import sigmoid
 
 OF = ("activated", "coefficients")
 REDUCTIONS = ("sum", "mean")

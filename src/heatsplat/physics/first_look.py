@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from heatsplat.same_bits import mean
+
 STAYS, RELAXES = 0.1, 4.0  # per span of the record: the time constant is ten records, or a quarter of one
 TRIED = (STAYS, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 ALIKE = 1.05  # the slowest rate whose misfit is within this factor of the least explains as much
@@ -25,7 +27,7 @@ def first_rates(values: Tensor, spans: Tensor, ambient: Tensor) -> Tensor:
     """
     seen = ~values.isnan()
     above = torch.where(seen, values - ambient, 0.0)
-    floor = 1e-4 * above.abs().mean().clamp_min(1e-12)
+    floor = 1e-4 * mean(above.abs()).clamp_min(1e-12)
     misfits = []
     for rate in TRIED:
         kept = torch.exp(-rate * spans).to(values)
@@ -54,7 +56,7 @@ def first_numbers(values: Tensor, courses: Tensor, levels: Tensor) -> Tensor:
     start = levels[:, None] * (usual / usual.square().sum().clamp_min(1e-12))
     seen = ~values.isnan()
     left = torch.where(seen, values - start @ courses.T, 0.0)
-    floor = 1e-2 * left.abs().mean().clamp_min(1e-12)
+    floor = 1e-2 * mean(left.abs()).clamp_min(1e-12)
     eye = torch.eye(courses.shape[1], dtype=values.dtype)
     numbers, weights = torch.zeros_like(start), seen.to(values)
     for _ in range(REWEIGHTED):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
-from heatsplat.physics.same_bits import everywhere, sigmoid
+from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.sensors.per_frame import PerFrame
 
 EPSILON = 1e-4  # images are kept this far from 0 and 1 under the logit, which bounds its slope by 1e4

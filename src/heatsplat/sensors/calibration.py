@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.geometry.resampling import resampled
-from heatsplat.physics.same_bits import everywhere
+from heatsplat.same_bits import everywhere
 from heatsplat.sensors.base import SensorPart
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame, SceneData, check_option
-from heatsplat.physics.same_bits import to_one
+from heatsplat.same_bits import to_one
 from heatsplat.sensors.base import SensorPart
 
 NORMS = ("image", "columns", "none")

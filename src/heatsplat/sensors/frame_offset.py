@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SHARE_OF_RANGE, Course, Frame, SceneData
-from heatsplat.physics.same_bits import everywhere
+from heatsplat.same_bits import everywhere
 from heatsplat.sensors.per_frame import PerFrame
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from heatsplat.contracts import Frame, SceneData
-from heatsplat.physics.same_bits import total
+from heatsplat.same_bits import total
 from heatsplat.sensors.base import SensorPart
 
 REACH = 3.5  # standard deviations that the kernel reaches at its widest; beyond lie 5e-4 of its weight

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import Course, SceneData
 from heatsplat.physics.curves import cubic_rows, resampled_values
-from heatsplat.physics.same_bits import everywhere
+from heatsplat.same_bits import everywhere
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query
 from heatsplat.thermal.coordinates import Clock

@@ -13,7 +13,7 @@ from heatsplat.physics.common_course import MOMENTS, RATES, response_table
 from heatsplat.physics.curves import resampled_values
 from heatsplat.physics.first_look import first_numbers
 from heatsplat.physics.responses import MOMENTS_KEPT
-from heatsplat.physics.same_bits import everywhere
+from heatsplat.same_bits import everywhere
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Rate, Seeds
 from heatsplat.thermal.relaxing import Relaxing

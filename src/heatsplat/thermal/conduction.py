@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import SceneData
-from heatsplat.physics.same_bits import PIECE, total
+from heatsplat.same_bits import PIECE, total
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, ThermalModel
 from heatsplat.thermal.coordinates import Clock

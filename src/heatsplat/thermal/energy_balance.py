@@ -18,10 +18,10 @@ from heatsplat.physics import sky
 from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, Surface, power_excess
 from heatsplat.physics.marching import Course, Kept
 from heatsplat.physics.responses import driver_means, interval_of
-from heatsplat.physics.same_bits import sigmoid, variance
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
 from heatsplat.physics.wetness import rained_on, wetted
+from heatsplat.same_bits import sigmoid, variance
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import (
     KELVIN_RANGE,

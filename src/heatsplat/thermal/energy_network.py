@@ -14,8 +14,8 @@ from torch import Tensor
 
 from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_numbers, check_option
 from heatsplat.physics.ellipsoids import SMALLEST_AXIS_M
-from heatsplat.physics.same_bits import mean, sigmoid
 from heatsplat.physics.units import DAY_S
+from heatsplat.same_bits import mean, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from heatsplat.contracts import SceneData
-from heatsplat.physics.same_bits import sigmoid
+from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Clock, ImageRange

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import check_option
-from heatsplat.physics.same_bits import mean, sigmoid
+from heatsplat.same_bits import mean, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.atmospheric_field import AtmosphericField
 from heatsplat.thermal.base import ThermalModel

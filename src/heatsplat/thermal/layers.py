@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from heatsplat.physics.same_bits import to_one
+from heatsplat.same_bits import to_one
 
 
 class Head(nn.Linear):

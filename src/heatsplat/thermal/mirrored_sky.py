@@ -12,8 +12,8 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics import sky
-from heatsplat.physics.same_bits import sigmoid
 from heatsplat.physics.units import kelvin
+from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import SKY_SEEN, PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.coordinates import ImageRange

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm, softplus
 
 from heatsplat.contracts import SceneData, check_option
-from heatsplat.physics.same_bits import sigmoid
 from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
+from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped

@@ -13,7 +13,7 @@ from torch.nn.functional import softplus
 from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.physics.grey_body import radiance, temperature_of
-from heatsplat.physics.same_bits import everywhere, sigmoid
+from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.band_scale import DEGREE, BandScale
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, check_numbers, check_option
-from heatsplat.physics.same_bits import everywhere, sigmoid
+from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.band_scale import DEGREE, BandScale

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
-from heatsplat.physics.same_bits import everywhere, sigmoid
+from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.part import HeatPart

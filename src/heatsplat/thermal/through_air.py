@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, check_option
-from heatsplat.physics.same_bits import everywhere
+from heatsplat.same_bits import everywhere
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
 from heatsplat.thermal.base import Query, ThermalModel

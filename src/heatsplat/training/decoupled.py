@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from heatsplat.same_bits import sigmoid
+
 
 class DecoupledDecay:
     """Makes Gaussians fainter and smaller after the optimiser's step, the more the less the image asks of them.
@@ -62,6 +64,7 @@ class DecoupledDecay:
             second = moments["exp_avg_sq"] / (1.0 - group["betas"][1] ** float(moments["step"]))
             slope = parameter.exp()
             if group["name"] == "opacity_logits":
-                slope = parameter.sigmoid() * (1.0 - parameter.sigmoid())
+                opacity = sigmoid(parameter)
+                slope = opacity * (1.0 - opacity)
             fall = (rate / pixels * slope / (second.sqrt() + group["eps"])).clamp(max=self.clip)
             parameter -= group["lr"] * torch.where(parameter.grad != 0, fall, 0.0)

@@ -4,7 +4,8 @@ import pytest
 import torch
 from threads import with_threads
 
-from heatsplat.physics.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total, variance
+from heatsplat.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total, variance
+from heatsplat.splats import Splats
 
 NUMBERS = 3 * PIECE + 12_345  # more than torch leaves to one thread; shares of threads end inside vectors
 
@@ -68,3 +69,10 @@ def test_a_sigmoid_is_torchs_on_one_thread_and_the_same_on_others(shape):
         assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
     apart = values.detach().double()[::2]
     torch.testing.assert_close(sigmoid(apart), apart.sigmoid(), rtol=1e-15, atol=0)
+
+
+def test_opacities_have_the_same_bits_for_any_number_of_threads():
+    shapes = {"means": torch.zeros(70_001, 3), "log_scales": torch.zeros(70_001, 3), "quats": torch.ones(70_001, 4)}
+    splats = Splats(shapes | {"opacity_logits": 8 * random(70_001, 1) - 4})
+    one, *others = with_threads((1, 2, 3, 5, 7), lambda: splats.opacities.detach().clone())
+    assert one.shape == (1, 70_001) and all(torch.equal(one, other) for other in others)
