@@ -13,7 +13,7 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
@@ -27,6 +27,7 @@ from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.training.averaging import Average
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
 from heatsplat.training.overlap import Overlap
@@ -123,6 +124,7 @@ class SplatTraining(pl.LightningModule):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
+        self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -253,6 +255,8 @@ class SplatTraining(pl.LightningModule):
     def _stop_at_the_end(self) -> None:
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
+            if self._average:
+                self.results.run["averaged_updates"] = self._average.give(self._learned())
 
     def on_train_epoch_end(self) -> None:
         """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
@@ -431,9 +435,17 @@ class SplatTraining(pl.LightningModule):
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
         if change is not None:
+            self._average.forget()
             for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
+        if update and self.schedule.left(step + 1) < self.optim.averaged:
+            self._average.take(self._learned())
+
+    def _learned(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """Parameters by name, without those that are given."""
+        given = {f"splats.raw.{name}" for name in self.constants}
+        return ((name, parameter) for name, parameter in self.named_parameters() if name not in given)
 
     def cloud(self, optimizer: torch.optim.Optimizer) -> Cloud:
         """The Gaussians with their moments and statistics, through which alone they come and go."""
@@ -553,6 +565,8 @@ class SplatTraining(pl.LightningModule):
         }
         if self.global_step > 0 and not self._updates(self.global_step - 1):
             checkpoint[CHECKPOINT_KEY] |= waiting_gradients(self)
+        if self._average:
+            checkpoint[CHECKPOINT_KEY]["average"] = self._average.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
@@ -568,6 +582,8 @@ class SplatTraining(pl.LightningModule):
         if self.schedule.load_state_dict(own["schedule"]):
             self.density.load_times(own.get("density_times", {}))
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
+        if "average" in own:
+            self._average.load_state_dict(own["average"], self.device)
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

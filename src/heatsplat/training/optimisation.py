@@ -253,6 +253,8 @@ class Optimisation:
         betas, eps: of Adam.
         accumulate: views whose gradients are summed for one update, rounded; 1: every view has an update of its own.
         accumulate_from: share of the run, or of each of its rounds, after which that begins.
+        averaged: share of the run, or of the last of its rounds, at whose end parameters become their mean over the
+            updates in it (``training.averaging``); 0: they stay as the last update left them.
         decoupled: decay of opacities and sizes beside Adam, or None.
 
     Raises:
@@ -273,10 +275,13 @@ class Optimisation:
         eps: float = 1e-15,
         accumulate: float = 1,
         accumulate_from: float = 0.5,
+        averaged: float = 0.0,
         decoupled: DecoupledDecay | None = None,
     ) -> None:
         if accumulate < 1:
             raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
+        if not 0 <= averaged <= 1:
+            raise ValueError(f"optim.averaged is a share of the run, from 0 to 1, got {averaged}")
         if min(means_end, decay) < 0:
             raise ValueError(f"optim.means_end and decay must not be negative, got {means_end} and {decay}")
         check_numbers("optim.betas", betas, 2)
@@ -289,6 +294,7 @@ class Optimisation:
         self.log_scales, self.quats, self.opacity_logits = log_scales, quats, opacity_logits
         self.betas, self.eps = tuple(betas), eps
         self.accumulate, self.accumulate_from, self.decoupled = round(accumulate), accumulate_from, decoupled
+        self.averaged = averaged
 
     def geometry_groups(self, splats: Splats, extent: float) -> list[dict[str, Any]]:
         """Parameter groups of the four geometry tensors; "lr_end" is the factor on a rate at the last step."""

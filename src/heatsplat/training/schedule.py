@@ -57,6 +57,10 @@ class Schedule:
         after = next((restart for restart in self.restarts if restart > step), self.steps)
         return min(max(self._planned_step(step) - first, 0) / max(after - first, 1), 1.0)
 
+    def left(self, step: float) -> float:
+        """Share of the last round that is left after ``step`` steps, in [0, 1]; 1 in the rounds before."""
+        return 1 - self.round_progress(step) if step > max(self.restarts, default=0) else 1.0
+
     def round_step(self, step: int) -> int:
         """The step counted from the first of its round."""
         return step - self._first(step)
