@@ -14,6 +14,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
+from heatsplat.studies.options import check_count
 
 TABLE_FILE = "company.md"
 
@@ -41,8 +42,10 @@ def run(
         threads: CPU threads of a run; None is all cores.
 
     Raises:
-        SceneError: a run failed, or runs side by side take longer than the limit.
+        SceneError: a number counts nothing, a run failed, or runs side by side take longer than the limit.
     """
+    check_count("study.rounds", rounds)
+    check_count("study.together", together)
     output_dir = Path(output_dir)
     command = [sys.executable, train, *overrides, f"threads={'null' if threads is None else threads}"]
     seconds_of(command, [output_dir / "first"])

@@ -32,7 +32,9 @@ log = logging.getLogger("heatsplat")
 
 HEAD = """# Effects: which physical effects a scene shows, and how `method=auto` decides
 
-This page is generated: `python src/study.py study=evidence`.
+This page is generated, with one recording of each scene and set, in the smallest size:
+`python src/study.py study=evidence study.sizes=[tiny] study.seeds=[0] study.unseen=[20] "study.drawn={tuned on:[0,0]}"`.
+Without these options there are five of each, in two sizes, and the random scenes on which rules were tuned.
 
 `method=auto` simulates an effect if its *evidence* exceeds its *threshold* and the decision is sufficiently certain. Evidence
 is a statistic of the training images that stays below the threshold under the effect's null hypothesis. An effect whose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from heatsplat.contracts import SceneError, check_numbers
@@ -18,6 +19,13 @@ UNITS = {
     "humidity_percent": ("humidity", 0.01, 0.0),
     "window_transmission": ("window_transmission", 1.0, 0.0),
     "window_c": ("window_k", 1.0, KELVIN_AT_0_C),
+}
+# A setting that changes nothing while another one has this value.
+NEEDS = {
+    "reflected_c": ("emissivity", 1.0),
+    "air_c": ("distance_m", 0.0),
+    "humidity_percent": ("distance_m", 0.0),
+    "window_c": ("window_transmission", 1.0),
 }
 
 
@@ -60,6 +68,22 @@ class Given:
     def conditions(self, others: Conditions) -> Conditions:
         """These conditions, the rest from others."""
         return replace(others, **self._given())
+
+    def check_use(self, frames: Sequence[Frame]) -> None:
+        """Raises SceneError where something is given that changes nothing for any of the frames, which are settled."""
+        given = [name for name in UNITS if getattr(self, name) is not None]
+        warm = [frame.conditions for frame in frames if frame.calibration is not None]
+        if given and not warm:
+            raise SceneError(
+                f"conditions.{given[0]} changes nothing for greys, which are no temperatures; give bounds_c=[min,max], too"
+            )
+        for name in given:
+            needed, neutral = NEEDS.get(name, (None, None))
+            if needed is not None and all(getattr(c, UNITS[needed][0]) == neutral for c in warm):
+                raise SceneError(
+                    f"conditions.{name}={getattr(self, name)} changes nothing while {needed} is {neutral:g}, which it is for "
+                    f"all frames; give conditions.{needed}, too, or leave it out"
+                )
 
     def settled(self, frame: Frame) -> Frame:
         """The frame under these conditions, the rest from its file."""

@@ -48,6 +48,7 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Given
 from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
+from heatsplat.preparation.target import CORRECTED, Target
 from heatsplat.preparation.writer import write_world
 from heatsplat.runs.run import load
 
@@ -147,8 +148,8 @@ def correct(
         trust: classes of yours that the checkpoint may name.
 
     Raises:
-        SceneError: the scene has no temperatures or no scale, ``target`` is its own folder, or the conditions leave nothing to
-            correct.
+        SceneError: the scene has no temperatures or no scale, ``target`` is its own folder or holds what no correction wrote, or
+            the conditions leave nothing to correct.
     """
     recorded = {"downscale": downscale, "degrade": "null", "upsample": "null"}  # a run may have been given less
     trained = load(ckpt, data=recorded, trust=trust)
@@ -198,6 +199,8 @@ def correct_scene(
         raise SceneError(
             f"target={target} is the folder of the scene that is to be corrected, whose images would be lost: give another one"
         )
+    place = Target(target, CORRECTED)
+    place.claim()
     views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
     far = typical_distance(views, depth_of) * metres_per_unit
     doubts = [_doubt(views, depth_of, scene.points), "" if index is None else _unsettled(views, depth_of, scene.points)]
@@ -235,6 +238,7 @@ def correct_scene(
             f"under these conditions no pixel of {scene.name} has a temperature; are they those of the recording?"
         )
     _write_cameras(target, scene, cameras)
+    place.has_cameras()
     write_csv(target / FRAMES_FILE, rows)
     write_world(target, metres_per_unit)
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
@@ -244,7 +248,7 @@ def correct_scene(
         doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
         log.warning("%s", doubts[-1])
     section = _section(changes, far, wanted, index, float(torch.stack(without).mean()), len(views), doubts)
-    page = write_report(target, [section], f"corrected pixel by pixel by the trained scene {scene.name}")
+    page = write_report(target, [section], f"{CORRECTED} by the trained scene {scene.name}")
     log.info("%s", page.with_suffix(".html"))
     return page
 

@@ -6,7 +6,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.exif import exif_in
-from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, read_image, to_grey
+from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, pages_of, read_image, to_grey
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
@@ -35,8 +35,14 @@ SEQUENCES = (".seq", ".csq")
 RECORDS = (".fff", *SEQUENCES)
 # What makers and people put into names to tell the modalities of one exposure apart.
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
-DJI_CLOCK = re.compile(r"DJI_\d{14}_(?=\d+)")
+DJI_CLOCK = re.compile(r"DJI_(\d{14})_(?=\d+)")
+SAME_EXPOSURE_S = 5.0  # by which the clocks in the names of one exposure's files may differ
 GREY_LEVELS = 4.0  # colour images below are greys that were stored as colours
+# Columns of a table that make up a position and an attitude.
+NUMBERS = {
+    Position: ("latitude_deg", "longitude_deg", "altitude_m", "above_takeoff_m"),
+    Attitude: ("yaw_deg", "pitch_deg", "roll_deg"),
+}
 KINDS = {
     "radiometric": "radiometric files",
     "float": "floating-point images",
@@ -160,7 +166,7 @@ def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
     except PermissionError as error:
         raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
     except UnidentifiedImageError:  # such as TIFF of 64 bits, which Pillow does not know
-        pixels = read_image(path)
+        pixels = read_image(path, 0)
         return "F" if pixels.dtype.kind == "f" else "I", (pixels.shape[1], pixels.shape[0])
     except Exception as error:  # Pillow raises whatever a damaged file leads to
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
@@ -169,7 +175,7 @@ def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
 def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
     """Greys that were stored as colours count as greys. Raises SceneError where the pictures are pseudo-colours or photos."""
     colour = kinds.get("colour", [])
-    if colour and all(colour_levels(read_image(path)[..., :3]) < GREY_LEVELS for path in colour[:3]):
+    if colour and all(colour_levels(read_image(path, 0)[..., :3]) < GREY_LEVELS for path in colour[:3]):
         return {"grey": colour}
     if colour:
         raise SceneError(
@@ -188,8 +194,14 @@ def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, not
     for path in paths:
         details, camera = _of_exif(read_bytes(path))
         _, size = _mode_and_size(path)
-        load = partial(_grey if kind == "grey" else read_image, path)
-        found.append(Frame(_name(path, folder), path, 0, load, camera=camera, size=size, **details))
+        pages = pages_of(path)
+        if several := len(pages) > 1:
+            details = {}  # a file has one time and one place, of whichever of its images
+            notes.append(f"{path.name}: {len(pages)} images in one file, each is a frame")
+        for number, page in enumerate(pages):
+            name = _name(path, folder, number if several else None)
+            load = partial(_grey if kind == "grey" else read_image, path, page if several else None)
+            found.append(Frame(name, path, number, load, camera=camera, size=size, **details))
     devices, calibrations = devices_of(found), {}
     for device in devices:
         sample = device.frames[0]
@@ -213,8 +225,8 @@ def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, not
     yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
 
 
-def _grey(path: Path) -> np.ndarray:
-    pixels = read_image(path)
+def _grey(path: Path, page: int | None) -> np.ndarray:
+    pixels = read_image(path, page)
     return to_grey(pixels[..., :3]) if pixels.ndim == 3 else pixels
 
 
@@ -364,10 +376,21 @@ def _exposure(path: Path) -> str:
     return DJI_CLOCK.sub("DJI_", stem).lower()
 
 
+def _apart_s(one: Path, other: Path) -> float:
+    """Seconds between two exposures by the clocks in DJI's names; 0 where one has none."""
+    clocks = [DJI_CLOCK.search(path.stem) for path in (one, other)]
+    try:
+        first, second = (datetime.strptime(clock[1], "%Y%m%d%H%M%S") for clock in clocks if clock)
+    except ValueError:  # no two clocks, or digits that are no time
+        return 0.0
+    return abs((first - second).total_seconds())
+
+
 def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
     """Frames with the photo of the same exposure: of several that may be, one of the same name, in the same folder.
 
-    Cards count from one in every folder: a photo beside a frame of its exposure is no other frame's.
+    Cards count from one in every folder: a photo beside a frame of its exposure is no other frame's. Counters restart within
+    a folder, too: names with clocks have to say about the same time.
     """
     frames = list(frames)
     by_exposure: dict[str, list[Path]] = {}
@@ -376,12 +399,15 @@ def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
     beside = {(_exposure(frame.path), frame.path.parent) for frame in frames}
 
     def photo_of(frame: Path) -> Path | None:
-        def unlike(photo: Path) -> tuple[bool, bool]:
-            return photo.stem.lower() != frame.stem.lower(), photo.parent != frame.parent
+        def unlike(photo: Path) -> tuple[bool, bool, float]:
+            return photo.stem.lower() != frame.stem.lower(), photo.parent != frame.parent, _apart_s(photo, frame)
 
         exposure = _exposure(frame)
         free = (
-            p for p in by_exposure.get(exposure, []) if p.parent == frame.parent or (exposure, p.parent) not in beside
+            p
+            for p in by_exposure.get(exposure, [])
+            if (p.parent == frame.parent or (exposure, p.parent) not in beside)
+            and _apart_s(p, frame) <= SAME_EXPOSURE_S
         )
         return min(free, key=unlike, default=None)
 
@@ -391,7 +417,7 @@ def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
 def _zoned(frame: Frame, zone: str | None) -> Frame:
     """The frame with a time, of its name where the file has none, in the zone that was given for those without one."""
     time = frame.time
-    if time is None and (seconds := dji_time(frame.path.name)) is not None:
+    if time is None and frame.number == 0 and (seconds := dji_time(frame.path.name)) is not None:
         time = datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None)
     if time is not None and time.tzinfo is None and zone is not None:
         time = time.replace(tzinfo=zone_of(zone, "zone"))
@@ -422,26 +448,38 @@ def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list
     for line, cells in table.rows:
         if by_name.setdefault(cells[at["name"]], (line, cells))[1] != cells:
             raise SceneError(f"table={reading.table}, line {line}: {cells[at['name']]} has another row above; keep one")
-    rows = {}
-    for path, names in same_files([frame.path.as_posix() for frame in frames], by_name).items():
+    count = Counter(frame.path for frame in frames)
+    # Rows name a file, or one of its frames, as flight_000003.
+    named = [(frame.path.with_name(f"{frame.path.stem}_{frame.number:06d}.tiff"), frame.path) for frame in frames]
+    by_file = {}
+    for path, names in same_files([path.as_posix() for both in named for path in both], by_name).items():
         if len(names) > 1:
             raise SceneError(f"table={reading.table}: {' and '.join(names)} may both be {path}; keep one of them")
         if names:
-            rows[path] = by_name[names[0]]
-    matched = sum(frame.path.as_posix() in rows for frame in frames)
+            by_file[path] = by_name[names[0]]
+    rows = {}
+    for frame, (own, path) in zip(frames, named, strict=True):
+        if count[path] > 1 and own.as_posix() in by_file:
+            rows[frame.name] = by_file[own.as_posix()]
+        elif path.as_posix() in by_file:
+            line, cells = rows[frame.name] = by_file[path.as_posix()]
+            if count[path] > 1 and "time" in at and cells[at["time"]]:
+                raise SceneError(
+                    f"{reading.table}, line {line}: {path.name} holds {count[path]} frames, which have no time in common; give "
+                    f"each a row, as {own.stem}"
+                )
+    matched = len(rows)
     if not matched:
         raise SceneError(
             f"table={reading.table} has no row for any of the {len(frames)} frames, such as {frames[0].path.name}; "
             f"its column {reading.columns['name']} begins with {next(iter(by_name), 'nothing')}"
         )
-    notes.append(
-        f"{reading.table.name} tells {', '.join(sorted(at.keys() - {'name'}))} of {matched} of {len(frames)} frames"
-    )
+    told: set[str] = set()
 
     def of(frame: Frame) -> Frame:
-        if frame.path.as_posix() not in rows:
+        if frame.name not in rows:
             return frame
-        line, cells = rows[frame.path.as_posix()]
+        line, cells = rows[frame.name]
 
         def number(key: str) -> float | None:
             if key not in at or not cells[at[key]]:
@@ -462,14 +500,33 @@ def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list
                     f"{reading.table}, line {line}: {text!r} in column {reading.columns['time']} is no date-time such as "
                     "2024-08-06T15:35:05.376"
                 ) from error
-        if (latitude := number("latitude_deg")) is not None and (longitude := number("longitude_deg")) is not None:
-            changes["position"] = Position(latitude, longitude, number("altitude_m"), number("above_takeoff_m"))
-        angles = [number(key) for key in ("yaw_deg", "pitch_deg", "roll_deg")]
-        if all(angle is not None for angle in angles):
-            changes["attitude"] = Attitude(*angles)
+            told.add("time")
+        for part, kind in (("position", Position), ("attitude", Attitude)):
+            said = {key: value for key in NUMBERS[kind] if (value := number(key)) is not None}
+            known = getattr(frame, part)
+            if said and (known is not None or _needed(kind) <= said.keys()):
+                changes[part] = kind(**said) if known is None else replace(known, **said)
+                told.update(said)
         return replace(frame, **changes)
 
-    return [of(frame) for frame in frames]
+    found = [of(frame) for frame in frames]
+    for kind, keys in NUMBERS.items():
+        idle = [key for key in keys if key in at and key not in told and any(row[at[key]] for _, row in rows.values())]
+        if idle:
+            lacking = ", ".join(reading.columns.get(key, key) for key in sorted(_needed(kind) - {idle[0]}))
+            raise SceneError(
+                f"table={reading.table}: column {reading.columns[idle[0]]} changes nothing, as neither the table nor the files "
+                f"say {lacking} of the same frame; add that, or take the column away"
+            )
+    notes.append(
+        f"{reading.table.name} tells {', '.join(sorted(told)) or 'nothing'} of {matched} of {len(frames)} frames"
+    )
+    return found
+
+
+def _needed(kind: type[Position | Attitude]) -> set[str]:
+    """What cannot be left out of a position or an attitude."""
+    return {part.name for part in fields(kind) if part.default is MISSING}
 
 
 def _check_names(frames: list[Frame]) -> None:

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.file_names import stem_of
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import find_model, read_model, write_model
-from heatsplat.datamodules.formats.images import ImageIndex
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.nerfstudio import find_transforms
 from heatsplat.datamodules.points import ply_points
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.poses import PICTURE, WORK, put_whole
+from heatsplat.preparation.poses import PICTURE, put_whole
 from heatsplat.preparation.report import Section
-from heatsplat.preparation.writer import write_world
+from heatsplat.preparation.target import WORK
+from heatsplat.preparation.writer import image_name, write_world
 
 OTHER_SHAPE = 0.01  # by which width over height of a camera and of its frame may differ
 
@@ -63,14 +63,13 @@ class GivenPoses:
         """
         model = model_in(Path(self.model).expanduser(), frames)
         camera_of = matched(frames, model)
-        index = ImageIndex(target / "images")
         viewmats, lenses = {}, {}
         for frame in frames:
             if frame.name in camera_of:
                 viewmat, lens = model.cameras[camera_of[frame.name]]
                 _check_shape(frame, lens, model.source)
-                viewmats[index.find(frame.name)] = viewmat
-                lenses[index.find(frame.name)] = _stored(lens)
+                viewmats[image_name(frame)] = viewmat
+                lenses[image_name(frame)] = _stored(lens)
         kinds = list(dict.fromkeys(lenses.values()))
         numbers = {name: kinds.index(kind) for name, kind in lenses.items()}
         colors = (255.0 * model.colors).round().astype(np.uint8)
@@ -122,21 +121,35 @@ def model_in(folder: Path, frames: Sequence[Frame]) -> Model:
 
 
 def matched(frames: Sequence[Frame], model: Model) -> dict[str, str]:
-    """By name of a frame, which image of a model it is: that with the name of its file, without folder and ending.
+    """By name of a frame, which image of a model it is: that with the name of its file, whatever ending it has.
+
+    Folders count where they tell images of one name apart, such as those of a visible camera beside.
 
     Raises:
-        SceneError: none of them has a name of a frame.
+        SceneError: none of them has a name of a frame, or several have that of one.
     """
-    by_name = {}
+    given = defaultdict(list)  # people and tools change the case of names
     for name in model.cameras:
-        whole = name.replace("\\", "/").rpartition(".")[0] or name
-        by_name[stem_of(name).lower()] = by_name[whole.replace("/", "_").lower()] = name
-    alone = Counter(frame.path.stem for frame in frames)
+        given[name.lower()].append(name)
+    whole = defaultdict(list)  # as names of frames have their folders
+    for name in given:
+        plain = name.replace("\\", "/")
+        whole[(plain.rpartition(".")[0] or plain).replace("/", "_")].append(name)
+    single = Counter(frame.path for frame in frames)
+    own = {frame.name: (frame.path.parent / f"{frame.name}.tiff").as_posix().lower() for frame in frames}
+    file = {frame.name: frame.path.as_posix().lower() for frame in frames if single[frame.path] == 1}
+    by_own, by_file = (_alone(same_files(list(names.values()), given)) for names in (own, file))
     found = {}
     for frame in frames:
-        tried = [frame.name, *([frame.path.stem] if alone[frame.path.stem] == 1 else [])]
-        if name := next((by_name[one.lower()] for one in tried if one.lower() in by_name), None):
-            found[frame.name] = name
+        names = whole.get(frame.name.lower()) or by_own.get(own[frame.name]) or by_file.get(file.get(frame.name))
+        images = [image for name in names or () for image in given[name]]
+        if len(images) > 1:
+            raise SceneError(
+                f"{model.source}: {' and '.join(images)} may both be the camera of {frame.path}; give a model of the thermal "
+                "images alone, or its images the folders of the camera's files"
+            )
+        if images:
+            found[frame.name] = images[0]
     if not found:
         raise SceneError(
             f"none of the {len(model.cameras)} cameras of {model.source} belongs to a frame: it has names like "
@@ -144,6 +157,12 @@ def matched(frames: Sequence[Frame], model: Model) -> dict[str, str]:
             "camera's files"
         )
     return found
+
+
+def _alone(same: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Of what ``same_files`` found, what belongs to one frame only: nothing tells whose the rest is."""
+    frames = Counter(name for names in same.values() for name in names)
+    return {frame: [name for name in names if frames[name] == 1] for frame, names in same.items()}
 
 
 def _check_shape(frame: Frame, lens: Lens, source: Path) -> None:

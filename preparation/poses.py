@@ -17,6 +17,7 @@ import pycolmap
 import torch
 from rich import get_console
 from rich.progress import Progress, track
+from scipy.spatial import cKDTree
 
 from heatsplat.contracts import SceneError, check_numbers, check_option, evenly_spread
 from heatsplat.datamodules.formats.colmap import pose_matrix
@@ -31,12 +32,12 @@ from heatsplat.preparation.features import Features, check_positive
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
-from heatsplat.preparation.writer import write_world
+from heatsplat.preparation.target import WORK
+from heatsplat.preparation.writer import image_name, write_world
 
 log = logging.getLogger(__name__)
 
 MADE_OF = "made_of"  # file in the work folder
-WORK = ".poses"  # folder in the prepared one: copies, features and matches, from which a stopped search goes on
 PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
 FEW_FEATURES = 60
@@ -131,7 +132,7 @@ class Search:
         self._check_devices()
         self.device_of = {frame.name: i for i, device in enumerate(self.devices) for frame in device.frames}
         index = ImageIndex(target / "images")
-        self.frames = {name: frame for frame in frames if (name := index.find(f"{frame.name}.tiff")) is not None}
+        self.frames = {name: frame for frame in frames if (name := index.find(image_name(frame))) is not None}
         if options.by == "rgb" and (lacking := [f.name for f in frames if f.rgb is None]):
             raise SceneError(
                 f"poses=rgb: {len(lacking)} of {len(frames)} frames have no photo, such as {lacking[0]}; "
@@ -216,11 +217,8 @@ class Search:
         found = {(i, i + step) for step in steps for i in range(len(names) - step)}
         places = self._places(names)
         if places is not None:
-            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-            for i, row in enumerate(apart):
-                found |= {
-                    (min(i, int(j)), max(i, int(j))) for j in np.argsort(row)[1 : 2 * self.options.overlap] if i != j
-                }
+            near = cKDTree(places).query(places, k=min(2 * self.options.overlap, len(names)))[1].reshape(len(names), -1)
+            found |= {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row if i != j}
         return [(names[i], names[j]) for i, j in sorted(found)]
 
     def map(self) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:

@@ -20,6 +20,7 @@ from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section
+from heatsplat.preparation.target import PREPARED, Target
 from heatsplat.preparation.writer import Writer
 
 log = logging.getLogger(__name__)
@@ -65,8 +66,8 @@ def prepare(
         poses: finds the cameras, or None.
 
     Raises:
-        SceneError: what is in the folder cannot be read, ``target`` lies in ``source``, or no cameras can be found; the
-            temperatures and the report are written all the same.
+        SceneError: what is in the folder cannot be read, a setting changes nothing, ``target`` lies in ``source`` or holds what
+            no preparation wrote, or no cameras can be found; the temperatures and the report are then written all the same.
     """
     folder = Path(source).expanduser().resolve()
     if not folder.is_dir():
@@ -90,8 +91,11 @@ def prepare(
         )
     sections = [doctor(folder, reading)] if doctor else []
     frames = [given.settled(frame) for frame in found.frames]
+    given.check_use(frames)
     writer = Writer(target, uncertain, keep_counts)
     writer.check(frames)
+    place = Target(target, PREPARED)
+    place.claim([path for frame in frames for path in (frame.path, frame.rgb) if path], poses is not None)
     dead = writer.find_dead_pixels(frames)
     records, fresh = [], 0
     for frame in track(frames, "radiometry"):
@@ -111,16 +115,17 @@ def prepare(
     ]
     sections += [part for part in parts if part is not None]
     if poses:
-        sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, target, sections)
+        sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)
     log.info("%s", page.with_suffix(".html"))
     return page
 
 
 def _cameras(
-    poses: Poses, doctor: Callable[[], Section] | None, frames: list[Frame], target: Path, before: Sequence[Section]
+    poses: Poses, doctor: Callable[[], Section] | None, frames: list[Frame], place: Target, before: Sequence[Section]
 ) -> list[Section]:
     """What became of the cameras, and what the doctor sees with them. Where there are none the report says why."""
+    target = place.folder
     report.write_report(target, before)  # a search may be stopped
     try:
         found = poses(frames, target)
@@ -129,6 +134,8 @@ def _cameras(
         raise SceneError(
             f"{error}. The temperatures are in {target / 'images'} all the same (poses=none leaves out the search)"
         ) from error
+    finally:
+        place.has_cameras()
     log.info("%s", found.lines[0])
     log.info("it trains: python src/train.py data=colmap %s", typed(setting("data.root", target)))
     return [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]

@@ -23,9 +23,9 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
 from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.target import PREPARED, REPORT
 from heatsplat.preparation.writer import QUANTILES, rows
 
-REPORT = "report.md"
 BINS = 160
 SHOWN, ACROSS = 6, 3  # frames that are shown, and how many of them in a row
 LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
@@ -41,8 +41,8 @@ LABELS = {
 }
 SUFFIX = {"reflected_k": " °C", "distance_m": " m", "air_k": " °C", "humidity": " %", "window_k": " °C"}
 APPARENT = (
-    "Apparent temperatures: neither files nor settings say what stands between surface and camera, so emissivity is 1, and no "
-    "air and no window are corrected. `conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
+    "Apparent temperatures: emissivity is 1, and neither air nor window is corrected; files and settings say nothing else. "
+    "`conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
 )
 NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
 
@@ -62,7 +62,7 @@ class Section:
     values: dict[str, object] = field(default_factory=dict)
 
 
-def write_report(target: Path, sections: Sequence[Section], made: str = "prepared from a camera's files") -> Path:
+def write_report(target: Path, sections: Sequence[Section], made: str = PREPARED) -> Path:
     """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
     lines = [f"# {plain(target.name)}, {made}", ""]
     for section in sections:
@@ -157,7 +157,7 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
         *markdown_table(head, table, "llrrrr"[: len(head)]),
     ]
     lines = [
-        *(stated if any(f.sources for f in frames) else [APPARENT]),
+        *(stated if any(_is_corrected(f) for f in frames) else [APPARENT]),
         "",
         "Uncertainty in °C by the GUM's law of propagation, for inputs that are independent of each other:",
         "",
@@ -165,6 +165,11 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
     ]
     values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
     return Section("Radiometry", lines + _doubts(frames), values)
+
+
+def _is_corrected(frame: Frame) -> bool:
+    """Whether its temperatures are those of surfaces; without an effect of emissivity, air and window they are apparent."""
+    return any(float(getattr(frame.conditions, name)) != neutral for name, neutral in NEUTRAL.items())
 
 
 def _plus_minus(name: str, value: float) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -33,9 +34,10 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import Uncertainty
 from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.target import PARTIAL
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
-PARTIAL = ".partial"  # folder of what is being written
+ENDINGS = ("png", "tiff")  # of images of greys, of temperatures
 DEAD_FRAMES = 8  # frames that dead pixels are judged from
 
 
@@ -56,24 +58,25 @@ class Writer:
         ] = {}  # by name of a frame: [H, W] bool, pixels of its detector that say nothing
 
     def check(self, frames: Sequence[Frame]) -> None:
-        """Raises SceneError where the folder holds images of another recording."""
+        """Raises SceneError where the folder holds images of another recording, or there are no counts to keep."""
+        if self.keep_counts and not any(d.frames[0].load().dtype == np.uint16 for d in devices_of(frames)):
+            raise SceneError(
+                f"keep_counts=true changes nothing: files such as {frames[0].path} hold no 16-bit counts; leave it out"
+            )
         ours = {frame.name for frame in frames}
         there = (p for p in sorted(self.images.glob("*")) if p.suffix.lower() in SUFFIXES)
         if foreign := next((p for p in there if p.stem not in ours), None):
             raise SceneError(f"{foreign} is no frame of this recording; give an empty folder as target, or remove it")
 
     def image_of(self, frame: Frame) -> Path:
-        """Its file in the prepared folder: float32 TIFF in °C, PNG for greys."""
-        return self.images / f"{frame.name}.{'png' if frame.calibration is None else 'tiff'}"
+        """Its file in the prepared folder."""
+        return self.images / image_name(frame)
 
     def write(self, frame: Frame) -> tuple[dict[str, Any], bool]:
         """The record of a frame, and whether its image had to be written."""
         record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
-        if (
-            (done := _read(record_file)) is not None
-            and done.get("made_of") == made_of
-            and self.image_of(frame).exists()
-        ):
+        done = _read(record_file) or {}
+        if done.get("made_of") == made_of and self.image_of(frame).exists():
             return done, False
         stored = frame.load()
         pixels = replace(frame, load=lambda: stored).pixels()
@@ -88,6 +91,10 @@ class Writer:
             self._replace(self.target / "counts" / f"{frame.name}.png", cv2.imencode(".png", stored)[1])
         if frame.picture is not None and (photo := frame.picture()):
             self._replace(self.photo_of(frame), photo)
+        if (before := done.get("file")) in {f"{frame.name}.{end}" for end in ENDINGS} - {image_name(frame)}:
+            # Greys that have become temperatures, or the other way round: two images of one name would be taken for each other.
+            (self.images / before).unlink(missing_ok=True)
+            (self.target / "masks" / f"{before}.png").unlink(missing_ok=True)
         record = self._record(frame, pixels) | {"made_of": made_of}
         write_atomically(record_file, json.dumps(record, indent=1, allow_nan=False) + "\n")
         return record, True
@@ -163,8 +170,7 @@ class Writer:
 
     def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:
         """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""
-        if (self.target / PARTIAL).is_dir():
-            (self.target / PARTIAL).rmdir()
+        shutil.rmtree(self.target / PARTIAL, ignore_errors=True)
         write_csv(self.target / FRAMES_FILE, rows(frames, records))
         found = [
             r["quantiles"] for f, r in zip(frames, records, strict=True) if f.calibration is not None and r["quantiles"]
@@ -173,6 +179,13 @@ class Writer:
             low, high = min(q[0] for q in found), max(q[-1] for q in found)
             bounds = {"absolute_min_temperature": low, "absolute_max_temperature": max(high, low + 1e-3)}
             write_atomically(self.target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+        else:  # bounds of an earlier preparation would make temperatures of greys
+            (self.target / BOUNDS_FILE).unlink(missing_ok=True)
+
+
+def image_name(frame: Frame) -> str:
+    """Name of a frame's image in a prepared folder: float32 TIFF in °C, PNG for greys."""
+    return f"{frame.name}.{ENDINGS[frame.calibration is not None]}"
 
 
 def write_world(target: Path, metres_per_unit: float | None) -> None:

@@ -178,7 +178,7 @@ def levels(values, views=5, doubt=None):
     # Residuals of turning signs tell as much as independent ones.
     images = [torch.full((CAMERA.height, CAMERA.width, 1), 0.25 + 0.01 * (-1) ** view) for view in range(views)]
     seen = [View(FRAME, thermal=image) for image in images]
-    module.scene = SimpleNamespace(train=seen)
+    module.scene = SimpleNamespace(train=ViewSet([view.frame for view in seen], seen.__getitem__))
     told = object.__new__(Uncertainty)
     told.module, told.stretch, told.noise, told.evidence = module, 1.0, 0.1, evidence(module, seen)
     return told

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import struct
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -16,29 +18,29 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
+# Kind of a page of a TIFF (1: a smaller copy, 4: a mask), its width, height, bits of a sample, samples of a pixel, their type.
+PAGE_TAGS = (254, 256, 257, 258, 277, 339)
+MOST_ENTRIES = 4096  # of a page; more are damage
+
 # Mean difference between the largest and smallest channel of a pixel, in 8-bit grey levels. Greys stored as RGB have 0,
 # after JPEG compression below 2; colour maps have 50 and more.
 PSEUDO_COLOUR_LEVELS = 4.0
 
 
-def read_image(path: Path) -> np.ndarray:
+def read_image(path: Path, page: int | None = None) -> np.ndarray:
     """The pixels of an image file as they are stored: [H, W] or [H, W, C], C = 3 (RGB) or 4 (RGBA).
 
     The format is taken from the content, not from the extension. uint8 and uint16 stay, floating point becomes float32.
 
+    Args:
+        path: of the file.
+        page: which of several images in a TIFF (``pages_of``); None where it is to hold one.
+
     Raises:
-        SceneError: the file is missing, empty, truncated, no image, or of another pixel type.
+        SceneError: the file is missing, empty, truncated, no image, of another pixel type, or holds several images.
     """
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
-    if not data:
-        raise SceneError(f"image {path} is empty (0 bytes); copy it again or remove it from the scene")
-    if data[:2] == b"\xff\xd8" and _is_truncated_jpeg(data):
-        raise SceneError(f"image {path} is corrupt: the JPEG ends early; copy it again or remove it from the scene")
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = _only(path) if page is None else _one_of(path, page)
     except cv2.error:
         pixels = None
     if pixels is None or pixels.size == 0:
@@ -50,6 +52,75 @@ def read_image(path: Path) -> np.ndarray:
     if pixels.ndim == 3:
         pixels = pixels[..., 0] if pixels.shape[2] == 1 else pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]
     return np.ascontiguousarray(pixels)
+
+
+def _only(path: Path) -> np.ndarray | None:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
+    if not data:
+        raise SceneError(f"image {path} is empty (0 bytes); copy it again or remove it from the scene")
+    if data[:2] == b"\xff\xd8" and _is_truncated_jpeg(data):
+        raise SceneError(f"image {path} is corrupt: the JPEG ends early; copy it again or remove it from the scene")
+    if (count := len(pages_of(path))) > 1:
+        raise SceneError(
+            f"image {path} is a TIFF of {count} images, and one is expected; write each into a file of its own, or prepare the "
+            "file (src/prepare.py), which takes every one"
+        )
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _one_of(path: Path, page: int) -> np.ndarray | None:
+    """One page, without reading the others: a recording need not fit into memory."""
+    found = cv2.imreadmulti(str(path), page, 1, flags=cv2.IMREAD_UNCHANGED)[1]
+    return found[0] if found else None
+
+
+def pages_of(path: Path) -> list[int]:
+    """The images of a TIFF that have size and type of the first one; [0] for a file of any other kind.
+
+    Previews, overviews and masks, which are pages too, are none of them.
+
+    Raises:
+        SceneError: the file cannot be read, or was cut short between two of them.
+    """
+    found: list[tuple] = []
+    try:
+        with path.open("rb") as file:
+            found.extend(_tiff_pages(file))
+    except OSError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
+    except (struct.error, ValueError, OverflowError) as error:
+        if len(found) > 1:  # of a damaged file with one image decoding says what it is worth
+            raise SceneError(f"image {path} is corrupt after its image {len(found)}; copy it again") from error
+    return [i for i, page in enumerate(found) if page == found[0]] or [0]
+
+
+def _tiff_pages(file: BinaryIO) -> Iterator[tuple]:
+    """What each page of a TIFF is: whether it belongs to another one, its width, height and type."""
+    order = {b"II": "<", b"MM": ">"}.get(file.read(2))
+    version = struct.unpack(f"{order}H", file.read(2))[0] if order else None
+    if version not in (42, 43):
+        return
+    offset, count, size = ("I", "H", 12) if version == 42 else ("Q", "Q", 20)  # 43 is BigTIFF, with wider numbers
+    wide = struct.calcsize(f"<{offset}")
+    file.seek(wide)
+    at, seen = struct.unpack(f"{order}{offset}", file.read(wide))[0], set()
+    while at and at not in seen:
+        seen.add(at)
+        file.seek(at)
+        entries = struct.unpack(f"{order}{count}", file.read(struct.calcsize(f"<{count}")))[0]
+        table = file.read(size * min(entries, MOST_ENTRIES))
+        values = {}
+        for start in range(0, len(table), size):
+            tag, kind, number = struct.unpack_from(f"{order}HH{offset}", table, start)
+            form = {3: "H", 4: "I"}.get(kind)
+            if tag in PAGE_TAGS and form and number * struct.calcsize(form) <= wide:  # longer ones stand elsewhere
+                values[tag] = struct.unpack_from(f"{order}{form}", table, start + size - wide)[0]
+        yield (values.get(PAGE_TAGS[0], 0) & 5, *(values.get(tag) for tag in PAGE_TAGS[1:]))
+        following = file.read(wide)
+        at = struct.unpack(f"{order}{offset}", following)[0] if len(following) == wide else 0
 
 
 def _is_truncated_jpeg(data: bytes) -> bool:

@@ -117,9 +117,14 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             if all_of_it:
                 raise
             place = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
-            if place and isinstance(error.__cause__, ValueError):
-                sys.exit(f"{place[1]}: {error.__cause__}")
-            sys.exit("\n".join(filter(None, [str(error), str(error.__cause__ or ""), _meant(error, name)])))
+            cause = error.__cause__
+            if place and isinstance(cause, ValueError):
+                sys.exit(f"{place[1]}: {cause}")
+            if place and isinstance(cause, TypeError) and _of_settings(cause):
+                sys.exit(f"{place[1]}: {cause} (HYDRA_FULL_ERROR=1 shows where)")
+            if place and cause is not None and _raised_here(cause) and _expected(cause) is None:
+                raise  # a mistake of ours, and no setting
+            sys.exit("\n".join(filter(None, [str(error), str(cause or ""), _meant(error, name)])))
         except Exception as error:  # of a job of a sweep, when all others have run
             if "group override must be a string" in str(error) and (nulled := _nulled()) and not all_of_it:
                 sys.exit(f"{nulled}=null: a group takes the name of one of its options: {', '.join(_options(nulled))}")
@@ -281,6 +286,13 @@ def _raised_here(error: BaseException) -> bool:
     return bool(frames) and frames[-1].f_globals.get("__name__", "").startswith(("heatsplat.", "datamodules."))
 
 
+def _of_settings(error: TypeError) -> bool:
+    """Whether a class or function did not take settings, or a constructor of ours itself stumbled over one."""
+    *_, last = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    called = last.f_globals.get("__name__", "").startswith("hydra.")  # and never entered
+    return called or (_raised_here(error) and last.f_code.co_name == "__init__")
+
+
 @_command
 @_job
 def train(config: dict[str, Any], output_dir: Path) -> float | None:
@@ -290,6 +302,9 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
 
     if (chosen := HydraConfig.get().runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
+    launcher = HydraConfig.get().runtime.choices.launcher
+    if launcher not in (None, "basic") and HydraConfig.get().mode != RunMode.MULTIRUN:
+        log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)
     return complete(config, output_dir).test.get("psnr")

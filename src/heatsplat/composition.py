@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
 from heatsplat.training.machine import cores
@@ -58,17 +60,79 @@ def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
 
 
 def plain(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
-    """A composed configuration as plain containers, with files as they are called from anywhere."""
-    found = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    """A composed configuration as plain containers, with files as they are called from anywhere.
+
+    Raises:
+        ValueError: an option follows a setting that the method does not have.
+    """
+    try:
+        found = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except InterpolationKeyError as error:
+        told = _unmet(error, HydraConfig.get().runtime.choices)
+        if told is None:
+            raise
+        raise ValueError(told) from error
     for group, key in ((found.get("data") or {}, "root"), (found, "budget_curves")):
         if group.get(key) is not None:
             group[key] = str(Path(group[key]).expanduser().resolve())
     return found | {"overrides": list(overrides)}
 
 
+def setters_of(key: str, choices: Mapping[str, str | None]) -> list[tuple[str, str]]:
+    """Group and name of the options among ``choices`` whose own files set a dotted key, such as ("method", "thermogs")."""
+    files = [(group, option, Path(CONF) / group / f"{option}.yaml") for group, option in choices.items() if option]
+    return [(group, option) for group, option, path in files if path.is_file() and _at(path, group, key) is not None]
+
+
+def _at(path: Path, group: str, key: str) -> Any:
+    """What an option's own file has at a dotted key, not resolved; None where it sets nothing there."""
+    told = re.match(r"# @package (\S+)", path.read_text(encoding="utf-8"))
+    package = told[1].replace("_global_", "") if told else group.replace("/", ".")
+    if package and not key.startswith(f"{package}."):
+        return None
+    found = OmegaConf.to_container(OmegaConf.load(path))
+    for name in key.removeprefix(f"{package}.").split("."):
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found
+
+
+def _unmet(error: InterpolationKeyError, choices: Mapping[str, str | None]) -> str | None:
+    """Which option follows a setting that is nowhere, and which methods have that; None where the error is another."""
+    missing = re.match(r"Interpolation key '([\w.]+)' not found", str(error))
+    if missing is None or not error.full_key:
+        return None
+    key, group, method = missing[1], str(error.full_key).partition(".")[0], choices.get("method")
+    option = f"{group}={choices[group]}" if choices.get(group) else str(error.full_key)
+    methods = {path.stem: path for path in sorted((Path(CONF) / "method").glob("*.yaml"))}
+    above, _, name = key.rpartition(".")
+    beside = _at(methods[method], "method", above) if above and method in methods else None
+    if isinstance(beside, Mapping):  # it has a value for each option of another group, but not for this one
+        asks = next((f"{one}={name}" for one, chosen in choices.items() if chosen == name), option)
+        return f"{asks} needs {key}, and {above} has {', '.join(beside)}: leave {asks} out, or add +{key}=..."
+    having = [name for name, path in methods.items() if _at(path, "method", above or key) is not None]
+    chosen = {f"override /{group}": choices.get(group)}
+    of_it = [name for name in having if chosen in (_at(methods[name], "method", "defaults") or ())]
+    other = f"choose method={' or '.join(of_it or having)}, or " if having else ""
+    return f"{option} needs {key}, which method={method} does not have: {other}add +{key}=..."
+
+
 def keys_of(overrides: Sequence[str]) -> set[str]:
     """What overrides are given for, such as {"max_steps", "data.scene"}."""
     return {text.lstrip("+~").partition("=")[0] for text in overrides}
+
+
+def overlap(key: str, other: str) -> bool:
+    """Whether one of two dotted keys is the other or lies below it."""
+    return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
+
+
+def followed(config: Any, before: Any, after: Any) -> Any:
+    """A configuration with the changes that lead from ``before`` to ``after``, and all else as it is."""
+    if not isinstance(config, Mapping) or not isinstance(after, Mapping):
+        return after
+    changed = {key for key in after if before.get(key) != after[key]}
+    kept = {key: value for key, value in config.items() if key in after or key not in before}
+    return kept | {key: followed(config.get(key), before.get(key), after[key]) for key in changed}
 
 
 def run_of(ckpt: str | None) -> str:

@@ -154,7 +154,7 @@ class Uncertainty:
         self.module = module
         self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
         self.noise = noise_of_views(scene.train, module.modality)
-        known = torch.cat([_pixels(view, module.modality)[::7] for view in scene.train])
+        known = torch.cat([_pixels(view, module.modality)[::7].clone() for view in scene.train])  # or each image stays
         if not len(known):
             raise SceneError(
                 f"masks leave no pixel of the training views of scene '{scene.name}', which tell how certain it is"
@@ -245,7 +245,8 @@ class Uncertainty:
             .var(0, correction=min(1, len(module.splats) - 1))  # one alone has no spread
         )
         known, pulled, weights, residuals = 0.0, 0.0, [], []
-        for view in sorted(module.scene.train, key=lambda view: view.time_s or 0.0):
+        views = module.scene.train
+        for view in views.subset(sorted(range(len(views)), key=lambda k: views.frames[k].time_s or 0.0)):
             view = view.to(module.device)
             weight, residual = _residual(module, view)
             tells = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)

@@ -21,6 +21,14 @@ def test_a_run_that_fails_is_quoted(tmp_path):
         company.seconds_of([sys.executable, "-S", "-c", "raise SystemExit('no such thing')"], [tmp_path])
 
 
+@pytest.mark.parametrize("key", ["rounds", "together"])
+@pytest.mark.parametrize("value", [0, "abc"])
+def test_what_counts_nothing_is_refused_before_the_first_run(tmp_path, monkeypatch, key, value):
+    monkeypatch.setattr(company, "seconds_of", lambda *_: pytest.fail("it ran"))
+    with pytest.raises(SceneError, match=f"study.{key} must be a whole number, 1 or more, got {value}"):
+        company.run(tmp_path, "train.py", [], **{key: value})
+
+
 @pytest.mark.parametrize("side_by_side", [2.0, 3.0])
 def test_the_ratio_is_written_and_one_above_the_limit_fails(tmp_path, monkeypatch, side_by_side):
     monkeypatch.setattr(company, "seconds_of", lambda _, folders: 1.0 if len(folders) == 1 else side_by_side)

@@ -13,7 +13,7 @@ from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves, find_probes, recorded, seen_by
 from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report
-from heatsplat.contracts import ViewSet
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.io.tables import read_csv
 
 
@@ -38,6 +38,33 @@ def test_temperature_errors_that_cannot_be_had_say_why(tmp_path, scene, reason):
         assert results.test[name] is None
     assert reason in results.reasons["test.mae_c"]
     assert results.test["lpips"] is None and results.reasons["test.lpips"] == "not asked for"
+
+
+@pytest.mark.parametrize(
+    ("net", "weights", "message"),
+    [
+        ("squeeze", None, "callbacks.metrics.lpips_net must be one of alex, vgg, None, got 'squeeze'"),
+        ("alex", "no.pth", "lpips_weights=no.pth: .*not at no.pth"),
+        ("alex", "text.pth", "lpips_weights=.*text.pth cannot be read as weights"),
+        ("vgg", "other.pth", "lpips_weights=.*other.pth: .* not those of the net"),
+    ],
+)
+def test_lpips_that_was_asked_for_and_cannot_be_had_is_said_before_the_first_step(tmp_path, net, weights, message):
+    (tmp_path / "text.pth").write_text("hello")
+    torch.save({"features.0.weight": torch.zeros(2)}, tmp_path / "other.pth")
+    given = weights if weights in (None, "no.pth") else str(tmp_path / weights)
+    module, metrics = FakeModule(wall(), tmp_path), QualityMetrics(lpips_net=net, lpips_weights=given)
+    with pytest.raises(SceneError, match=message):
+        fit(module, trainer(tmp_path, [metrics], steps=4, every=4, logger=False))
+    assert not metrics.curve and module.value.item() == pytest.approx(0.9)
+
+
+def test_without_the_default_file_of_lpips_the_reason_stands_beside_the_other_scores(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    module = FakeModule(wall(), tmp_path)
+    evaluate(module, trainer(tmp_path, [QualityMetrics()], logger=False))
+    assert module.results.test["psnr"] > 20 and module.results.test["lpips"] is None
+    assert "Download https" in module.results.reasons["test.lpips"]
 
 
 def test_images_without_region_of_interest_are_not_averaged_in(tmp_path):

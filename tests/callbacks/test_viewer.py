@@ -27,7 +27,10 @@ def test_the_pages_name_the_methods_that_leave_none(page):
     without = set()
     for path in (root / "conf" / "method").glob("*.yaml"):
         part = re.search(r"override /thermal: (\w+)", path.read_text(encoding="utf-8"))
-        model = yaml.safe_load((root / "conf" / "thermal" / f"{part[1]}.yaml").read_text()) if part else {}
+        option, model = part and part[1], {}
+        while option and "_target_" not in model:  # else it is that of the option which this one builds upon
+            model = yaml.safe_load((root / "conf" / "thermal" / f"{option}.yaml").read_text())
+            option = next(iter(model.get("defaults", ())), None)
         module, _, name = model.get("_target_", "").rpartition(".")
         if module and getattr(getattr(import_module(module), name), "stays_here", ""):
             without.add(path.stem)

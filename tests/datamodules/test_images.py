@@ -8,6 +8,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
+    pages_of,
     read_image,
     resized,
     resized_mask,
@@ -118,3 +119,30 @@ def test_a_small_pixel_counts_only_where_all_of_it_does():
     mask = np.ones((4, 6), bool)
     mask[1, 1] = False
     assert resized_mask(mask, 3, 2).tolist() == [[False, True, True], [True, True, True]]
+
+
+def test_a_tiff_of_several_images_is_refused_where_one_is_expected_and_its_images_are_counted(tmp_path):
+    stack = np.random.default_rng(0).normal(20.0, 1.0, (3, 6, 8)).astype(np.float32)
+    path = tmp_path / "a.tiff"
+    assert cv2.imwritemulti(str(path), list(stack))
+    assert pages_of(path) == [0, 1, 2]
+    for page in pages_of(path):
+        np.testing.assert_array_equal(read_image(path, page), stack[page])
+    with pytest.raises(SceneError, match=r"a\.tiff is a TIFF of 3 images, and one is expected; write each into a file"):
+        read_image(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: data.rindex(stack[2].tobytes()) + 4])  # its last images are cut off
+    with pytest.raises(SceneError, match=r"a\.tiff is corrupt"):
+        pages_of(path)
+        read_image(path, 2)
+    write_image(tmp_path / "b.png", np.zeros((4, 4), np.uint8))
+    assert pages_of(tmp_path / "b.png") == [0]
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_previews_in_a_tiff_are_no_images(tmp_path, big):
+    full, small = (Image.fromarray(np.full(shape, 7.0, np.float32)) for shape in ((8, 6), (4, 3)))
+    full.save(tmp_path / "a.tiff", save_all=True, append_images=[small, full], big_tiff=big)
+    assert pages_of(tmp_path / "a.tiff") == [0, 2]
+    full.save(tmp_path / "a.tiff", save_all=True, append_images=[small], big_tiff=big)
+    assert read_image(tmp_path / "a.tiff").shape == (8, 6)

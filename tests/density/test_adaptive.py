@@ -5,9 +5,10 @@ import json
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.contracts import Camera, RenderOutput, SceneError
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.budget import Budget
+from heatsplat.density.co_support import CoSupport
 from heatsplat.density.fixed import Fixed
 from heatsplat.density.multiview_gate import MultiviewGate
 from heatsplat.density.ops import Cloud
@@ -25,6 +26,7 @@ def make_cloud(policy: Adaptive, scales: list[float], opacities: list[float]) ->
         }
     )
     optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names])
+    splats["opacity_logits"].grad = torch.zeros(count, 1)  # it is trained
     return Cloud(splats, optimizer, policy.initial_state(count, torch.device("cpu")))
 
 
@@ -86,6 +88,26 @@ def test_opacity_reset_happens_on_time_and_not_after_stop():
     assert refine(policy, cloud, 299) is None
 
 
+def test_opacities_that_a_stage_holds_still_are_not_reset_nor_where_it_begins_before_they_are_back():
+    policy = Adaptive(start=0, stop=250, every=5, reset_every=100)
+    cloud = make_cloud(policy, [0.01] * 2, [0.9, 0.9])
+    cloud.splats["opacity_logits"].grad = None
+    assert not refine(policy, cloud, 99).opacity_reset and cloud.splats.opacities.min() > 0.89
+    cloud.splats["opacity_logits"].grad = torch.zeros(2, 1)
+    for until, reset in ((249, False), (250, True)):  # ten refinements take 50 steps
+        policy.opacities_until = until
+        assert refine(policy, cloud, 199).opacity_reset == reset
+        assert policy.settled(199) != reset and not policy.settled(149 - 1)
+    assert cloud.splats.opacities.max() < 0.011
+
+
+def test_large_gaussians_stay_where_no_reset_comes():
+    policy = Adaptive(start=0, stop=1000, every=10, reset_every=100)
+    policy.opacities_until = 150
+    cloud = make_cloud(policy, [0.01, 0.5], [0.5, 0.5])
+    assert refine(policy, cloud, 109).removed == 0
+
+
 def test_opacities_settle_ten_refinements_after_a_reset():
     policy = Adaptive(start=0, stop=250, every=5, reset_every=100)
     settled = [step + 1 for step in range(400) if not policy.settled(step)]
@@ -130,16 +152,18 @@ def test_nothing_before_start_between_refinements_or_after_stop():
 def test_an_empty_cloud_is_an_error_that_says_why():
     policy = Adaptive(start=0, stop=100, every=10)
     cloud = make_cloud(policy, [0.01] * 2, [0.001] * 2)
-    with pytest.raises(RuntimeError, match="prune all 2 Gaussians at step 9"):
+    with pytest.raises(SceneError, match="prune all 2 Gaussians at step 9"):
         refine(policy, cloud, 9)
     assert len(cloud) == 2
 
 
-def test_statistics_are_mean_norms_in_normalised_device_coordinates():
-    policy = Adaptive()
+@pytest.mark.parametrize("kind", [Adaptive, CoSupport])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # of splats that the reference renders
+def test_statistics_are_mean_norms_in_normalised_device_coordinates(kind, dtype):
+    policy = kind()
     state = policy.initial_state(3, torch.device("cpu"))
-    means2d = torch.zeros(3, 2, requires_grad=True)
-    means2d.grad = torch.tensor([[3.0, 0.0], [0.0, 2.0], [9.0, 9.0]])
+    means2d = torch.zeros(3, 2, dtype=dtype, requires_grad=True)
+    means2d.grad = torch.tensor([[3.0, 0.0], [0.0, 2.0], [9.0, 9.0]], dtype=dtype)
     output = RenderOutput(
         torch.zeros(2, 2, 1), torch.zeros(1, 2, 2), None, {"means2d": means2d, "visible_ids": torch.tensor([0, 1])}
     )

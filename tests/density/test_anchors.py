@@ -1,9 +1,12 @@
 """Where anchors come and which go, on a few of them whose statistics are known."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.composition import build, compose
+from heatsplat.contracts import Camera, RenderOutput, SceneError
 from heatsplat.density.anchors import Anchors
 from heatsplat.density.ops import Cloud
 from heatsplat.splats import Splats
@@ -26,6 +29,14 @@ def make(*places, **options):
     state = rule.initial_state(n, torch.device("cpu"))
     state |= {"gradient": torch.zeros(n, 2), "shown": torch.full((n, 2), 10.0)}
     return rule, Cloud(Splats(tensors), None, state)
+
+
+@pytest.mark.parametrize("init", ["sfm", "random"])
+def test_voxels_are_those_of_the_initialisation_and_else_as_far_apart_as_points(init):
+    assert compose(["method=scaffold_gs", "init.voxel=0.5"])["density"]["voxel"] == 0.5
+    rule = build(compose(["method=scaffold_gs", f"init={init}"])["density"])
+    rule.prepare(SimpleNamespace(points=torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [4.0, 0, 0]]), name="row"), "thermal")
+    assert rule.size == 2.0
 
 
 def refined(rule, cloud, seed=0):
@@ -105,7 +116,7 @@ def test_anchors_leave_that_were_seen_and_are_transparent():
 def test_a_scene_without_any_anchor_left_and_wrong_options_are_refused():
     rule, cloud = make([0.0, 0, 0])
     cloud.state["views"][:] = 9.0
-    with pytest.raises(RuntimeError, match="would prune all 1 anchors at step 9"):
+    with pytest.raises(SceneError, match="would prune all 1 anchors at step 9"):
         refined(rule, cloud)
     with pytest.raises(ValueError, match="finer at least 2"):
         Anchors(finer=1)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.contracts import Camera
+from heatsplat.contracts import Camera, SceneError
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.co_support import CoSupport
 from heatsplat.density.ops import Cloud
@@ -86,7 +86,7 @@ def test_a_reset_prunes_none_that_it_lowered():
 
 def test_an_empty_cloud_is_an_error_that_says_why():
     policy = control()
-    with pytest.raises(RuntimeError, match="would prune all 2 Gaussians at step 9: each has an opacity below 0.005"):
+    with pytest.raises(SceneError, match="would prune all 2 Gaussians at step 9: each has an opacity below 0.005"):
         refine(policy, make_cloud(policy, [[0.001, 0.5], [0.5, 0.001]]))
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, View, ViewSet, WeightedSums
+from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View, ViewSet, WeightedSums
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.budget import CURVES, Budget, _drawn
 from heatsplat.density.ops import Cloud
@@ -284,7 +284,7 @@ def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
     policy = budget(start=0, stop=100, every=10, cap_max=3, remove_at=())
     cloud = make_cloud(policy, 3, [0.5, 0.001, 0.5])
     assert refine(policy, cloud, 9).removed == 1 and len(cloud) == 2
-    with pytest.raises(RuntimeError, match="remove all 2 Gaussians at step 9"):
+    with pytest.raises(SceneError, match="remove all 2 Gaussians at step 9"):
         refine(policy, make_cloud(policy, 2, [0.001] * 2), 9)
 
 

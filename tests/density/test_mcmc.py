@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from heatsplat.contracts import SceneError
 from heatsplat.density.mcmc import MCMC, MOST, stacked
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.base import rasterization
@@ -171,7 +172,7 @@ def test_frozen_centres_do_not_wander():
 
 
 def test_a_dead_cloud_is_an_error_that_says_why():
-    with pytest.raises(RuntimeError, match="finds all 2 Gaussians dead at step 9"):
+    with pytest.raises(SceneError, match="finds all 2 Gaussians dead at step 9"):
         refine(policy(), cloud_of([0.001, 0.002]))
     for name in ("start", "stop", "dead_opacity", "growth", "noise"):
         with pytest.raises(ValueError, match=f"{name}.* at least 0, got .*-0.5"):

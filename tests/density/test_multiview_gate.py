@@ -134,6 +134,10 @@ def test_late_pruning_takes_the_blamed_first_then_the_faintest_and_no_more_than_
     cloud.state["blame"][[40, 41]] = torch.tensor([10.0, 5.0])
     before = cloud.splats["means"].detach().clone()
     assert policy.refine(cloud, 118, 1.0, torch.Generator()) is None
+    blame = cloud.state["blame"].clone()
+    assert policy.refine(cloud, 119, 1.0, torch.Generator()).removed == 0  # a stage holds opacities still
+    cloud.state["blame"] = blame
+    cloud.splats["opacity_logits"].grad = torch.zeros(64, 1)
     assert policy.refine(cloud, 119, 1.0, torch.Generator()).removed == 3  # 5 % of 64
     left = torch.ones(64, dtype=torch.bool)
     left[[40, 9, 8]] = False

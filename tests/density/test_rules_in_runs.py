@@ -96,6 +96,34 @@ def test_a_whole_pass_of_the_views_is_judged_in_every_round(tmp_path, monkeypatc
     assert len(judged) == len(set(judged)) == len(module.scene.train)
 
 
+@pytest.mark.parametrize(
+    ("method", "more", "resets"),
+    [
+        ("3dgs", ("optim.accumulate=4", "optim.accumulate_from=0"), [10, 20, 30]),  # gradients wait meanwhile
+        ("thermalgs", ("first_steps=25",), [10]),  # from where on geometry is frozen; ten refinements take ten steps
+    ],
+)
+def test_opacities_are_reset_while_they_are_trained(method, more, resets, tmp_path, monkeypatch):
+    steps, ended = [], SplatTraining.on_train_batch_end
+
+    def noted(self, *rest):
+        if self.density_change is not None and self.density_change.opacity_reset:
+            steps.append(self.global_step)
+        ended(self, *rest)
+
+    monkeypatch.setattr(SplatTraining, "on_train_batch_end", noted)
+    every = (
+        "density.start=5",
+        "density.every=1",
+        "density.stop=36",
+        "density.reset_every=10",
+        "density.prune_opacity=0",
+    )
+    given = (*TINY, "density=adaptive", *every, "max_steps=40", "test=false", "trainer.limit_val_batches=0")
+    run(tmp_path, *given, f"method={method}", *more)
+    assert steps == resets
+
+
 PAIRS = [  # every method of Gaussians under one of the rules; under the others where there is time
     pytest.param(rule, method, marks=() if i % len(RULES) == j else pytest.mark.slow)
     for i, method in enumerate(OF_GAUSSIANS)

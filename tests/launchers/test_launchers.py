@@ -1,5 +1,6 @@
 """Sweeps in many processes: the same bits as in one, whatever is killed; all results in one table."""
 
+import inspect
 import json
 import os
 import subprocess
@@ -11,10 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobStatus
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 from running import run
 
+from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
 from heatsplat.training.machine import cores
@@ -150,6 +154,60 @@ def test_without_slurm_its_rehearsal_is_named(monkeypatch, tmp_path):
         Slurm().outcomes([])
 
 
+@pytest.mark.parametrize(
+    ("launcher", "mode", "told"),
+    [("slurm", RunMode.RUN, True), ("slurm", RunMode.MULTIRUN, False), ("basic", RunMode.RUN, False)],
+)
+def test_a_single_run_says_that_its_launcher_has_nothing_to_start(launcher, mode, told, monkeypatch, caplog, tmp_path):
+    hydra_config = OmegaConf.create({"mode": mode, "runtime": {"choices": {"study": None, "launcher": launcher}}})
+    monkeypatch.setattr(HydraConfig, "get", lambda: hydra_config)
+    monkeypatch.setattr("heatsplat.runs.run.complete", lambda *_: RunResults())
+    with caplog.at_level("WARNING", logger="heatsplat"):
+        inspect.unwrap(cli.train)({}, tmp_path)
+    assert (
+        "launcher=slurm starts the jobs of a sweep; this single run trains right here: add -m" in caplog.text
+    ) == told
+
+
+NO_SUBMITIT = pytest.mark.skipif(
+    find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed: pip install -e '.[slurm]'"
+)
+
+
+def submitted(folder: Path, monkeypatch, sbatch: str, jobs: int, **settings) -> list:
+    """What waits for each of so many jobs, handed to a cluster whose sbatch is a line of shell."""
+    from hydra_plugins.heatsplat_launchers._jobs import Job
+    from hydra_plugins.heatsplat_launchers.submitit import Slurm
+
+    for name, line in {"srun": "", "sbatch": sbatch}.items():
+        (folder / name).write_text(f"#!/bin/sh\n{line}\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.environ.get("PYTHONPATH", ""))  # which the launcher sets
+    monkeypatch.setattr(Slurm, "wait", lambda self, job: job)
+    launcher = Slurm(submitit_folder=str(folder / "%j"), **settings)
+    launcher.hydra_context = launcher.config = launcher.task_function = None
+    return list(launcher.outcomes([Job(number, (), folder, None) for number in range(jobs)]))
+
+
+@NO_SUBMITIT
+def test_what_sbatch_has_against_the_jobs_is_told_in_a_sentence(tmp_path, monkeypatch):
+    no = "echo 'sbatch: error: invalid partition specified: gpu' >&2; exit 1"
+    with pytest.raises(SceneError, match=r"invalid partition specified: gpu\. .*hydra\.launcher\.partition"):
+        submitted(tmp_path, monkeypatch, no, 2, partition="gpu")
+
+
+@NO_SUBMITIT
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_srun_is_told_the_cores_of_a_job_too(tmp_path, monkeypatch, jobs):
+    """Not every srun takes them over from sbatch."""
+    sbatch = f'cp "$1" {tmp_path}/script; echo Submitted batch job 7'
+    assert len(submitted(tmp_path, monkeypatch, sbatch, jobs, cpus_per_task=8, gpus_per_node=None)) == jobs
+    script = (tmp_path / "script").read_text().splitlines()
+    (srun,) = (line for line in script if line.startswith("srun "))
+    assert "#SBATCH --cpus-per-task=8" in script and " --cpus-per-task=8 " in srun
+
+
 @pytest.mark.slow  # processes of their own load torch five times over; shares and going on: test_stop_and_go_on.py
 @pytest.mark.skipif(find_spec("joblib") is None, reason="joblib is not installed: pip install -e '.[sweep]'")
 def test_jobs_side_by_side_share_the_cores_and_survive_a_killed_process(tmp_path, alone):
@@ -161,9 +219,7 @@ def test_jobs_side_by_side_share_the_cores_and_survive_a_killed_process(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed: pip install -e '.[slurm]'"
-)
+@NO_SUBMITIT
 def test_a_job_whose_time_is_over_goes_back_into_the_queue_and_on_from_its_checkpoint(tmp_path, alone):
     """SIGUSR2 is what SLURM sends before the time limit; checkpoints come every two steps, and one more now."""
     folder = tmp_path / "sweep"

@@ -3,8 +3,12 @@
 import pytest
 import torch
 
+from heatsplat.composition import build, compose
 from heatsplat.losses import schedules
 from heatsplat.losses.compose import During, Loss, LossInputs, Weighted
+from heatsplat.losses.low_resolution import OnTargetGrid
+from heatsplat.losses.modality_balance import ByOthersShare
+from heatsplat.losses.photometric import Photometric
 
 
 def at(step):
@@ -41,6 +45,20 @@ def test_steps_at_which_nothing_is_compared_are_refused():
             Loss({"first": During(mean, stop=stop), "second": During(mean, start=5)})
     with pytest.raises(ValueError, match=r"the loss has no term: give one of loss.terms \(plain\) that is not null"):
         Loss({"plain": None})
+
+
+def test_it_is_known_whether_some_term_compares_the_images_of_a_companion():
+    own, colour = Photometric(), Photometric(modality="rgb")
+    assert not Loss({"own": own}).compares("rgb")
+    for term in (colour, Weighted(colour, 0.5), During(Weighted(OnTargetGrid(colour)), 5), ByOthersShare(colour, 1)):
+        assert Loss({"own": own, "colour": term}).compares("rgb")
+    assert not Loss({"own": own, "colour": During(Weighted(colour, 0.0))}).compares("rgb")
+
+
+@pytest.mark.parametrize("method", ["3dgs_ir", "mftg", "msmg", "ommg", "ravigs", "thermonerf"])
+def test_every_loss_of_two_images_compares_both(method):
+    config = compose([f"method={method}"])
+    assert build(config["thermal"]).companions == ("rgb",) and build(config["loss"]).compares("rgb")
 
 
 def test_weight_and_schedule_multiply():

@@ -202,6 +202,35 @@ def test_an_enlarged_image_of_the_wrong_size_is_refused_before_training(tmp_path
         term.prepare(make_scene(), "thermal")
 
 
+@pytest.mark.parametrize(
+    "low, high, told", [(25.0, 26.0, "from 25 to 26"), (-9.0, 1.0, "from -9"), (np.nan, 1.0, "from nan")]
+)
+def test_enlarged_images_in_celsius_are_no_white_teacher(tmp_path, low, high, told):
+    fine = low + (high - low) * smooth()[..., 0].numpy()
+    fine[0, :2] = low, high
+    Image.fromarray(fine).save(tmp_path / "000.tif")
+    with pytest.raises(SceneError, match=f"000.tif has values {told}.* encoded like the training images, 0 to 1"):
+        load_teacher(str(tmp_path))(noise(), frame(), FACTOR)
+
+
+def test_edges_of_an_enlarged_image_may_overshoot(tmp_path):
+    fine = 1.2 * smooth()[..., 0].numpy() - 0.1
+    Image.fromarray(fine).save(tmp_path / "000.tif")
+    answer = load_teacher(str(tmp_path))(noise(), frame(), FACTOR)
+    assert np.array_equal(answer[..., 0], fine.clip(0, 1))
+
+
+@pytest.mark.parametrize("size", [0, 30, 400])
+def test_a_truncated_image_of_a_teacher_is_named(tmp_path, size):
+    Image.fromarray((smooth()[..., 0].numpy() * 255).astype(np.uint8)).save(tmp_path / "000.png")
+    whole = (tmp_path / "000.png").read_bytes()
+    assert len(whole) > 400
+    (tmp_path / "000.png").write_bytes(whole[:size])
+    term = HighFrequency(lambda: load_teacher(str(tmp_path)))
+    with pytest.raises(SceneError, match=r"teacher image .*000.png cannot be read: .* Copy it again"):
+        term.prepare(make_scene(1), "thermal")
+
+
 def test_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(SceneError, match="the folder holds no image"):
         load_teacher(str(tmp_path))
@@ -233,6 +262,36 @@ def test_a_network_from_a_file_is_asked_once_and_its_answer_kept(tmp_path, name,
     assert torch.equal(again(noise(), frame(), FACTOR), answer)  # a later run trains on the same bits
     with pytest.raises(pytest.fail.Exception):
         again(noise(seed=1), frame(), FACTOR)
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "other shape"])
+def test_a_damaged_answer_in_the_cache_is_made_again(tmp_path, damage):
+    save_enlarger(tmp_path / "net.pt")
+    teacher = load_teacher(str(tmp_path / "net.pt"), cache=str(tmp_path / "cache"), trust=True)
+    answer = teacher(noise(), frame(), FACTOR)
+    (kept,) = (tmp_path / "cache").iterdir()
+    whole = kept.read_bytes()
+    if damage == "other shape":
+        np.save(kept, np.zeros((2, 2, 1), np.float16))
+    else:
+        kept.write_bytes(whole[: len(whole) // 2 if damage == "cut" else 0])
+    assert torch.equal(teacher(noise(), frame(), FACTOR), answer)
+    assert kept.read_bytes() == whole and list(kept.parent.iterdir()) == [kept]
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_a_cache_that_cannot_be_written_costs_one_warning(tmp_path, monkeypatch, caplog, full):
+    save_enlarger(tmp_path / "net.pt")
+    (tmp_path / "file").write_text("no folder")
+    cache = tmp_path / "cache" if full else tmp_path / "file" / "cache"
+    if full:
+        monkeypatch.setattr(np, "save", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    teacher = load_teacher(str(tmp_path / "net.pt"), cache=str(cache), trust=True)
+    for seed in range(2):
+        assert teacher(noise(seed=seed), frame(), FACTOR).shape == (FACTOR * HEIGHT, FACTOR * WIDTH, 1)
+    (told,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert f"cannot be kept in {cache}" in told and "teacher.cache" in told
+    assert not full or not list(cache.iterdir())
 
 
 def test_jobs_that_share_a_cache_do_not_meet(tmp_path):

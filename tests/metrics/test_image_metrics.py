@@ -120,3 +120,22 @@ def test_saturated_pixels_are_counted():
     assert saturated_fraction(target, valid) == pytest.approx(2 / 3)
     assert saturated_fraction(target, torch.zeros_like(valid)) is None
     assert np.isclose(saturated_fraction(target, torch.ones_like(valid)), 0.5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_ssim_equals_kornias_under_a_mask_with_gaps(channels):
+    from kornia.metrics import ssim as ssim_map
+
+    generator = torch.Generator().manual_seed(channels)
+    target = torch.rand(37, 52, channels, generator=generator)
+    prediction = (target + 0.1 * torch.randn(target.shape, generator=generator)).clamp(0, 1)
+    mask = torch.ones(37, 52, dtype=torch.bool)
+    mask[20:23, 30:31] = False
+    planes = [
+        torch.where(mask[..., None], image.double(), 0.0).permute(2, 0, 1)[None] for image in (prediction, target)
+    ]
+    scores = ssim_map(*planes, window_size=11, eps=0.0, padding="valid")[0]
+    whole = -torch.nn.functional.max_pool2d(-mask[None].double(), 11, stride=1)[0] > 0.5
+    assert 0 < whole.sum() < whole.numel()
+    prediction[20, 30] = torch.nan  # hidden
+    assert ssim(prediction, target, mask) == pytest.approx(scores[:, whole].mean().item(), abs=1e-12)

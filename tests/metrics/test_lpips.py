@@ -101,6 +101,8 @@ def test_weights_are_found_and_checked(tmp_path, monkeypatch):
     assert "SHA-256" in by_path.description
     with pytest.raises(LpipsUnavailable, match="not those of the net"):
         load_lpips("vgg", hub)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert load_lpips("alex", f"~/checkpoints/{hub.name}").source == by_path.source
     hub.write_bytes(b"no weights")
     with pytest.raises(LpipsUnavailable, match="cannot be read as weights"):
         load_lpips("alex", hub)

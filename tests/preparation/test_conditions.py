@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,3 +52,31 @@ def test_uncertainties_come_in_the_units_of_the_conditions():
     for wrong in (-1.0, "little", float("nan")):
         with pytest.raises(SceneError, match="uncertainty.air_c"):
             Uncertainty(air_c=wrong)
+
+
+@pytest.mark.parametrize(
+    ("idle", "needed"),
+    [
+        (
+            {"reflected_c": 5.0},
+            "reflected_c=5.0 changes nothing while emissivity is 1, .* give conditions.emissivity, too",
+        ),
+        ({"window_c": 5.0}, "window_c=5.0 changes nothing while window_transmission is 1"),
+        ({"air_c": 5.0, "humidity_percent": 50}, "air_c=5.0 changes nothing while distance_m is 0"),
+        ({"humidity_percent": 50, "distance_m": 0.0}, "humidity_percent=50 changes nothing while distance_m is 0"),
+    ],
+)
+def test_conditions_that_change_nothing_are_refused_with_what_they_need(idle, needed):
+    plain = replace(FRAME, conditions=Conditions(), sources={})
+    with pytest.raises(SceneError, match=needed):
+        Given(**idle).check_use([Given(**idle).settled(plain)])
+    useful = Given(**idle | {"emissivity": 0.9, "distance_m": 9.0, "window_transmission": 0.9})
+    useful.check_use([useful.settled(plain)])
+    some = Given(reflected_c=5.0)
+    some.check_use([some.settled(plain), some.settled(FRAME)])  # it counts for one of them
+    neutral = Given(emissivity=1.0, distance_m=0.0, window_transmission=1.0)
+    neutral.check_use([neutral.settled(plain)])  # goes before what files say
+    with pytest.raises(
+        SceneError, match=r"conditions.emissivity changes nothing for greys, .* give bounds_c=\[min,max\]"
+    ):
+        Given(emissivity=0.9).check_use([replace(plain, calibration=None)])

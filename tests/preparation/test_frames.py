@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -237,8 +238,6 @@ def test_the_photo_inside_a_file_is_offered(tmp_path):
 @needs_data
 def test_real_files_give_the_temperatures_that_are_stated_for_them(tmp_path):
     """PROVENANCE: FLIR ONE about -10 .. 27 °C; M3T within 23.6 .. 52.9 °C; ThermoScenes' greys between their bounds."""
-    from dataclasses import replace
-
     from heatsplat.physics.radiometry import Conditions
 
     (tmp_path / "one.jpg").write_bytes((DATA / "flir" / "IMG_0620.JPG").read_bytes())
@@ -265,3 +264,81 @@ def test_floats_of_64_bits_are_read_as_those_of_32(tmp_path):
     wide, usual = (read_recording(tmp_path / name).frames[0] for name in ("wide", "usual"))
     assert wide.size == usual.size
     np.testing.assert_array_equal(wide.temperature(), usual.temperature())
+
+
+def test_counters_that_restart_within_a_folder_do_not_mix_photos(tmp_path):
+    clocks = ("20240806173449", "20240807101500")
+    write_images(tmp_path, {f"DJI_{clock}_0008_T.tiff": FLOATS for clock in clocks})
+    photo = np.zeros((8, 8, 3), np.uint8)
+    write_images(tmp_path, {f"DJI_{clock}_0008_V.jpg": photo for clock in ("20240806173450", "20240807101501")})
+    write_images(tmp_path, {"DJI_20240807101503_0008_V.jpg": photo})
+    assert [frame.rgb.stem for frame in read_frames(tmp_path)] == [
+        "DJI_20240806173450_0008_V",
+        "DJI_20240807101501_0008_V",
+    ]
+    (tmp_path / "DJI_20240806173450_0008_V.jpg").unlink()
+    assert [frame.rgb is not None for frame in read_frames(tmp_path)] == [False, True]
+
+
+@pytest.mark.parametrize("kind", ["float", "grey"])
+def test_every_image_of_a_tiff_is_a_frame(tmp_path, kind):
+    stack = np.stack([FLOATS + i for i in range(4)])
+    stack = stack if kind == "float" else (5 * stack).astype(np.uint8)
+    assert cv2.imwritemulti(str(tmp_path / "rec.tiff"), list(stack))
+    reading = Reading(Meaning(bounds_c=[0.0, 51.0]) if kind == "grey" else Meaning())
+    found = read_recording(tmp_path, reading)
+    assert [frame.name for frame in found.frames] == [f"rec_{i:06d}" for i in range(4)]
+    for frame, image in zip(found.frames, stack, strict=True):
+        np.testing.assert_array_equal(frame.load(), image)
+    assert "rec.tiff: 4 images in one file, each is a frame" in found.notes
+    table = tmp_path / "table.csv"
+    table.write_text("\n".join(["file,when", *(f"rec_{i:06d},2024-07-01T10:00:0{9 - i}Z" for i in range(4))]))
+    timed = replace(reading, table=table, columns={"name": "file", "time": "when"})
+    assert [frame.number for frame in read_frames(tmp_path, timed)] == [3, 2, 1, 0]
+    table.write_text("file,when\nrec.tiff,2024-07-01T10:00:00Z\n")
+    with pytest.raises(SceneError, match="line 2: rec.tiff holds 4 frames, .* give each a row, as rec_000000"):
+        read_frames(tmp_path, timed)
+
+
+PLACED = {
+    "name": "file",
+    "latitude_deg": "lat",
+    "longitude_deg": "lon",
+    "altitude_m": "alt",
+    "above_takeoff_m": "height",
+    "yaw_deg": "yaw",
+    "pitch_deg": "pitch",
+    "roll_deg": "roll",
+}
+
+
+def test_a_column_of_a_table_replaces_its_own_value_and_no_other(tmp_path):
+    source = write_flir(tmp_path / "files", 2)
+    table = tmp_path / "table.csv"
+    reading = Reading(table=table, columns=PLACED)
+    table.write_text("file,lat,lon\nIR_0000,50,8\nIR_0001,50.1,8\n")
+    first = read_frames(source, reading)[0].position
+    assert (first.latitude_deg, first.longitude_deg, first.altitude_m) == (50.0, 8.0, 100.0)
+    table.write_text("file,alt,height\nIR_0000,250,\nIR_0001,,30\n")
+    found = read_recording(source, reading)
+    places = [frame.position for frame in found.frames]
+    assert [(p.latitude_deg, p.altitude_m, p.above_takeoff_m) for p in places] == [
+        (51.0, 250.0, None),
+        (pytest.approx(51.00001), 100.0, 30.0),
+    ]
+    assert "table.csv tells above_takeoff_m, altitude_m of 2 of 2 frames" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        ("alt,height", "column alt changes nothing, as neither the table nor the files say lat, lon of the same frame"),
+        ("lat,alt", "column lat changes nothing, .* say lon of the same frame; add that, or take the column away"),
+        ("yaw,roll", "column yaw changes nothing, .* say pitch, roll"),
+    ],
+)
+def test_a_column_that_completes_nothing_is_refused(tmp_path, head, said):
+    write_images(tmp_path / "files", {"a.tiff": FLOATS})
+    (tmp_path / "table.csv").write_text(f"file,{head}\na,1,2\n")
+    with pytest.raises(SceneError, match=said):
+        read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))

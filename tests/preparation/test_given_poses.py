@@ -93,3 +93,45 @@ def test_what_does_not_belong_to_the_recording_is_refused_by_name(tmp_path):
     write_model(model, {"IR_0001.jpg": pose(0)}, [("PINHOLE", (30.0, 30.0, 16.0, 16.0), 32, 32)], *points)
     refused("camera of IR_0001.jpg is one of 32x32 pixels, the frame has 40x32")
     assert len(list((tmp_path / "scene" / "images").glob("*.tiff"))) == 3  # the temperatures stay
+
+
+def test_a_visible_camera_s_pose_and_lens_are_not_taken_for_the_thermal_one_s(tmp_path):
+    source = write_flir(tmp_path / "files" / "thermal", 3)
+    names = [f"IR_{i:04d}" for i in range(3)]
+    points = np.zeros((4, 3)), np.zeros((4, 3))
+    thermal = ("PINHOLE", (30.0, 30.0, 20.0, 16.0), 40, 32)
+    visible = ("PINHOLE", (900.0, 900.0, 400.0, 320.0), 800, 640)  # of the same shape
+
+    def prepared(folders: tuple[str, str]):
+        cameras, kinds = {}, {}
+        for k, folder in enumerate(folders):
+            cameras |= {f"{folder}/{name}.{('png', 'jpg')[k]}": pose(i + 10 * k) for i, name in enumerate(names)}
+        kinds = {name: int(name.endswith("jpg")) for name in cameras}
+        write_model(tmp_path / "tool" / "sparse" / "0", cameras, [thermal, visible], *points, camera_of=kinds)
+        prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
+        return read_model(tmp_path / "scene")
+
+    for folders in (("thermal", "visible"), ("Thermal", "a")):
+        found = prepared(folders)
+        assert found.names == tuple(f"{name}.tiff" for name in names)
+        np.testing.assert_allclose(np.stack(found.viewmats), np.stack([pose(i) for i in range(3)]), atol=1e-12)
+        assert all(lens.fx == 30.0 for lens in found.lenses)
+    with pytest.raises(
+        SceneError, match="ir/IR_0000.png and rgb/IR_0000.jpg may both be the camera of .*IR_0000.jpg; give"
+    ):
+        prepared(("ir", "rgb"))
+
+
+def test_greys_that_become_temperatures_leave_no_image_under_the_same_name(tmp_path):
+    grey = np.random.default_rng(0).integers(0, 255, (3, 32, 40)).astype(np.uint8)
+    source = write_images(tmp_path / "files", {f"f{i}.png": image for i, image in enumerate(grey)})
+    kind = ("PINHOLE", (30.0, 30.0, 20.0, 16.0), 40, 32)
+    points = np.zeros((4, 3)), np.zeros((4, 3))
+    write_model(tmp_path / "tool" / "sparse" / "0", {f"f{i}.png": pose(i) for i in range(3)}, [kind], *points)
+    for ending, bounds in (("png", None), ("tiff", [10.0, 30.0]), ("png", None)):
+        given = GivenPoses(str(tmp_path / "tool"))
+        prepare(str(source), tmp_path / "scene", **PLAIN, bounds_c=bounds, poses=given)
+        assert read_model(tmp_path / "scene").names == tuple(f"f{i}.{ending}" for i in range(3))
+        images = {p.name for p in (tmp_path / "scene" / "images").glob("*") if p.suffix != ".json"}
+        assert images == {f"f{i}.{ending}" for i in range(3)}
+        assert (tmp_path / "scene" / "temperature_bounds.json").exists() == (bounds is not None)

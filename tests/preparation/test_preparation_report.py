@@ -86,3 +86,12 @@ def test_names_are_shown_as_they_are(tmp_path):
 def test_the_page_has_its_sections_in_order(tmp_path):
     page = report.write_report(tmp_path / "scene", [report.Section("One", ["a"]), report.Section("Two", ["b"])])
     assert page.read_text().index("## One") < page.read_text().index("## Two")
+
+
+def test_conditions_that_change_nothing_make_no_surface_temperatures(tmp_path):
+    image = np.linspace(10, 30, 64, dtype=np.float32).reshape(8, 8)
+    frames = read_frames(write_images(tmp_path / "files", {"a.tiff": image}))
+    for given, apparent in ((Given(emissivity=1.0, distance_m=0.0), True), (Given(distance_m=10.0), False)):
+        settled = [given.settled(frame) for frame in frames]
+        text = "\n".join(report.radiometry(settled, prepared(settled, tmp_path / "scene"), Uncertainty()).lines)
+        assert ("Apparent temperatures" in text) == apparent and ("Temperatures of surfaces" in text) != apparent

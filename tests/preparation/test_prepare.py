@@ -170,3 +170,10 @@ def test_the_command_prepares_and_goes_on(tmp_path):
     (tmp_path / "scene.txt").touch()
     said = succeeds([*command[:2], "target=scene.txt"], tmp_path, 1)
     assert "scene.txt: File exists; a file is where a folder is to be" in said and "Traceback" not in said
+
+
+def test_settings_that_change_nothing_are_refused(tmp_path):
+    source = write_images(tmp_path / "files", {"a.tiff": np.full((8, 8), 20.0, np.float32)})
+    with pytest.raises(SceneError, match="conditions.reflected_c=5 changes nothing while emissivity is 1"):
+        prepare(str(source), tmp_path / "scene", **{**PLAIN, "conditions": {"reflected_c": 5}})
+    assert not (tmp_path / "scene").exists()

@@ -121,3 +121,20 @@ def test_dead_pixels_are_masked_in_every_image_and_sound_ones_are_not(tmp_path):
     few = Writer(tmp_path / "few", Uncertainty(), False)
     assert few.find_dead_pixels(frames[:3]) == 0  # too few to tell
     assert few.write(frames[0])[0]["quantiles"][-1] == 30.0
+
+
+def test_counts_that_files_do_not_hold_cannot_be_kept(tmp_path):
+    frames = read_frames(write_images(tmp_path / "files", {"a.tiff": np.full((8, 8), 20.0, np.float32)}))
+    with pytest.raises(
+        SceneError, match="keep_counts=true changes nothing: files such as .*a.tiff hold no 16-bit counts"
+    ):
+        written(frames, tmp_path / "scene", keep_counts=True)
+
+
+def test_what_a_stopped_preparation_left_half_written_is_taken_away(tmp_path):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    written(frames, tmp_path / "scene")
+    (tmp_path / "scene" / ".partial").mkdir()
+    (tmp_path / "scene" / ".partial" / f"{frames[0].name}.tiff").write_bytes(b"half")  # of other conditions
+    assert written(frames, tmp_path / "scene")[1] == [False] * 4
+    assert not (tmp_path / "scene" / ".partial").exists()

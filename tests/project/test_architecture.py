@@ -83,7 +83,7 @@ DOORS = {
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
     "pycolmap": {"datamodules/formats", "preparation"},
     "pvlib": {"datamodules"},
-    "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io", "preparation"},
+    "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io", "metrics", "preparation"},
     "numba": {"kernels"},
     "gsplat": {"renderers"},
     "triton": {"kernels/gpu"},

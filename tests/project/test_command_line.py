@@ -9,7 +9,7 @@ import hydra
 import numpy as np
 import pytest
 from commands import succeeds
-from hydra.errors import OverrideParseException
+from hydra.errors import InstantiationException, OverrideParseException
 from omegaconf import OmegaConf
 
 from heatsplat import cli, composition
@@ -230,6 +230,77 @@ def test_a_value_that_only_a_scene_shows_to_be_wrong_is_told_in_a_sentence(tmp_p
     output = command("train", "method=etgs", *TINY, "thermal.frequencies=-1", "hydra.run.dir=run", cwd=tmp_path, code=1)
     assert "frequencies must be a whole number of at least 0, got -1" in output and "Traceback" not in output
     assert "Traceback" in (tmp_path / "run" / "FAILED").read_text()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (
+            "method=etgs stages=frozen_geometry",
+            "stages=frozen_geometry needs first_steps, which method=etgs does not have: choose method=ntr_gaussian or thermalgs "
+            r"or thermogs, or add \+first_steps=\.\.\.",
+        ),
+        ("method=etgs stages=fine_tuning", "stages=fine_tuning needs first_steps, .*: choose method=mftg, or"),
+        ("method=3dgs loss=mftg", "loss=mftg needs first_steps, .*: choose method=mftg, or"),
+        ("method=3dgs loss=supirgs", "loss=supirgs needs super_resolution, .*: choose method=supirgs, or"),
+        ("method=3dgs loss=srgs", "loss=srgs needs super_resolution, .*: choose method=srgs, or"),
+        ("method=etgs density=first_stage", "density=first_stage needs grown.sfm, .*: choose method=ntr_gaussian or"),
+        ("method=msmg density=first_stage", "density=first_stage needs grown.separate, .*: choose method=ntr_gaussian or"),
+        ("method=thermogs init=voxels", "init=voxels needs first_stage.voxels, and first_stage has sfm, .*: leave init=voxels"),
+        ("method=etgs name='${nowhere}'", r"name needs nowhere, which method=etgs does not have: add \+nowhere="),
+    ],
+)  # fmt: skip
+def test_an_option_of_other_methods_is_told_what_it_needs_and_which_have_it(overrides, told):
+    with pytest.raises(ValueError, match=f"^{told}"):
+        composition.compose(overrides.split())
+
+
+def test_an_option_of_other_methods_is_told_in_a_sentence(tmp_path):
+    output = command("train", "method=etgs", "stages=fine_tuning", *TINY, "hydra.run.dir=run", cwd=tmp_path, code=1)
+    assert (
+        "stages=fine_tuning needs first_steps" in output and "Traceback" not in output and "object_type" not in output
+    )
+
+
+def command_that_raises(error, monkeypatch):
+    """A command whose job fails with an error of Hydra's."""
+    monkeypatch.setattr(cli.hydra, "main", lambda **_: lambda job: lambda: job(None))
+    monkeypatch.setattr(cli.sys, "argv", ["train", "method=etgs"])
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def train(config):
+        raise error
+
+    return cli._command(train)
+
+
+def failed(**settings):
+    with pytest.raises(InstantiationException) as failure:
+        composition.build({"thermal": settings})
+    return failure.value
+
+
+def test_settings_that_a_class_does_not_take_are_told_in_a_sentence(monkeypatch):
+    for settings, told in (
+        (
+            {"_target_": "heatsplat.losses.compose.Weighted", "term": None, "wait": 1},
+            "unexpected keyword argument 'wait'",
+        ),
+        ({"_target_": "heatsplat.losses.compose.Weighted"}, "missing 1 required positional argument: 'term'"),
+        ({"_target_": "heatsplat.density.anchors.Anchors", "every": "abc"}, "'<' not supported between"),
+    ):
+        with pytest.raises(SystemExit, match=rf"^thermal: .*{told}.* \(HYDRA_FULL_ERROR=1 shows where\)$"):
+            command_that_raises(failed(**settings), monkeypatch)()
+
+
+def test_a_mistake_of_ours_keeps_its_traceback(monkeypatch):
+    for target, settings in (
+        ("losses.schedules.linear", {"progress": "abc", "start": 0.0, "end": 1.0}),  # not in a constructor
+        ("losses.compose.Loss", {"terms": 5}),  # 'int' object has no attribute 'items'
+    ):
+        error = failed(_target_=f"heatsplat.{target}", **settings)
+        with pytest.raises(InstantiationException):
+            command_that_raises(error, monkeypatch)()
 
 
 def test_results_stay_those_of_their_settings(finished):

@@ -393,12 +393,29 @@ def test_gaussians_that_are_still_to_come_are_counted_before_they_come(counts, d
     assert clock._dearer(0.0) == pytest.approx(dearer)
 
 
-def test_rounds_begin_at_their_own_steps_however_slow_the_machine():
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.5])
+def test_rounds_begin_at_their_own_steps_and_the_last_is_spread_with_its_growth(factor):
     module = a_module()
     module.schedule = Schedule(1000, restarts=[400])
-    _, module = simulate(a_clock(), lambda step: 1.5 * 9.0 / 1000, module=module)
+    trainer, module = simulate(a_clock(), lambda step: factor * 9.0 / 1000, module=module)
+    found, share = module.results.run["budget"], (trainer.global_step - 400) / 600
+    assert abs(found["off_percent"]) < 2 and found["schedule_done"] > 0.99
+    assert found["notes"] == a_clock().plan["reasons"]
+    assert trainer.rates[:399] == pytest.approx([0.01 ** (step / 1000) for step in range(1, 400)])
+    assert module.density.stop == pytest.approx(480 * share, rel=0.1)  # counted in the round
+
+
+@pytest.mark.parametrize("factor", [2.0, 2.5, 4.0])
+def test_the_last_round_is_trained_even_where_the_first_took_all_the_time(factor, caplog):
+    module = a_module()
+    module.schedule = Schedule(1000, restarts=[500])
+    trainer, module = simulate(a_clock(), lambda step: factor * 9.0 / 1000, module=module)
     found = module.results.run["budget"]
-    assert module.density.times() == {} and abs(found["off_percent"]) < 2 and found["schedule_done"] > 0.99
+    assert trainer.global_step == 667 and found["schedule_done"] > 0.999
+    assert module.density.stop == pytest.approx(160, abs=2)
+    assert found["off_percent"] == pytest.approx(100 * (0.667 * factor - 1), rel=0.1)
+    told = "the machine was too slow for the 500 steps of earlier rounds, so the last one has 167 of 500 planned steps"
+    assert told in found["notes"][-1] and f"budget: {told}" in caplog.text
 
 
 def test_a_moved_plan_goes_on_as_it_was_after_a_stop():
@@ -572,6 +589,13 @@ def test_a_budget_is_planned_from_the_curves_that_it_is_pointed_at(tmp_path, mon
     left_by(tmp_path, other, 50, 100.0)  # its plan is kept by a run that is planned from the same curves only
     assert planned("budget_curves=curves.csv")["budget"] == other["budget"]
     assert planned()["budget"]["decay"] != 0.4
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_plan_that_leaves_nothing_after_the_first_stage_is_refused(tmp_path, monkeypatch):
+    Hours(monkeypatch, 1.0)
+    with pytest.raises(SceneError, match=r"first_steps=20000 leaves no step of max_steps=\d+ .* \(a longer budget\)"):
+        prepared(tmp_path, "method=mftg", "first_steps=20000")
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -5,11 +5,12 @@ import torch
 from running import TINY
 
 import heatsplat
+from heatsplat.composition import build
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
-from heatsplat.runs.resume import differences
+from heatsplat.runs.resume import differences, on_scene, resumed
 from heatsplat.training.checkpoints import load_checkpoint
 
 QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "trainer.limit_test_batches=1")
@@ -104,11 +105,58 @@ def test_clipping_and_a_plateau_are_settings_that_are_learned_by(trained):
 
 
 @pytest.mark.parametrize("changed", ["data.downscale=2", "data.scene=cooling"])
-def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed, tmp_path):
+def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed):
+    """Of a folder elsewhere (data.root) only its scene tells."""
     folder, _, _ = trained
-    config = heatsplat.compose([*QUICK, f"ckpt={folder}/checkpoints/last.ckpt", changed])
+    config = went_on(folder)
+    there = build(heatsplat.compose([*QUICK, changed])["data"]).scene
     with pytest.raises(SceneError, match=r"was trained on static in \d+ x \d+ pixels, and this is (static|cooling) in"):
-        heatsplat.train(config, tmp_path)
+        on_scene(config, there)
+
+
+def went_on(folder, *changed):
+    """The configuration of a run that goes on from the last checkpoint of the run in a folder."""
+    config = heatsplat.compose([*QUICK, f"ckpt={folder}/checkpoints/last.ckpt", *changed])
+    return resumed(checked(config), folder / "on")
+
+
+@pytest.mark.parametrize(
+    ("changed", "keys"),
+    [
+        ("optim.means=1", "optim.means"),
+        ("optim.means=1 max_steps=4000", "optim.means"),
+        ("loss=squared", "loss.terms.photometric, loss.terms.squared"),
+        ("sensor=frame_offset", "sensor.parts.frame_offset"),
+        ("density=adaptive", "density._target_, .*"),
+        ("data.split=block", "data.split"),
+        ("cap_max=700", "cap_max, density.cap_max"),
+        ("+trainer.gradient_clip_val=1", "trainer.gradient_clip_val"),
+    ],
+)
+def test_a_checkpoint_goes_on_with_the_settings_that_it_was_trained_with(trained, changed, keys):
+    with pytest.raises(SceneError, match=f"last.ckpt was trained with another {keys}: give what it was trained with"):
+        went_on(trained[0], *changed.split())
+
+
+def test_a_checkpoint_goes_on_for_longer_with_all_that_follows_from_the_length(trained):
+    """Not steps alone: of 8 steps an update takes 1 view, of 2000 it takes 5."""
+    folder, config, _ = trained
+    longer = went_on(folder, "max_steps=2000", "doctor=false", "renderer=cpu")
+    assert longer["ckpt"] and longer["optim"]["accumulate"] == 5 * config["optim"]["accumulate"]
+
+
+def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they_are_asked_for(
+    trained, tmp_path, caplog
+):
+    folder, _, _ = trained
+    stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")
+    for settings in (stored["heatsplat"]["config"], stored["heatsplat"]["config"]["module"]):
+        settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "averaged"}
+    torch.save(stored, tmp_path / "old.ckpt")
+    assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt"]), tmp_path)["ckpt"]
+    assert "old.ckpt is of an older heatsplat without optim.averaged: they count from here on" in caplog.text
+    with pytest.raises(SceneError, match="was trained with another optim.averaged"):
+        resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "optim.averaged=0.2"]), tmp_path)
 
 
 def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
@@ -182,6 +230,10 @@ def test_a_first_stage_of_two_lengths_is_refused(method):
     ):
         checked(heatsplat.compose([f"method={method}", "thermal.first_steps=18", "max_steps=30"]))
     checked(heatsplat.compose([f"method={method}", "first_steps=18", "max_steps=30"]))
+    with pytest.raises(
+        SceneError, match="first_steps=30 leaves no step of max_steps=30 .*fewer first_steps, or more max"
+    ):
+        checked(heatsplat.compose([f"method={method}", "first_steps=30", "max_steps=30"]))
 
 
 def test_what_the_machine_lacks_is_told_before_data_are_read(monkeypatch):

@@ -12,9 +12,10 @@ from heatsplat.losses.teacher import load_teacher
 from heatsplat.studies import teacher
 from heatsplat.studies.teacher import images_of, made_small, patches, run, train
 
+NETWORK = {"dim": 8, "depths": [2], "heads": 2, "window": 4}
 OPTIONS = {
     "factor": 2, "steps": 12, "batch": 4, "patch": 8, "rate": 2e-3, "seed": 0,
-    "network": {"dim": 8, "depths": [2], "heads": 2, "window": 4},
+    "network": NETWORK,
 }  # fmt: skip
 DATA = partial(Synthetic, size="tiny", frames=3)
 
@@ -72,10 +73,18 @@ def test_training_lowers_the_error():
         ({"steps": 0}, "study.steps must be a whole number, 1 or more, got 0"),
         ({"batch": "abc"}, "study.batch must be a whole number, 1 or more, got abc"),
         ({"factor": 0}, "study.factor must be a whole number"),
+        ({"rate": "abc"}, "study.rate"),
+        ({"rate": 0}, "study.rate must be above 0, or nothing is learned, got 0"),
+        ({"network": NETWORK | {"heads": 5}}, "dim=8 channels .* study.network.heads=5: give a multiple of 5"),
+        ({"network": NETWORK | {"heads": 0}}, "study.network.heads must be a whole number, 1 or more, got 0"),
+        ({"network": NETWORK | {"depths": [2, "a"]}}, "study.network.depths must be a whole number"),
+        ({"network": NETWORK | {"depths": []}}, r"study.network.depths=\[\] has nothing in it"),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_learned(wrong, message, tmp_path, monkeypatch):
     monkeypatch.setattr(teacher, "train", None)
+    if "held_out" not in wrong:
+        monkeypatch.setattr(teacher, "images_of", lambda *_: pytest.fail("scenes were rendered"))
     with pytest.raises(ValueError, match=message):
         run(tmp_path, DATA, **{"scenes": ["room_0"], "held_out": "room_1"} | OPTIONS | wrong)
 

@@ -115,7 +115,7 @@ def test_a_trained_field_is_loaded_and_rendered_and_has_a_depth(trained):
 
 
 def test_what_needs_gaussians_is_refused_with_a_remedy(trained):
-    _, _, module = trained
+    _, folder, module = trained
 
     def begun(*overrides):
         build(compose([*TINY, *overrides])["module"]).attach(module.scene)
@@ -137,7 +137,15 @@ def test_what_needs_gaussians_is_refused_with_a_remedy(trained):
             begun("method=instant_ngp", f"{name}={other}")
     with pytest.raises(SceneError, match="Static has Gaussians, and VolumeRenderer is for fields: leave renderer"):
         begun("method=3dgs", "renderer=volume")
+    with pytest.raises(SceneError, match="leave renderer to the method, and thermal with it"):
+        begun("method=instant_ngp", "thermal=static")
     with pytest.raises(
         SceneError, match="Lattice takes single pixels out of images, .*frame_offset.*: give sensor=none"
     ):
         begun("method=instant_ngp", "sensor=frame_offset")
+    with pytest.raises(SceneError, match="HashField is a field without Gaussians, .* ShortLists .* overlap=none"):
+        begun("method=instant_ngp", "overlap=short_lists")
+    with pytest.raises(SceneError, match="HashField is a field without Gaussians, .* optim.decoupled .* optim=adam"):
+        begun("method=instant_ngp", "optim=adamw")
+    with pytest.raises(SceneError, match="last.ckpt holds a field without Gaussians: give a .ply, or the checkpoint"):
+        begun("method=3dgs", "init=pretrained", f"init.path={folder}/checkpoints/last.ckpt")

@@ -127,7 +127,7 @@ def test_a_run_learns_and_a_resumed_one_equals_it_bit_for_bit(trained, tmp_path)
 
 
 def test_what_needs_gaussians_that_stay_is_refused_with_a_remedy(trained):
-    _, _, module = trained
+    _, folder, module = trained
 
     def begun(*overrides):
         build(compose([*TINY, *overrides])["module"]).attach(module.scene)
@@ -143,9 +143,15 @@ def test_what_needs_gaussians_that_stay_is_refused_with_a_remedy(trained):
     ):
         begun("method=scaffold_gs", "density=adaptive")
     with pytest.raises(SceneError, match=r"Static has Gaussians, and Anchors is for anchors"):
-        begun("method=3dgs", "density=anchors", "density.voxel=null")
+        begun("method=3dgs", "density=anchors")
     with pytest.raises(SceneError, match="which no filter of Gaussians in space knows: give smoothing=none"):
         begun("method=scaffold_gs", "smoothing=sampling")
+    pretrained = "init=pretrained", f"init.path={folder}/checkpoints/last.ckpt"
+    with pytest.raises(
+        SceneError, match="last.ckpt holds anchors, whose Gaussians are made for each view: give a .ply"
+    ):
+        begun("method=3dgs", *pretrained)
+    begun("method=scaffold_gs", *pretrained)  # which takes them for what they are
     with pytest.raises(ValueError, match="TimeMlp changes what Gaussians emit, and those of Scaffold are made anew"):
         TimeMlp(Scaffold())
 

@@ -107,6 +107,16 @@ def test_methods_train_with_the_papers_settings_and_grow_without_a_limit(method,
     assert module.schedule.end == compose([f"method={method}", "recipe=published"])["max_steps"]
 
 
+def test_harmonics_join_within_a_shortened_run_and_where_3dgs_adds_them_in_a_whole_one(tmp_path):
+    """In a short run, degrees that joined after a fixed number of steps would all stay zero."""
+    whole = compose(["method=3dgs", "recipe=published"])["thermal"]
+    assert (whole["sh_degree"], whole["sh_degree_interval"]) == (3, 1000)
+    module, _ = run(
+        tmp_path, "method=3dgs", "recipe=published", *TINY, "max_steps=30", "trainer.limit_val_batches=0", "test=false"
+    )
+    assert (module.splats["sh_rest"].abs().amax((0, 2)) > 0).all()  # every coefficient of all three degrees
+
+
 @pytest.mark.parametrize(("method", "preset"), TURNS)
 def test_every_method_trains_with_a_preset(method, preset, tmp_path):
     """First steps of the preset's own schedule; presets take turns."""

@@ -69,8 +69,15 @@ def test_losses_are_those_of_a_model_for_each_image(scene, tmp_path):
     assert halves["smoothness"] == pytest.approx(0.3 * 2 * differences / still.numel(), rel=1e-3)
 
 
-def test_a_run_scores_both_images(tmp_path):
+def test_images_that_no_term_compares_are_warned_of(tmp_path, caplog):
+    given = (*SHORT, "max_steps=1", "test=false", "trainer.limit_val_batches=0", "loss=photometric")
+    run(tmp_path, *given, "method=3dgs_ir")
+    assert "no term of loss.terms compares rgb images: they are scored, but not learned" in caplog.text
+
+
+def test_a_run_scores_both_images(tmp_path, caplog):
     module, _ = run(tmp_path, *SHORT, "method=3dgs_ir", "max_steps=2", "trainer.val_check_interval=2")
+    assert "no term of loss.terms" not in caplog.text
     found = json.loads((tmp_path / "metrics.json").read_text())["test"]
     assert found["psnr"] > 5 and found["rgb_psnr"] > 5
     assert module.splats["sh0"].shape[1:] == (1, 4) and module.splats["sh_rest"].shape[1:] == (15, 4)

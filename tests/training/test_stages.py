@@ -1,6 +1,7 @@
 """Stages: which parameters are frozen at which steps, and that nothing of them changes then."""
 
 import logging
+import math
 
 import pytest
 import torch
@@ -82,6 +83,18 @@ def snapshot(optimizer):
 
 def moved(before, after):
     return [name for name in before if not torch.equal(before[name]["value"], after[name]["value"])]
+
+
+def test_what_is_frozen_until_the_run_ends_tells_from_when():
+    stretches = {
+        "late": Freeze(["opacity_*"], start=40),
+        "end": Freeze(["means", "opacity_logits"], start=25),
+        "first": Freeze(["opacity_logits"], stop=10),
+        "turns": Freeze(["opacity_logits"], start=5, cycle=4, share=0.5),
+        "column": Freeze(["opacity_logits[1]"], start=3),
+    }
+    assert Stages(stretches).held_from("opacity_logits") == 25
+    assert Stages(stretches, restarts=[20]).held_from("opacity_logits") == Stages({}).held_from("means") == math.inf
 
 
 def test_what_is_frozen_keeps_value_and_moments_and_pays_no_penalty():

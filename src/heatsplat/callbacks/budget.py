@@ -15,11 +15,12 @@ from heatsplat.contracts import SceneError
 
 log = logging.getLogger("heatsplat")
 
-SETTLED = 0.5  # share of the schedule after which no Gaussian is added (density.stop)
+SETTLED = 0.5  # share of a round after which no Gaussian is added (density.stop)
 EARLY = 0.1  # share of the time in which the plan is followed as it is: first steps are slow
 WINDOW = 0.05  # share of the time over which the pace is measured: a machine may become slower at any moment
-LATE = 0.4  # share of the schedule from which on growing is left to end as it goes
+LATE = 0.4  # share of a round from which on growing is left to end as it goes
 OFF = 0.1  # share of the steps left by which the plan may miss the time before it is moved, while Gaussians grow
+ROUND = 1 / 3  # share of its planned steps that the last of several rounds has, whatever the time
 LOOKS = 400  # looks at the clock in a run of the planned length
 
 
@@ -32,8 +33,9 @@ class BudgetClock(pl.Callback):
     slower makes fewer steps, with as many Gaussians in the end. What those that are still to come will add to a step is counted
     by the calibration.
 
-    Rounds (``stages.restarts``) begin at steps of their own, and growing with them: of such a run only the second half is
-    spread.
+    Rounds (``stages.restarts``) begin at steps of their own: of such a run only the last round is spread. A machine that is
+    much slower than the calibration would have no time left for it; it then has a third of its steps, beyond the budget, with a
+    warning: what it is there for was not trained at all otherwise.
 
     Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
     budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its schedule.
@@ -68,21 +70,24 @@ class BudgetClock(pl.Callback):
         self._seen.append((step, spent, len(module.splats)))
         while len(self._seen) > 2 and spent - self._seen[1][1] > WINDOW * self.seconds:
             self._seen.popleft()
-        progress, step_s, left = schedule.progress(step), self._step_s(), self.seconds - spent
-        if left <= 0:
+        if step < max(schedule.restarts, default=0):
+            return
+        least = _least(schedule)
+        progress, step_s, left = schedule.round_progress(step), self._step_s(), self.seconds - spent
+        if left <= 0 and step >= least:
             schedule.end_at(step, step)
         elif step_s is None:
             return
         elif progress >= SETTLED:
-            schedule.end_at(step, step + left / step_s)
-        elif spent >= EARLY * self.seconds and progress < LATE and not schedule.restarts:
-            self._move(module, step, step + left / (step_s * self._dearer(progress)))
+            schedule.end_at(step, max(step + left / step_s, least))
+        elif spent >= EARLY * self.seconds and progress < LATE:
+            self._move(module, step, max(step + left / (step_s * self._dearer(progress)), least))
 
     def _move(self, module: pl.LightningModule, step: int, end: float) -> None:
         """Spreads the rest of the schedule, and of growing, over the steps up to ``end``, unless it ends near there."""
         planned = module.schedule.end
         if abs(end - planned) > OFF * (planned - step):
-            module.density.retime(step, (end - step) / (planned - step))
+            module.density.retime(module.schedule.round_step(step), (end - step) / (planned - step))
             module.schedule.end_at(step, end)
             self._moved = step if self._moved is None else self._moved
 
@@ -131,7 +136,7 @@ class BudgetClock(pl.Callback):
             "twice_gain_db": self.plan["twice_gain_db"],
             "twice_steps": self.plan["twice_steps"],
             "twice": self.twice,
-            "notes": self.plan["reasons"],
+            "notes": [*self.plan["reasons"], *self._beyond(trainer.global_step, module.schedule)],
         }
         module.results.run["budget"] = found
         log.info(
@@ -143,6 +148,18 @@ class BudgetClock(pl.Callback):
                 "budget: training stopped when %.0f %% of its schedule was done; the pace was misjudged", 100 * done
             )
 
+    def _beyond(self, steps: int, schedule: Any) -> list[str]:
+        """A sentence, and a warning, where there was no time left for the last of several rounds."""
+        if not schedule.restarts or steps > round(_least(schedule)) or self._spent() <= self.seconds:
+            return []
+        first = schedule.restarts[-1]
+        told = (
+            f"the machine was too slow for the {first} steps of earlier rounds, so the last one has {steps - first} of "
+            f"{schedule.steps - first} planned steps, beyond the budget; give more time"
+        )
+        log.warning("budget: %s", told)
+        return [told]
+
     # Resume ----------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
@@ -150,3 +167,9 @@ class BudgetClock(pl.Callback):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._moved = state.get("moved")  # older states know other numbers
+
+
+def _least(schedule: Any) -> float:
+    """Steps that a run of several rounds has at least; 0 of one."""
+    begin = max(schedule.restarts, default=0)
+    return begin + ROUND * (schedule.steps - begin) if begin else 0.0

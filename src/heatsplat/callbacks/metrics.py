@@ -10,11 +10,11 @@ import pytorch_lightning as pl
 from torch import Tensor
 
 from heatsplat.callbacks.board import board
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.io.results import CURVE_FILE
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.definitions import DEFINITIONS, IMAGE_SCORES
-from heatsplat.metrics.lpips import LpipsUnavailable, load_lpips
+from heatsplat.metrics.lpips import FILES, LpipsUnavailable, load_lpips
 from heatsplat.metrics.mae_roi import scene_threshold
 from heatsplat.metrics.scores import Scorer, mean_of_images
 
@@ -39,7 +39,7 @@ class QualityMetrics(pl.Callback):
 
     Args:
         lpips_net: "alex" or "vgg"; values of one net say nothing about the other's. None leaves LPIPS out.
-        lpips_weights: file of the backbone's weights; None looks in torch's hub folder.
+        lpips_weights: file of the backbone's weights; None looks in torch's hub folder, and LPIPS is null if that has none.
         lpips_in_validation: LPIPS costs more than all other scores together, so validation goes without it by default.
         cold_scene: the scene's object is colder than its surroundings (for ThermoNeRF's region of interest).
     """
@@ -59,8 +59,21 @@ class QualityMetrics(pl.Callback):
         self._rows: list[dict[str, Any]] = []
         self._empty = 0  # images that have one value everywhere
         self._no_lpips = "not asked for"
+        self._checked = False
         self._losses: Tensor | float = 0.0  # of the steps since the last row of the curve
         self._steps = 0
+
+    def setup(self, trainer: pl.Trainer, module: pl.LightningModule, stage: str) -> None:
+        """Raises SceneError, before the first step, where LPIPS was asked for by a name or file that cannot serve."""
+        if self._checked or self.lpips_net is None:
+            return
+        check_option("callbacks.metrics.lpips_net", self.lpips_net, (*FILES, None), SceneError)
+        if self.lpips_weights is not None:
+            try:
+                load_lpips(self.lpips_net, self.lpips_weights)
+            except LpipsUnavailable as error:
+                raise SceneError(f"callbacks.metrics.lpips_weights={self.lpips_weights}: {error}") from error
+        self._checked = True  # by fit; a file that is gone once all is learnt costs no test
 
     # Scores of one image ---------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.contracts import Camera, RenderOutput, SceneError
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
@@ -29,7 +29,8 @@ class Adaptive(DensityControl):
         duplicate_scale: Gaussians with a largest semi-axis up to this (times extent) are duplicated, larger ones split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed.
         prune_scale: after the first opacity reset, Gaussians with a semi-axis above this (times extent) are removed.
-        reset_every: steps between opacity resets; none at or after ``stop``. None: no resets.
+        reset_every: steps between opacity resets; none at or after ``stop``, nor while a stage holds opacities still, nor so
+            shortly before that they would not come back. None: no resets.
         reset_opacity: opacities are lowered to at most this, as rendered.
         cap_max: never more Gaussians than this, infinity for no limit; the strongest gradients grow first.
         multiple: nor more than so many times the Gaussians of the start; None: ``cap_max`` alone.
@@ -91,7 +92,7 @@ class Adaptive(DensityControl):
         if pull is None:
             return
         pull = pull[ids] * pull.new_tensor([camera.width / 2, camera.height / 2])
-        state["gradient"].index_add_(0, ids, pull.norm(dim=1))
+        state["gradient"].index_add_(0, ids, pull.norm(dim=1).to(state["gradient"]))
         state["seen"].index_add_(0, ids, torch.ones_like(ids, dtype=state["seen"].dtype))
 
     @torch.no_grad()
@@ -103,16 +104,21 @@ class Adaptive(DensityControl):
             removed = self._prune(cloud, step, extent)
             for statistic in cloud.state.values():
                 statistic.zero_()
-        reset = self.reset_every is not None and 0 < step + 1 < self.stop and (step + 1) % self.reset_every == 0
-        if reset:
+        reset = 0 < step + 1 == self._last_reset(step) and cloud.splats["opacity_logits"].grad is not None
+        if reset:  # and no stage holds them still
             cloud.lower_opacities(self.reset_opacity)
         return DensityChange(added, removed, reset) if due or reset else None
 
     def settled(self, step: int) -> bool:
-        if self.reset_every is None:
-            return True
-        last = min(step + 1, self.stop - 1) // self.reset_every * self.reset_every
+        last = self._last_reset(step)
         return last <= 0 or step + 1 - last >= RECOVERY * self.every
+
+    def _last_reset(self, step: int) -> int:
+        """Steps after which opacities were reset last, up to ``step`` + 1; 0 or less before the first."""
+        if self.reset_every is None:
+            return 0
+        last = min(step + 1, self.stop - 1, self.opacities_until - RECOVERY * self.every)
+        return last // self.reset_every * self.reset_every
 
     def _visible(self, opacities: Tensor) -> Tensor:
         """Which Gaussians [N] of opacities [M, N] need not be pruned as transparent."""
@@ -157,12 +163,12 @@ class Adaptive(DensityControl):
 
     def _prune(self, cloud: Cloud, step: int, extent: float) -> int:
         keep = self._visible(cloud.splats.opacities)
-        if self.reset_every is not None and step + 1 > self.reset_every:
+        if self._last_reset(step - 1) > 0:
             keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
         keep &= torch.isfinite(cloud.splats.means).all(dim=1)
         removed = int((~keep).sum())
         if removed == len(cloud):
-            raise RuntimeError(
+            raise SceneError(
                 f"density control would prune all {removed} Gaussians at step {step}: each has an opacity below "
                 f"{self.prune_opacity}. Lower the learning rates or density.prune_opacity, or start from more points."
             )

@@ -118,7 +118,7 @@ class Anchors(DensityControl):
             state[name][known] = 0
         removed = int(gone.sum())
         if removed == len(cloud):
-            raise RuntimeError(
+            raise SceneError(
                 f"density control would prune all {removed} anchors at step {step}: the opacities of the Gaussians of each "
                 f"sum up to less than {self.prune_opacity}. Lower the learning rates or density.prune_opacity."
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,7 @@ class DensityControl:
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
         moments, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
         shortest: what an interval has at least.
+        opacities_until: step from which on a stage holds opacities still until the run ends, as the run tells it; infinity: none.
     """
 
     absgrad: bool = False
@@ -42,6 +44,7 @@ class DensityControl:
     moments: tuple[str, ...] = ()
     intervals: tuple[str, ...] = ()
     shortest: int = 1
+    opacities_until: float = math.inf
     _times: dict[str, Any] = {}  # of those attributes, not rounded, once they were moved
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:

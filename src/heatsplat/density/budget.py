@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_laplace
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
+from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError, check_option
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud, LongAxisSplit
 from heatsplat.physics.noise import MIN_NOISE, noise_of_views
@@ -229,7 +229,7 @@ class Budget(DensityControl):
     def _keep(self, cloud: Cloud, mask: Tensor, step: int) -> int:
         removed = int((~mask).sum())
         if removed == len(cloud):
-            raise RuntimeError(
+            raise SceneError(
                 f"density control would remove all {removed} Gaussians at step {step}: none is more opaque than "
                 f"{self.prune_opacity} and shown by the training views. Lower the learning rates or density.prune_opacity, "
                 "or start from more points."

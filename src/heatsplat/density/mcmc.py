@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import SceneError
 from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
@@ -88,7 +89,7 @@ class MCMC(DensityControl):
         alive = (opacities > self.dead_opacity) & finite
         before, living = len(cloud), int(alive.sum())
         if living == 0:
-            raise RuntimeError(
+            raise SceneError(
                 f"density control finds all {before} Gaussians dead at step {step}: each has an opacity up to "
                 f"{self.dead_opacity}. Lower the learning rates or the penalty on opacities, or start from more points."
             )

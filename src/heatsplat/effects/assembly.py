@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
@@ -252,34 +252,8 @@ def _set(template: Mapping[str, Any], effects: Sequence[Effect], verdicts: Mappi
     return {key: value for key, value in settings.items() if value != SCENE_SAYS}
 
 
-def asked(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run's configuration, as composed, says of effects, their parts and the loss; pricing decides nothing."""
-    effects = {key: value for key, value in config["effects"].items() if key not in ("price", "least_db_per_ms")}
-    return deepcopy({"effects": effects, "loss": config["loss"]})
-
-
-def changed_keys(config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
-    """Keys of what was asked for (``asked``) that differ between a configuration and that of an earlier run.
-
-    Whole numbers do not count where "max_steps" differs: many are shares of it.
-    """
-    before, now = (dict(_leaves(one)) for one in (stored.get("asked", asked(config)), asked(config)))
-    longer = config["max_steps"] != stored.get("max_steps")
-    keys = [key for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
-    return [key for key in keys if not (longer and all(type(one.get(key)) is int for one in (before, now)))]
-
-
-def _leaves(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of nested mappings by dotted key."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
-
-
 def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's configuration with these parts in it, the verdicts that led to them, and what was asked for.
+    """A run's configuration with these parts in it and the verdicts that led to them.
 
     Args:
         config: as composed.
@@ -301,7 +275,6 @@ def filled(config: Mapping[str, Any], parts: Mapping[str, Any], verdicts: Mappin
         "module": {**config["module"], **changed, **finer},
         "effects": effects,
         "verdicts": dict(verdicts),
-        "asked": asked(config),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -31,6 +32,14 @@ class Sighting:
     camera: Camera
     depth: Tensor
     mask: Tensor | None = None
+
+    @cached_property
+    def around(self) -> tuple[Tensor, Tensor]:
+        """The nearest and the farthest depth [H, W] of each pixel and its neighbours: every new view asks for them."""
+        nearest, farthest = (
+            sign * max_pool2d(sign * self.depth[None, None], 3, stride=1, padding=1)[0, 0] for sign in (-1.0, 1.0)
+        )
+        return nearest, farthest
 
 
 def surface_depth(depth: Tensor, alpha: Tensor) -> Tensor:
@@ -77,37 +86,49 @@ def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Ten
     rays = pixels @ torch.linalg.inv(camera.K).T
     z = depth.detach().cpu().double().reshape(-1)
     is_open = z.isinf()
-    reach = FAR * max([float((other.camera.center - camera.center).norm()) for other in sightings] + [1.0])
-    points = (rays * torch.where(is_open, reach, z)[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    order, apart = _by_likeness(camera, [sighting.camera for sighting in sightings])
+    points = (rays * torch.where(is_open, FAR * max(apart, 1.0), z)[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[
+        :3, :3
+    ]
 
-    found = torch.zeros(len(points), dtype=torch.bool)
-    for sighting in sorted(sightings, key=lambda other: _difference(camera, other.camera)):
-        left = (~found).nonzero().squeeze(1)
+    left = torch.arange(len(points))  # not found yet
+    for k in order:
         if not len(left):
             break
-        found[left] = _sees(sighting, points[left], is_open[left])
+        unseen = ~_sees(sightings[k], points, is_open)
+        if not unseen.all():
+            left, points, is_open = left[unseen], points[unseen], is_open[unseen]
+    found = torch.ones(camera.height * camera.width, dtype=torch.bool)
+    found[left] = False
     return found.reshape(camera.height, camera.width)
 
 
-def _difference(one: Camera, other: Camera) -> float:
-    """How unlike two views are; only the order in which cameras are asked depends on it."""
-    turned = 1.0 - float(one.viewmat[2, :3] @ other.viewmat[2, :3])
-    return turned + float((one.center - other.center).norm()) / (1.0 + float(one.center.norm()))
+def _by_likeness(camera: Camera, others: Sequence[Camera]) -> tuple[list[int], float]:
+    """Other cameras from the most to the least like one, and the distance to the farthest of them.
+
+    Only how soon all pixels are found depends on this order.
+    """
+    if not others:
+        return [], 0.0
+    matrices = torch.stack([other.viewmat for other in others])
+    centers = -(matrices[:, :3, :3].mT @ matrices[:, :3, 3:]).squeeze(2)
+    apart = (centers - camera.center).norm(dim=1)
+    turned = 1.0 - matrices[:, 2, :3] @ camera.viewmat[2, :3]
+    return (turned + apart / (1.0 + camera.center.norm())).argsort(stable=True).tolist(), float(apart.max())
 
 
 def _sees(sighting: Sighting, points: Tensor, is_open: Tensor) -> Tensor:
     """Which of the points [P, 3] a training camera sees, [P] bool; ``is_open`` [P] tells which stand for directions."""
     camera = sighting.camera
     local = to_camera(points, camera.viewmat)
-    column, row = to_pixels(local, camera.K).floor().nan_to_num(-1.0).clamp(-1, 2**31).long().unbind(-1)
+    column, row = to_pixels(local, camera.K).unbind(-1)
     inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     ids = inside.nonzero().squeeze(1)
-    row, column = row[ids], column[ids]
+    row, column = row[ids].long(), column[ids].long()
     # The farthest of the pixel and its neighbours: at an edge the coarse grid cannot tell them apart. A direction must be
     # free in all of them: holes between Gaussians, and the ragged end of what is reconstructed, have some open pixels.
-    depth = sighting.depth.double()[None, None]
-    farthest, nearest = (sign * max_pool2d(sign * depth, 3, stride=1, padding=1)[0, 0] for sign in (1.0, -1.0))
-    reach = torch.where(is_open[ids], nearest[row, column], farthest[row, column])
+    nearest, farthest = sighting.around
+    reach = torch.where(is_open[ids], nearest[row, column], farthest[row, column]).double()
     visible = local[ids, 2] <= (1.0 + DEPTH_TOLERANCE) * reach
     if sighting.mask is not None:
         visible &= sighting.mask[row, column]

@@ -96,7 +96,8 @@ class LossTerm(Protocol):
     """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term.
 
     A term may also have ``prepare(scene, modality) -> dict[str, str]``, called once before training, to check and to
-    compute what it needs of the scene; it returns what the report should say of it, by name.
+    compute what it needs of the scene; it returns what the report should say of it, by name. One that compares the images of a
+    companion says which in ``modality``; one that weighs another has it as ``term``.
     """
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]: ...
@@ -177,6 +178,10 @@ class Loss:
             notes |= prepare(term, scene, modality)
         return notes
 
+    def compares(self, companion: str) -> bool:
+        """Whether some term compares the images of a companion."""
+        return any(_modality(term) == companion for term in self.terms.values())
+
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         """Scalars by name: ``name`` of a term that returns a tensor, ``name/part`` of one that returns several."""
         scalars: dict[str, Tensor] = {}
@@ -191,6 +196,15 @@ def _span(term: LossTerm) -> tuple[float, float]:
     if not isinstance(term, During):
         return 0, math.inf
     return term.start, math.inf if term.stop is None else term.stop
+
+
+def _modality(term: LossTerm) -> str | None:
+    """The companion whose images a term compares; None for none, or for a weight of zero."""
+    while hasattr(term, "term"):
+        if getattr(term, "weight", 1.0) == 0.0:
+            return None
+        term = term.term
+    return getattr(term, "modality", None)
 
 
 def prepare(term: LossTerm, scene: SceneData, modality: str) -> dict[str, str]:

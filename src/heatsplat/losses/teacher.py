@@ -9,7 +9,8 @@ import tempfile
 import warnings
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ INTERPOLATIONS = ("lanczos", "bicubic")
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 # Modes of Pillow in which numbers are no brightness, or have an alpha among them, and what they become.
 PLAIN_MODES = dict.fromkeys(("1", "LA", "La"), "L") | dict.fromkeys(("P", "PA"), "RGB")
+OVERSHOOT = 0.25  # by which sharp edges of an enlarged image may leave [0, 1]; they are clamped
 WHERE = (
     "Give a file with a network (a state dict of SwinIR such as 002_lightweightSR_DIV2K_s64w8_SwinIR-S_x4.pth from "
     "github.com/JingyunLiang/SwinIR/releases; with trust=true also TorchScript or torch.export's .pt2) or a folder with one "
@@ -138,7 +140,8 @@ class Interpolation(Teacher):
 class Images(Teacher):
     """A folder of enlarged images, found by the name of the training image whatever its extension.
 
-    Grey or RGB, 8 or 16 bit, or float in [0, 1], encoded like the training images: 0 and full scale are 0 and 1.
+    Grey or RGB, 8 or 16 bit, or float in [0, 1], encoded like the training images: 0 and full scale are 0 and 1. Images
+    in °C are refused, for the teacher does not know the scene's bounds.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -154,17 +157,23 @@ class Images(Teacher):
 
     def check(self, frame: Frame, factor: int) -> None:
         path = self._file_of(frame)
-        with Image.open(path) as image:
+        with _opened(path) as image:
             self._check_size(path, image.size, frame, factor)
 
     def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
         path = self._file_of(frame)
-        with Image.open(path) as stored:
+        with _opened(path) as stored:
             self._check_size(path, stored.size, frame, factor)
             plain = PLAIN_MODES.get(stored.mode)
             pixels = np.asarray(stored if plain is None else stored.convert(plain))
         full = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 65535 if pixels.dtype.kind == "i" else 1
         values = torch.from_numpy(pixels.astype(np.float32) / full)
+        low, high = values.min().item(), values.max().item()
+        if not (low >= -OVERSHOOT and high <= 1.0 + OVERSHOOT):  # nor where one is NaN
+            raise SceneError(
+                f"teacher image {path} has values from {low:g} to {high:g}, but must be encoded like the training images, "
+                "0 to 1. Of °C subtract the scene's lower bound, divide by the difference of its bounds, and store that"
+            )
         values = values[..., None] if values.ndim == 2 else values[..., :3]
         channels = image.shape[2]
         values = values if values.shape[2] == channels else values.mean(2, keepdim=True).expand(-1, -1, channels)
@@ -189,6 +198,18 @@ class Images(Teacher):
             )
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """A stored image. Raises SceneError, with the file's name, where it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            yield image
+    except SceneError:
+        raise
+    except Exception as error:  # Pillow raises half a dozen types on a damaged file
+        raise SceneError(f"teacher image {path} cannot be read: {error}. Copy it again, or make it again") from error
+
+
 class Network(Teacher):
     """A super-resolution network from a file, asked once per image; answers are kept on disk.
 
@@ -203,9 +224,11 @@ class Network(Teacher):
 
     def __call__(self, image: Tensor, frame: Frame, factor: int) -> Tensor:
         kept = self._kept(image, factor)
-        if kept is not None and kept.is_file():
-            return torch.from_numpy(np.load(kept).astype(np.float32)).to(image.device)
         height, width, channels = image.shape
+        if kept is not None:
+            answer = _stored(kept, (factor * height, factor * width, channels))
+            if answer is not None:
+                return answer.to(image.device)
         planes = image.detach().cpu().float().permute(2, 0, 1)[None]
         with torch.no_grad():
             answer = self.network(planes.expand(-1, 3, -1, -1) if channels == 1 else planes)
@@ -220,12 +243,15 @@ class Network(Teacher):
         if not fine.isfinite().all():
             raise SceneError(f"teacher={self.path}: its answer to {frame.name} is not finite")
         if kept is not None:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            # Jobs share the cache: each writes a file of its own.
-            with tempfile.NamedTemporaryFile(dir=kept.parent, suffix=".part", delete=False) as partial:
-                np.save(partial, fine.numpy().astype(np.float16))
-            os.chmod(partial.name, 0o644)
-            os.replace(partial.name, kept)
+            try:
+                _store(kept, fine)
+            except OSError as error:
+                log.warning(
+                    "the answers of teacher=%s cannot be kept in %s (%s), so every run asks it again; teacher.cache of the "
+                    "loss term names another folder, and null keeps none",
+                    self.path, self.cache, error.strerror or error,
+                )  # fmt: skip
+                self.cache = None
         return fine.to(image.device)
 
     def _kept(self, image: Tensor, factor: int) -> Path | None:
@@ -235,6 +261,30 @@ class Network(Teacher):
         content = image.detach().cpu().contiguous().numpy().tobytes()
         key = hashlib.sha256(f"{self._digest}/{list(image.shape)}/{factor}/".encode() + content).hexdigest()[:32]
         return self.cache / f"{key}.npy"
+
+
+def _stored(file: Path, shape: tuple[int, ...]) -> Tensor | None:
+    """The answer in a file of the cache; None where there is none of this shape that can be read."""
+    try:
+        values = np.load(file)
+    except (OSError, ValueError, EOFError):
+        return None
+    return torch.from_numpy(values.astype(np.float32)) if values.shape == shape else None
+
+
+def _store(file: Path, answer: Tensor) -> None:
+    """Writes an answer to a file of the cache. Raises OSError, and leaves nothing, where that cannot be done."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Jobs share the cache: each writes a file of its own.
+    number, partial = tempfile.mkstemp(dir=file.parent, suffix=".part")
+    try:
+        with os.fdopen(number, "wb") as stream:
+            np.save(stream, answer.numpy().astype(np.float16))
+        os.chmod(partial, 0o644)
+        os.replace(partial, file)
+    except OSError:
+        os.unlink(partial)
+        raise
 
 
 def load_network(path: Path, trust: bool = False) -> tuple[nn.Module, str]:

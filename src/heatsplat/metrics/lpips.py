@@ -61,7 +61,7 @@ def find_backbone(net: str, path: str | Path | None = None) -> Path:
     """
     if net not in FILES:
         raise LpipsUnavailable(f"LPIPS net '{net}' is not known; there are {', '.join(FILES)}")
-    found = Path(path) if path is not None else Path(torch.hub.get_dir()) / "checkpoints" / FILES[net]
+    found = Path(path).expanduser() if path is not None else Path(torch.hub.get_dir()) / "checkpoints" / FILES[net]
     if not found.is_file():
         raise LpipsUnavailable(
             f"LPIPS({net}) needs the backbone's ImageNet weights, which are not at {found}. Download "

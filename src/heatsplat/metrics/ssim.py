@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import torch
-import torch.nn.functional as F
-from kornia.metrics import ssim as ssim_map
+import cv2
+import numpy as np
 from torch import Tensor
 
 from heatsplat.metrics.valid import valid_pixels
 
 WINDOW = 11  # taps of the Gaussian window, sigma 1.5 pixels: the window of Wang et al. 2004 and of the 3DGS scripts
+_WEIGHTS = np.exp(-0.5 * ((np.arange(WINDOW) - WINDOW // 2) / 1.5) ** 2)
+_TAPS = _WEIGHTS / _WEIGHTS.sum()
+C1, C2 = 0.01**2, 0.03**2
 
 
 def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
@@ -26,15 +28,27 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> floa
 
     Source: Wang et al., Image Quality Assessment (2004), Eq. 13.
     """
-    valid = valid_pixels(prediction, target, mask)
+    valid = valid_pixels(prediction, target, mask).cpu().numpy()
     if min(valid.shape) < WINDOW:
         return None
-    whole = -F.max_pool2d(-valid[None].double(), WINDOW, stride=1)[0] > 0.5
+    whole = _inner(cv2.erode(valid.astype(np.uint8), np.ones((WINDOW, WINDOW), np.uint8))) > 0
     if not whole.any():
         return None
     # Values outside the mask reach no window that counts; zero keeps NaN from reaching any.
-    images = [
-        torch.where(valid[..., None], image.double(), 0.0).permute(2, 0, 1)[None] for image in (prediction, target)
-    ]
-    scores = ssim_map(*images, window_size=WINDOW, eps=0.0, padding="valid")
-    return scores[0][:, whole].mean().item()
+    x, y = (np.where(valid[..., None], image.double().cpu().numpy(), 0.0) for image in (prediction, target))
+    mean_x, mean_y, xx, yy, xy = (_means(values) for values in (x, y, x * x, y * y, x * y))
+    scores = (2 * mean_x * mean_y + C1) * (2 * (xy - mean_x * mean_y) + C2)
+    scores /= (mean_x**2 + mean_y**2 + C1) * (xx - mean_x**2 + yy - mean_y**2 + C2)
+    return float(scores[whole].mean())
+
+
+def _means(values: np.ndarray) -> np.ndarray:
+    """Weighted means [H - 10, W - 10, C] over the windows that lie wholly within an image [H, W, C]."""
+    found = cv2.sepFilter2D(values, cv2.CV_64F, _TAPS, _TAPS)
+    return _inner(found.reshape(values.shape))
+
+
+def _inner(image: np.ndarray) -> np.ndarray:
+    """An image without the pixels in whose windows others are missing."""
+    edge = WINDOW // 2
+    return image[edge:-edge, edge:-edge]

@@ -46,6 +46,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -239,9 +240,8 @@ class Climate:
         columns = {name: series for name, series in columns.items() if series is not None}
         self.columns = {name: j for j, name in enumerate(columns)}
         series = torch.stack(list(columns.values()), dim=1)
-        self.table = (SemiInfiniteTable if semi_infinite else ResponseTable)(drivers.times_s, series)
+        self._series = series
         self.means = driver_means(drivers.times_s, series).float()
-        self.beam = None if drivers.beams is None else SunlightTable(drivers.times_s, drivers.beams)
         rows = [columns.get(name, zero) for name in ("air", "sky", "around", "light")]
         rows += [zero if drivers.wind_anomaly is None else drivers.wind_anomaly]
         rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
@@ -251,6 +251,17 @@ class Climate:
         self.slots = torch.zeros(len(zero), dtype=torch.int64)
         if drivers.ways is not None:
             self.slots = (drivers.beams @ drivers.ways.T).argmax(1)
+
+    # Tables of long records take seconds and gigabytes, and a balance that is marched reads none.
+    @cached_property
+    def table(self) -> ResponseTable:
+        """Responses of bodies of any rate to each column."""
+        return (SemiInfiniteTable if self.semi_infinite else ResponseTable)(self.drivers.times_s, self._series)
+
+    @cached_property
+    def beam(self) -> SunlightTable | None:
+        """What surfaces of any slope take of the direct sun; None without."""
+        return None if self.drivers.beams is None else SunlightTable(self.drivers.times_s, self.drivers.beams)
 
     def share_of_sky(self, surface: Surface) -> Tensor | float:
         """Share of what a surface sees that is sky, [n]: (1 + n · up) / 2 of what is open."""

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from scipy.spatial import cKDTree
 
-from heatsplat.composition import build, choices_of, compose, keys_of
+from heatsplat.composition import build, choices_of, compose, followed, keys_of, overlap
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
 from heatsplat.runs.device import device_of
@@ -342,16 +342,11 @@ def open_points(points: Sequence[Point], method: str, overrides: Sequence[str]) 
 
     def is_open(point: Point) -> bool:
         keys = keys_of(point.settings)
-        if any(_overlap(key, other) for key in keys for other in given):
+        if any(overlap(key, other) for key in keys for other in given):
             return False
         return point.method == method or all(key in default and here[key] == default[key] for key in keys)
 
     return [point for point in points if is_open(point)]
-
-
-def _overlap(key: str, other: str) -> bool:
-    """Whether one of two dotted keys is the other or lies below it."""
-    return f"{key}.".startswith(f"{other}.") or f"{other}.".startswith(f"{key}.")
 
 
 # The run ------------------------------------------------------------------------------------------------------------
@@ -377,7 +372,7 @@ def budgeted(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
         growth["reset_every"] = "null"  # as in the runs behind the curves
     growing = [f"density.{key}={value}" for key, value in growth.items() if density.get(key) is not None]
     planned = [*made.settings, f"max_steps={made.steps}", *growing, *decay]
-    config = _followed(config, compose(overrides), compose([*overrides, *planned]))
+    config = followed(config, compose(overrides), compose([*overrides, *planned]))
     clock = {"_target_": "heatsplat.callbacks.budget.BudgetClock", "plan": made.as_dict(), "twice": made.twice()}
     return config | {
         "overrides": overrides,
@@ -398,12 +393,3 @@ def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
     for line in made.lines():
         log.info("%s", line)
     return made
-
-
-def _followed(config: Any, before: Any, after: Any) -> Any:
-    """A configuration with the changes that lead from ``before`` to ``after``, and all else as it is."""
-    if not isinstance(config, Mapping) or not isinstance(after, Mapping):
-        return after
-    changed = {key for key in after if before.get(key) != after[key]}
-    kept = {key: value for key, value in config.items() if key in after or key not in before}
-    return kept | {key: _followed(config.get(key), before.get(key), after[key]) for key in changed}

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib import import_module
-from numbers import Real
 from typing import Any
 
 from heatsplat.composition import keys_of
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
 from heatsplat.runs.budget import seconds_of
+from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
 
 RATES = (
@@ -23,8 +21,6 @@ RATES = (
     "opacity_logits",
 )  # learning rates in the group "optim"; elsewhere they are lr, lr_*
 WEIGHTS = ("weight", "_l2", "_penalty")  # endings of the names of weights; "weights" holds more of them
-# Kinds of settings by the names that classes declare them with, in words.
-KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "None": "null"}
 MAX_THREADS_PER_CORE = 4  # more only wait for each other
 
 
@@ -39,13 +35,14 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
     """The configuration with ``budget`` in seconds.
 
     Raises:
-        SceneError: settings contradict each other, are of another kind than is asked for, lie out of range, or need what this
-            machine lacks.
+        SceneError: settings contradict each other, are of another kind than is asked for or asked for by nothing, lie out of
+            range, or need what this machine lacks.
         ImportError: the renderer is not installed.
     """
     _check_ranges(config)
-    _check_kinds(config)
+    check_declared(config)
     _check_first_stage(config)
+    check_last_stage(config)
     _check_machine(config)
     if config["budget"] is not None:
         config = config | {"budget": seconds_of(config["budget"])}
@@ -64,60 +61,22 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
     return config
 
 
-def _check_kinds(config: Mapping[str, Any]) -> None:
-    groups = {name: settings for name, settings in config.items() if isinstance(settings, Mapping)}
-    groups.pop("module", None)  # holds the others once more
-    for key, value, kinds in _declared_in(groups):
-        left = value == assembly.SCENE_SAYS and key.startswith("effects.")
-        if not left and not _is_of(kinds, value):
-            wanted = " or ".join(words for kind, words in KINDS.items() if kind in kinds)
-            raise SceneError(f"{key} must be {wanted}, got {value}")
-
-
-def _is_of(kinds: frozenset[str], value: Any) -> bool:
-    if value is None:
-        return "None" in kinds
-    if isinstance(value, bool):
-        return "bool" in kinds
-    if not isinstance(value, Real) or math.isnan(value):
-        return False
-    whole = math.isinf(value) or value == int(value)  # 1e5 is one, and so is no limit
-    return "float" in kinds or ("int" in kinds and whole) or ("bool" in kinds and value in (0, 1))
-
-
-def _declared_in(settings: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any, frozenset[str]]]:
-    """Settings that classes of heatsplat declare as numbers or as true or false: dotted key, value and kinds."""
-    kinds = _kinds_of(str(settings.get("_target_")))
-    for name, value in settings.items():
-        key = f"{path}.{name}".removeprefix(".")
-        if isinstance(value, Mapping):
-            yield from _declared_in(value, key)
-        elif name in kinds:
-            yield key, value, kinds[name]
-
-
-@cache
-def _kinds_of(target: str) -> dict[str, frozenset[str]]:
-    """Arguments of a class or function of heatsplat, and of its bases, that are of ``KINDS``, by name."""
-    module, _, name = target.rpartition(".")
-    if not module.startswith("heatsplat."):
-        return {}  # others may not mean what they declare
-    try:
-        found = getattr(import_module(module), name)
-    except (ImportError, AttributeError):
-        return {}  # building it says what is wrong
-    makers = [vars(base).get("__init__") for base in reversed(found.__mro__)] if isinstance(found, type) else [found]
-    hints = {name: hint for maker in makers for name, hint in getattr(maker, "__annotations__", {}).items()}
-    kinds = {name: frozenset(str(hint).split(" | ")) for name, hint in hints.items()}
-    return {name: one for name, one in kinds.items() if one <= KINDS.keys()}
-
-
 def _check_first_stage(config: Mapping[str, Any]) -> None:
     shared, own = config.get("first_steps"), config["thermal"].get("first_steps")
     if None not in (shared, own) and own != shared:
         raise SceneError(
             f"thermal.first_steps={own}, but stages, density control and losses follow first_steps={shared}: set "
             f"first_steps={own} instead"
+        )
+
+
+def check_last_stage(config: Mapping[str, Any]) -> None:
+    """Raises SceneError where the first stage of a run takes all of its steps, which a budget may have chosen."""
+    first, steps = config.get("first_steps"), config["max_steps"]
+    if isinstance(first, int | float) and first >= steps:
+        raise SceneError(
+            f"first_steps={first} leaves no step of max_steps={steps} for what is to be trained after the first stage: give "
+            "fewer first_steps, or more max_steps (a longer budget)"
         )
 
 

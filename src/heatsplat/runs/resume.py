@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from heatsplat.composition import compose, followed, keys_of, overlap
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
 from heatsplat.runs.trust import trusted
@@ -16,11 +17,13 @@ from heatsplat.training.module import CHECKPOINT_KEY
 log = logging.getLogger("heatsplat")
 
 # What may differ between a run and the one that wrote its checkpoint: where and how it runs, not what it learns.
-NOT_LEARNED = {"threads", "ckpt", "row", "table", "leaderboard", "test", "trainer", "callbacks", "logger"}
+NOT_LEARNED = {"threads", "ckpt", "row", "table", "leaderboard", "doctor", "test", "trainer", "callbacks", "logger"}
 LEARNED = {  # and what in these says how it learns, or how long
     "trainer": ("gradient_clip_val", "gradient_clip_algorithm", "accumulate_grad_batches"),
     "callbacks": ("plateau",),
 }
+# What may differ beside the length from the run whose checkpoint is given: where it is, when it ends, what is decided already.
+OPEN = ("data.root.", "renderer.backend.", "callbacks.plateau.", "effects.price.", "effects.least_db_per_ms.")
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
@@ -34,7 +37,7 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         output_dir: folder of the run.
 
     Raises:
-        SceneError: the checkpoint that was given is none, or of a run with another budget or other effects.
+        SceneError: the checkpoint that was given is none, or of a run with another budget or other settings than its length.
     """
     if config["ckpt"] is not None:
         return _continued(config, stored_config(load_checkpoint(config["ckpt"])))
@@ -127,19 +130,45 @@ def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
 def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with what was measured for the run of the checkpoint that it was given."""
     ckpt, asked, plan = config["ckpt"], config["budget"], stored.get("budget")
-    if asked is not None:
-        if plan is None:
-            raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
-        if plan["asked_s"] != asked:
-            raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
-        config = config | _measured(stored, ckpt, "budget")
-    config = config | _measured(stored, ckpt, "scene")
-    if "verdicts" in stored and assembly.chooses_effects(config):
-        changed = assembly.changed_keys(config, stored)
-        if changed:
-            raise SceneError(
-                f"{ckpt} was trained with another {', '.join(changed)}: give what it was trained with, or start anew "
-                "without ckpt"
-            )
+    if asked is not None and plan is None:
+        raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
+    if plan is not None and plan["asked_s"] != asked:
+        raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
+    if stored.get("name") == config["name"]:  # another method is refused with the tensors in which it differs
+        _check_same_settings(config, stored)
+    config = config | _measured(stored, ckpt, "budget", "scene")
+    if assembly.chooses_effects(config):
         config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
     return config
+
+
+def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> None:
+    """Raises SceneError where a run would learn by other settings than that of its checkpoint; it may be longer.
+
+    Rates of the optimiser are in the checkpoint, and others would have no effect. Settings that heatsplat did not have when it
+    was written are warned of, unless they were asked for.
+    """
+    before = {**stored, **stored.get("composed", {})}
+    overrides = config["overrides"]
+    if config["max_steps"] != before["max_steps"]:  # and what follows from it
+        shorter = compose([*overrides, f"max_steps={before['max_steps']}"])
+        config = followed(config, compose(overrides), shorter)
+    changed = [key for key in differences(config, stored) if not f"{key}.".startswith(OPEN)]
+    given = keys_of(overrides)
+    new = [key for key in changed if not (_holds(before, key) or any(overlap(key, other) for other in given))]
+    if known := [key for key in changed if key not in new]:
+        raise SceneError(
+            f"{config['ckpt']} was trained with another {', '.join(known)}: give what it was trained with, or start anew without "
+            "ckpt"
+        )
+    if new:
+        log.warning("%s is of an older heatsplat without %s: they count from here on", config["ckpt"], ", ".join(new))
+
+
+def _holds(settings: Any, key: str) -> bool:
+    """Whether nested settings have a dotted key."""
+    for name in key.split("."):
+        if not isinstance(settings, Mapping) or name not in settings:
+            return False
+        settings = settings[name]
+    return True

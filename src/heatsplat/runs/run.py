@@ -24,7 +24,7 @@ from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
-from heatsplat.runs.checks import checked
+from heatsplat.runs.checks import check_last_stage, checked
 from heatsplat.runs.device import device_of
 from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import locked
@@ -101,6 +101,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
     config = on_scene(config, data.scene)
     config = decided(config, data.scene)
     config = budgeted(config, data.scene)
+    check_last_stage(config)
     config = filled(config)
     config = completed(config, composed)
     module = build_module(config, output_dir)

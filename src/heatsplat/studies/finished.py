@@ -24,7 +24,7 @@ HOW_IT_RUNS = {"threads", "ckpt", "test"}
 NOT_A_ROW = SEEDS | PLACES | NAMES | HOW_IT_RUNS
 # Groups with all that is below them. Those that say whose job a run was do not tell it from any other.
 WHOSE_JOB = {"launcher", "hydra", "table", "leaderboard"}
-NOT_WHAT_WAS_LEARNED = WHOSE_JOB | {"trainer", "callbacks", "logger"}
+NOT_WHAT_WAS_LEARNED = WHOSE_JOB | {"doctor", "trainer", "callbacks", "logger"}
 
 
 @dataclass

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 from tqdm import tqdm
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.pictures import Panel, colorize, compose, write_png
 from heatsplat.io.results import write_atomically
@@ -59,12 +59,17 @@ def run(
         seed: of the network's start and of what is cut out.
 
     Raises:
-        SceneError: a list has no scene, a scene is in both, its images are smaller than a patch, or a number counts nothing.
+        SceneError: a list has no scene, a scene is in both, its images are smaller than a patch, a number counts nothing, or
+            the network cannot be.
     """
     output_dir = Path(output_dir)
     scenes, held_out = filled("study.scenes", scenes), filled("study.held_out", held_out)
     for key, value in {"factor": factor, "steps": steps, "batch": batch, "patch": patch}.items():
         check_count(f"study.{key}", value)
+    check_numbers("study.rate", rate, error=SceneError)
+    if rate <= 0:
+        raise SceneError(f"study.rate must be above 0, or nothing is learned, got {rate}")
+    check_network(network)
     if both := sorted(set(scenes) & set(held_out)):
         raise SceneError(f"study.held_out names scenes that the network learns from: {', '.join(both)}")
     log.info("rendering %d scenes", len(scenes) + len(held_out))
@@ -110,6 +115,21 @@ def run(
     write_png(output_dir / "teacher.png", compose(panels, f"{held_out[0]}, {factor} times as fine"))
     log.info("teacher: %.2f dB on scenes it has not seen, %s %.2f dB; %s", scores["network"], best, scores[best], file)
     return file
+
+
+def check_network(network: dict[str, Any]) -> None:
+    """Raises SceneError where options of SwinIR do not go together, or count nothing."""
+    sizes = {key: network[key] for key in ("dim", "heads", "window") if key in network}
+    for key, value in sizes.items():
+        check_count(f"study.network.{key}", value)
+    for depth in filled("study.network.depths", network["depths"]) if "depths" in network else ():
+        check_count("study.network.depths", depth)
+    dim, heads = sizes.get("dim"), sizes.get("heads")
+    if None not in (dim, heads) and dim % heads:
+        raise SceneError(
+            f"study.network.dim={dim} channels cannot be shared among study.network.heads={heads}: give a multiple of "
+            f"{heads}"
+        )
 
 
 def images_of(data: Any, factor: int) -> Tensor:

@@ -159,7 +159,7 @@ class Pretrained:
             restored run reads it again.
 
     Raises:
-        SceneError: there is no such file, or it holds no splats.
+        SceneError: there is no such file, or it holds no splats, or anchors where Gaussians are wanted.
     """
 
     rows = frozenset({GAUSSIANS, ANCHORS})
@@ -178,7 +178,13 @@ class Pretrained:
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
             )
         read = _splats_of_file if self.path.suffix == ".ply" else _splats_of_checkpoint
-        geometry, wanted = read(self.path), len(thermal.opacity_channels)
+        geometry, rows = read(self.path)
+        if rows not in (GAUSSIANS, thermal.rows):
+            held = "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+            raise SceneError(
+                f"init.path={self.path} holds {held}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
+            )
+        wanted = len(thermal.opacity_channels)
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
@@ -217,20 +223,24 @@ def _times(scene: SceneData) -> Tensor | None:
     return None if None in times else torch.tensor(times, dtype=torch.float64)
 
 
-def _splats_of_file(path: Path) -> dict[str, Tensor]:
+def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], str]:
+    """Geometry of a point cloud, and what its rows are: Gaussians."""
     try:
         found = read_splats(path)
     except ValueError as error:
         raise SceneError(f"init.path: {error}") from error
-    return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}
+    return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}, GAUSSIANS
 
 
-def _splats_of_checkpoint(path: Path) -> dict[str, Tensor]:
+def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
+    """Geometry of a checkpoint, and what its rows are."""
     try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-        return {name: weights[f"splats.raw.{name}"] for name in GEOMETRY}
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+        geometry = {name: stored["state_dict"][f"splats.raw.{name}"] for name in GEOMETRY}
+        rows = stored.get("heatsplat", {}).get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
     except Exception as error:
         raise SceneError(f"init.path={path} is no checkpoint of heatsplat that can be read: {error!r}") from error
+    return geometry, rows
 
 
 def neighbour_distances(points: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import operator
 import time
 from collections.abc import Iterator, Sequence
@@ -37,6 +38,8 @@ from heatsplat.training.scales import scales_of
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
 from heatsplat.training.surroundings import Surroundings
+
+log = logging.getLogger(__name__)
 
 CHECKPOINT_KEY = "heatsplat"
 
@@ -141,6 +144,9 @@ class SplatTraining(pl.LightningModule):
         if self.scene is None:
             self.attach(self.trainer.datamodule.scene)
         if stage == "fit":
+            for name in self.thermal.companions:
+                if not self.loss.compares(name):
+                    log.warning("no term of loss.terms compares %s images: they are scored, but not learned", name)
             self.results.data |= self.loss.prepare(self.scene, self.modality)
             self.trainer.val_check_interval = self._between_resets(self.trainer.val_check_interval)
 
@@ -155,6 +161,7 @@ class SplatTraining(pl.LightningModule):
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.surroundings.prepare(scene, self.renderer, self.splats, self.composited)
+        self.density.opacities_until = self.stages.held_from("opacity_logits")
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
@@ -177,7 +184,7 @@ class SplatTraining(pl.LightningModule):
             if rows not in known:
                 raise SceneError(
                     f"{model} {what}, and {type(part).__name__} is for {' and '.join(names[row] for row in sorted(known))}: "
-                    f"leave {name} to the method"
+                    f"leave {name} to the method, and thermal with it"
                 )
         if not self.resolution.whole and self.sensor.parts:
             raise SceneError(
@@ -191,6 +198,12 @@ class SplatTraining(pl.LightningModule):
             )
         if rows != GAUSSIANS and self.smoothing.changes:
             raise SceneError(f"{model} {what}, which no filter of Gaussians in space knows: give smoothing=none")
+        if rows == NOTHING and type(self.overlap) is not Overlap:
+            raise SceneError(
+                f"{model} {what}, whose sizes {type(self.overlap).__name__} would reset: give overlap=none"
+            )
+        if rows == NOTHING and self.optim.decoupled is not None:
+            raise SceneError(f"{model} {what}, whose opacities and sizes optim.decoupled lets decay: give optim=adam")
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -558,6 +571,7 @@ class SplatTraining(pl.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint[CHECKPOINT_KEY] = {
             "config": self.config,
+            "rows": self.thermal.rows,
             "scales": scales_of(self.scene),
             "schedule": self.schedule.state_dict(),
             "density_times": self.density.times(),

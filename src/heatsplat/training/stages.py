@@ -6,6 +6,7 @@ A pure function of the step, so resuming is free.
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -87,6 +88,15 @@ class Stages:
         once = [freeze for freeze in self.freezes.values() if freeze.cycle is None]
         turns = [step for freeze in once for step in (freeze.start, freeze.stop) if step is not None and step < steps]
         return max((*self.restarts, *turns), default=0)
+
+    def held_from(self, group: str) -> float:
+        """The step from which on a group is frozen until the run ends; infinity where none is, or in runs of several rounds."""
+        if self.restarts:
+            return math.inf  # density control, which asks, counts the steps of a round
+        ends = (freeze for freeze in self.freezes.values() if freeze.stop is None and freeze.cycle is None)
+        return min(
+            (one.start for one in ends if any(fnmatchcase(group, name) for name in one.groups)), default=math.inf
+        )
 
     def check(self, optimizer: torch.optim.Optimizer) -> None:
         """Warns of stages that freeze nothing, as none of their names is a group of this run."""

@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from hydra.core.utils import JobReturn
@@ -64,8 +64,12 @@ class SubmititLauncher(JobLauncher):
         )
         os.environ["PYTHONPATH"] = python_path()  # jobs inherit the environment
         arguments = zip(*(self.arguments(job) for job in jobs), strict=True)
-        for waiting in executor.map_array(Requeued(), *arguments):
+        for waiting in self.submitted(executor, arguments):
             yield attempt(lambda waiting=waiting: self.wait(waiting))
+
+    def submitted(self, executor: Any, arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
+        """All jobs, handed over to the executor."""
+        return executor.map_array(Requeued(), *arguments)
 
     def wait(self, job: Any) -> JobReturn:
         """What a submitted job returned. Raises what ended it."""
@@ -95,6 +99,25 @@ class Slurm(SubmititLauncher):
                 "launcher=submitit_local rehearses it here"
             )
         return super().outcomes(jobs)
+
+    def submitted(self, executor: Any, arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
+        """As above. Raises SceneError, with what sbatch says, where it takes no job."""
+        from submitit.core.utils import FailedJobError, FailedSubmissionError
+
+        from heatsplat.contracts import SceneError
+
+        if (cores := executor.parameters.get("cpus_per_task")) is not None:
+            # Not every srun takes them over from sbatch (not that of 22.05 and 23.02), and a job would have one core.
+            given = executor.parameters.get("srun_args", [])
+            executor.update_parameters(slurm_srun_args=[f"--cpus-per-task={cores}", *given])
+        try:
+            return super().submitted(executor, arguments)
+        except (FailedJobError, FailedSubmissionError) as error:
+            raise SceneError(
+                f"launcher=slurm: sbatch took no job: {' '.join(str(error).split())}. What it is asked for are the "
+                "settings of hydra.launcher, such as hydra.launcher.partition, hydra.launcher.gpus_per_node and "
+                "hydra.launcher.timeout_min (all of them: conf/launcher/slurm.yaml)"
+            ) from error
 
     def wait(self, job: Any) -> JobReturn:
         """As above. A job that is neither in the queue nor has a result has died.
