@@ -154,7 +154,8 @@ class Uncertainty:
         self.module = module
         self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
         self.noise = noise_of_views(scene.train, module.modality)
-        known = torch.cat([_pixels(view, module.modality)[::7].clone() for view in scene.train])  # or each image stays
+        # Copies, for a slice would keep its whole image in memory.
+        known = torch.cat([_pixels(view, module.modality)[::7].clone() for view in scene.train])
         if not len(known):
             raise SceneError(
                 f"masks leave no pixel of the training views of scene '{scene.name}', which tell how certain it is"

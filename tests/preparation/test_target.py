@@ -56,6 +56,7 @@ def test_a_folder_with_something_else_in_it_is_no_target(tmp_path, own):
     (scene / own).parent.mkdir(parents=True)
     (scene / own).write_text("mine")
     is_refused(source, scene, f"{own} is of something else .* give an empty folder as target, or move it elsewhere")
+    assert contents(scene) == {own: b"mine"}  # nor was anything of ours begun beside it
 
 
 def test_cameras_that_no_preparation_wrote_stay(tmp_path):
@@ -70,6 +71,7 @@ def test_cameras_that_no_preparation_wrote_stay(tmp_path):
         prepare(str(source), scene, **PLAIN, poses=search)
     (scene / "sparse" / "0" / "notes.txt").write_text("mine")
     is_refused(source, scene, "or that were changed since.*move them elsewhere", poses=search)
+    assert (scene / "sparse" / "0" / "notes.txt").read_text() == "mine"
 
 
 def test_cameras_that_are_not_found_anew_are_still_ours(tmp_path):

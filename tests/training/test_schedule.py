@@ -28,6 +28,14 @@ def test_rounds_of_any_number_and_without():
         Schedule(0)
 
 
+def test_what_is_left_is_of_the_last_round_and_follows_an_end_that_moves():
+    rounds, one = Schedule(100, [10, 40]), Schedule(100)
+    assert [rounds.left(step) for step in (0, 25, 40, 70, 100)] == [1, 1, 1, 0.5, 0]
+    assert [one.left(step) for step in (0, 90, 100)] == [1, pytest.approx(0.1), 0]
+    one.end_at(50, 150)
+    assert one.left(100) == pytest.approx(0.25) and one.left(150) == 0
+
+
 @pytest.mark.parametrize(("end", "steps"), [(900.4, 900), (520.0, 520), (500.0, 500)])
 def test_what_is_left_is_spread_over_the_steps_that_are_left(end, steps):
     schedule = Schedule(600, [300])

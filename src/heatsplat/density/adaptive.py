@@ -104,8 +104,8 @@ class Adaptive(DensityControl):
             removed = self._prune(cloud, step, extent)
             for statistic in cloud.state.values():
                 statistic.zero_()
-        reset = 0 < step + 1 == self._last_reset(step) and cloud.splats["opacity_logits"].grad is not None
-        if reset:  # and no stage holds them still
+        reset = 0 < step + 1 == self._last_reset(step) and not cloud.is_held("opacity_logits")
+        if reset:
             cloud.lower_opacities(self.reset_opacity)
         return DensityChange(added, removed, reset) if due or reset else None
 

@@ -74,7 +74,7 @@ class MCMC(DensityControl):
 
     @torch.no_grad()
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
-        trained = cloud.splats.means.grad is not None  # a stage may have frozen them
+        trained = not cloud.is_held("means")
         change = None
         if self.start <= step < self.stop and (step + 1) % self.every == 0:
             change = self._relocate(cloud, step, generator)

@@ -170,8 +170,8 @@ class MultiviewGate(Adaptive):
         late = self.stop < step + 1 <= self.late_stop and (step + 1 - self.stop) % self.late_every == 0
         if not late:
             return super().refine(cloud, step, extent, generator)
-        held = cloud.splats["opacity_logits"].grad is None  # by a stage: others could not make up for those that go
-        removed = 0 if held else self._prune_late(cloud)
+        # Where opacities are held still, others could not make up for those that go.
+        removed = 0 if cloud.is_held("opacity_logits") else self._prune_late(cloud)
         for statistic in cloud.state.values():
             statistic.zero_()
         return DensityChange(removed=removed)

@@ -62,6 +62,10 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.splats)
 
+    def is_held(self, name: str) -> bool:
+        """Whether a tensor stays as it is in this step, as a stage froze it: it has no gradient then."""
+        return self.splats[name].grad is None
+
     @torch.no_grad()
     def lower_opacities(self, ceiling: float) -> None:
         """Lowers opacities until none is rendered with more than ``ceiling``, and forgets their moments."""

@@ -99,7 +99,7 @@ class ShortLists(Overlap):
 
     @torch.no_grad()
     def shrink(self, cloud: Cloud, step: int) -> None:
-        if not self._resets(step) or cloud.splats["log_scales"].grad is None:  # a stage may have frozen them
+        if not self._resets(step) or cloud.is_held("log_scales"):
             return
         cloud.overwrite("log_scales", cloud.splats["log_scales"] + math.log(self.reset_factor))
         if cloud.optimizer is not None:
