@@ -9,6 +9,7 @@ machine.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 import statistics
@@ -20,12 +21,13 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from heatsplat.composition import compose
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import all_rows, trained
+from heatsplat.studies.options import check_count, counted, filled, listed
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
 
@@ -97,20 +99,22 @@ def run(
             differ, scenes, steps, caps, decays and seeds of its own. The same is measured without "set", to know its cost.
 
     Raises:
-        SceneError: ``scenes`` or ``curves`` cannot be used as they are, or a run failed.
+        SceneError: an option or ``curves`` cannot be used as it is, or a run failed.
     """
-    folder = Path(output_dir).resolve()
+    folder, overrides, budgets = Path(output_dir).resolve(), listed(overrides), listed(budgets)
     common = [*([f"threads={threads}"] if threads else []), *overrides]
     grid = []
     pairs = _pairs(scenes)
+    for budget in budgets:
+        check_numbers("study.budgets", budget, error=SceneError)
     _known(curves)  # a file that is none is told before the runs, not after them
     whole = {"scenes": scenes, "steps": steps, "caps": caps, "decays": decays, "seeds": seeds}
-    for (method, scene), length, cap, decay, seed, settings in _asked(whole, further):
+    for (method, scene), length, cap, decay, seed, settings in _asked(whole, listed(further)):
         names = [method, scene, str(length), str(cap or "free"), f"{decay:g}", *settings]
         place = folder / "runs" / "_".join(names).replace("/", "-") / str(seed)
         wanted = [*settings, f"max_steps={length}", f"optim.decay={decay:g}"]
         chosen = [*_of(method, scene, seed), *settings]
-        density = compose(chosen)["density"]
+        density = compose([*overrides, *chosen])["density"]
         off = ("reset_every", "multiple") if cap else ("reset_every",)  # as budget= trains
         wanted += [f"density.{name}=null" for name in off if name in density]
         wanted += [f"density.cap_max={cap}"] if cap else []
@@ -123,14 +127,16 @@ def run(
     if curves is not None:
         source = Path(curves).resolve()
         write_points(merged(_known(curves), points), source)
+    plans = hashlib.sha256(source.read_bytes()).hexdigest()[:8]  # other curves plan other runs
     planned = [
         (method, scene, budget, trained(
-            folder / "planned" / f"{method}_{scene}_{budget:g}s" / "0", train,
+            folder / "planned" / f"{method}_{scene}_{budget:g}s_{plans}" / "0", train,
             [*common, *_of(method, scene, 0), f"budget={budget:g}s", f"budget_curves={source}"], folder,
         ))
         for (method, scene), budget in itertools.product(pairs, budgets)
     ]  # fmt: skip
-    write_atomically(folder / TABLE_FILE, tables(grid, planned))
+    about = all_rows(common, threads=[one.results.run.get("threads") for one in grid])
+    write_atomically(folder / TABLE_FILE, tables(grid, planned, about))
     write_png(folder / PICTURE_FILE, figure_picture(picture(points)))
 
 
@@ -141,19 +147,27 @@ def _known(curves: str | None) -> list[Point]:
 
 def _pairs(scenes: Sequence[str]) -> list[tuple[str, ...]]:
     """Method and scene of each entry."""
-    pairs = [tuple(pair.split("/")) for pair in scenes]
+    scenes = filled("study.scenes", scenes)
+    pairs = [tuple(str(pair).split("/")) for pair in scenes]
     if any(len(pair) != 2 for pair in pairs):
-        raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {list(scenes)}")
+        raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {scenes}")
     return pairs
 
 
 def _asked(whole: Mapping[str, Sequence[Any]], further: Sequence[Mapping[str, Any]]) -> list[tuple[Any, ...]]:
-    """(method, scene), steps, cap, decay, seed and settings of every run, each once."""
+    """(method, scene), steps, cap, decay, seed and settings of every run, each once. Raises SceneError as ``run`` does."""
     asked: dict[tuple[Any, ...], None] = {}
     for part in [{}, *further]:
         own = {name: part.get(name, values) for name, values in whole.items()}
-        choices = [(), tuple(sorted(part["set"]))] if "set" in part else [()]
-        grid = (_pairs(own["scenes"]), own["steps"], own["caps"], own["decays"], own["seeds"], choices)
+        steps, seeds = counted("study.steps", own["steps"]), counted("study.seeds", own["seeds"], least=0)
+        caps, decays = filled("study.caps", own["caps"]), filled("study.decays", own["decays"])
+        for cap in caps:
+            if cap is not None:
+                check_count("study.caps", cap)
+        for decay in decays:
+            check_numbers("study.decays", decay, error=SceneError)
+        choices = [(), tuple(sorted(listed(part["set"])))] if "set" in part else [()]
+        grid = (_pairs(own["scenes"]), steps, caps, decays, seeds, choices)
         asked |= dict.fromkeys(itertools.product(*grid))
     return list(asked)
 
@@ -220,8 +234,8 @@ def means(grid: Sequence[Trained]) -> list[Point]:
     ]
 
 
-def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, RunResults]]) -> str:
-    """The grid, and each planned run beside the best run of the grid that was no slower."""
+def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, RunResults]], about: str) -> str:
+    """What all runs have, the grid, and each planned run beside the best run of the grid that was no slower."""
     rows = [
         (
             one.method, one.scene, f"{one.steps:,}", _cap(one.cap), f"{one.decay:g}", " ".join(one.settings), one.seed,
@@ -235,7 +249,8 @@ def tables(grid: Sequence[Trained], planned: Sequence[tuple[str, str, float, Run
         "method", "scene", "steps", "Gaussians at most", "decay", "further", "seed", "cost of a step", "train (s)",
         "Gaussians", "PSNR (dB)",
     )  # fmt: skip
-    lines = ["# Accuracy against steps and Gaussians, and planned runs", "", *markdown_table(head, rows, "llrrrlrrrrr")]
+    lines = ["# Accuracy against steps and Gaussians, and planned runs", "", about, ""]
+    lines += markdown_table(head, rows, "llrrrlrrrrr")
     if not planned:
         return "\n".join([*lines, ""])
     rows = []

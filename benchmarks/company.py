@@ -42,11 +42,16 @@ def run(
         threads: CPU threads of a run; None is all cores.
 
     Raises:
-        SceneError: a number counts nothing, a run failed, or runs side by side take longer than the limit.
+        SceneError: a number counts nothing, the folder holds runs, a run failed, or runs side by side take longer than the
+            limit.
     """
     check_count("study.rounds", rounds)
     check_count("study.together", together)
     output_dir = Path(output_dir)
+    if (output_dir / "first").exists():
+        raise SceneError(
+            f"{output_dir} holds runs, and a finished one is not run again: give a new folder with hydra.run.dir"
+        )
     command = [sys.executable, train, *overrides, f"threads={'null' if threads is None else threads}"]
     seconds_of(command, [output_dir / "first"])
     alone, beside = [], []
@@ -77,8 +82,12 @@ def seconds_of(command: Sequence[str], folders: Sequence[Path]) -> float:
     processes = [
         subprocess.Popen(each, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) for each in with_folders
     ]
-    for process in processes:
-        _, errors = process.communicate()
-        if process.returncode:
-            raise SceneError(f"a run of the study failed:\n{' '.join(process.args)}\n{errors[-2000:]}")
+    try:
+        for process in processes:
+            _, errors = process.communicate()
+            if process.returncode:
+                raise SceneError(f"a run of the study failed:\n{' '.join(process.args)}\n{errors[-2000:]}")
+    finally:
+        for process in processes:  # those that go on where one failed or the study is stopped
+            process.terminate()
     return time.perf_counter() - start

@@ -14,10 +14,11 @@ from heatsplat.effects import assembly
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number
-from heatsplat.studies.child_runs import trained
-from heatsplat.studies.options import filled, listed
+from heatsplat.studies.child_runs import all_rows, trained
+from heatsplat.studies.options import counted, filled, listed, named
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
+SELECTIONS = ("auto", "none", "all", "oracle")
 MOST_NAMED = 5  # effects that a cell of the table names
 CLOCKS = {
     "train_seconds": "Milliseconds are those of whole training steps: compare them on a machine that does nothing else.",
@@ -94,7 +95,7 @@ def run(
         output_dir: of the study; runs that have results there are not run again.
         train: path of train.py; None: the installed heatsplat-train.
         presets: synthetic scene -> the effects that are truly there.
-        selections: some of "auto", "none", "all", "oracle".
+        selections: some of SELECTIONS.
         leave_one_out: whether chosen effects are left out in turn.
         seeds: of every row.
         overrides: of every run.
@@ -103,14 +104,12 @@ def run(
         only: names of presets; None for all.
 
     Raises:
-        SceneError: a run failed, its folder holds a run of other settings, there is no such clock or preset, or there is none
-            of what makes a run.
+        SceneError: a run failed, its folder holds a run of other settings, there is no such clock, preset or selection, or
+            there is none of what makes a run.
     """
     check_option("study.clock", clock, CLOCKS, SceneError)
-    chosen = filled("study.presets", list(presets)) if only is None else filled("study.only", only)
-    for name in chosen:
-        check_option("each of study.only", name, presets, SceneError)
-    selections, seeds = filled("study.selections", selections), filled("study.seeds", seeds)
+    chosen = filled("study.presets", list(presets)) if only is None else named("study.only", only, presets)
+    selections, seeds = named("study.selections", selections, SELECTIONS), counted("study.seeds", seeds, least=0)
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *listed(overrides)]
     known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on
@@ -138,7 +137,9 @@ def run(
                         for seed, results in zip(seeds, whole, strict=True)
                     ]
                     rows.append(_row(left, less, clock))
-        write_atomically(folder / TABLE_FILE, tables(rows, clock))  # what is known so far
+        found = {key: [results.run.get(key) for results in known.values()] for key in ("threads", "steps")}
+        about = all_rows(common, seed=seeds, threads=found["threads"], max_steps=found["steps"])
+        write_atomically(folder / TABLE_FILE, tables(rows, clock, about))  # what is known so far
     figure = picture(rows)
     if figure is not None:
         write_png(folder / PICTURE_FILE, figure_picture(figure))
@@ -167,8 +168,8 @@ def _row(job: Job, results: Sequence[RunResults], clock: str) -> Row:
     )
 
 
-def tables(rows: Sequence[Row], clock: str) -> str:
-    """Markdown: selections side by side, then what leaving each effect out costs."""
+def tables(rows: Sequence[Row], clock: str, about: str) -> str:
+    """Markdown: what all runs have, selections side by side, then what leaving each effect out costs."""
     chosen = [
         (
             row.job.preset, row.job.selection, row.shown, _told(row.psnr, 2), _told(row.clean_psnr, 2), _told(row.mae_c, 3),
@@ -182,6 +183,8 @@ def tables(rows: Sequence[Row], clock: str) -> str:
         "# What selecting effects is worth",
         "",
         f"{NOTE} {CLOCKS[clock]}",
+        "",
+        about,
         "",
         *markdown_table(head, chosen, align="lllrrrrr"),
     ]

@@ -25,17 +25,18 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
-from heatsplat.studies.options import filled, listed
+from heatsplat.studies.child_runs import refuse_others
+from heatsplat.studies.options import check_count, filled, listed
 from heatsplat.training.machine import cores, prepare_machine
 
 log = logging.getLogger("heatsplat")
 
-HEAD = """# Effects: which physical effects a scene shows, and how `method=auto` decides
-
-This page is generated, with one recording of each scene and set, in the smallest size:
-`python src/study.py study=evidence study.sizes=[tiny] study.seeds=[0] study.unseen=[20] "study.drawn={tuned on:[0,0]}"`.
-Without these options there are five of each, in two sizes, and the random scenes on which rules were tuned.
-
+SCENES = (
+    "static", "cooling", "heated", "glass", "noisy_sensor", "haze", "drifting", "drifting_cooling", "uneven", "dark_corners",
+    "uneven_heated", "blurred", "blurred_cooling", "bent_tone", "mirrors", "dull", "sheets", "outdoor", "swung", "moving_camera",
+)  # fmt: skip
+TITLE = "# Effects: which physical effects a scene shows, and how `method=auto` decides"
+HEAD = """
 `method=auto` simulates an effect if its *evidence* exceeds its *threshold* and the decision is sufficiently certain. Evidence
 is a statistic of the training images that stays below the threshold under the effect's null hypothesis. An effect whose
 metadata are missing is off, and its reason says so.
@@ -87,8 +88,8 @@ them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere 
 **Weather.** Sun, sky and wind are judged by heat balances fitted with and without them (`effects/weathered.py`); massive
 walls by balances of bodies with one rate, with a core, and of infinite depth.
 
-- Sun, sky and wind count from a gain of two standard errors on: a part that is absent loses on held-out observations. On the 200
-  scenes below that were not inspected, three standard errors found 61 of 91, two find 70, and one more is wrongly found.
+- Sun, sky and wind count from a gain of two standard errors on: a part that is absent loses on held-out observations. On 200
+  random scenes that were not inspected, three standard errors found 61 of 91, two find 70, and one more is wrongly found.
 - Shadows are cast by the sparse points and add no parameter to a balance. They gain 0.13 dB (3.2 standard errors) on
   `outdoor_true` (demo) and lose 0.85 dB on `outdoor`, which has none.
 - Hidden sky, light from the ground and reflected sky are tested in the same way, but they also absorb other errors of a
@@ -220,7 +221,7 @@ class Outcome:
 def run(
     output_dir: Path | str,
     data: Callable[..., Any],
-    scenes: Sequence[str],
+    scenes: Sequence[str] | None = None,
     sizes: Sequence[str] = ("tiny",),
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     unseen: Sequence[int] = (),
@@ -234,18 +235,25 @@ def run(
 
     Args:
         output_dir: folder of the results.
-        data: makes the data module of a scene from ``scene``, ``size`` and ``scene_seed``; its notes name the "effects".
-        scenes, sizes: verdicts are asked for every pair of them.
+        data: makes the data module of a scene from ``scene``, ``size`` and ``scene_seed``; its notes name the "effects". What a
+            partial function has further is kept with the verdicts.
+        scenes, sizes: verdicts are asked for every pair of them; None for SCENES.
         seeds: of the recordings of each.
         unseen: of further ones, which no threshold was set on; they are counted apart.
         drawn: first number and count of scenes that are drawn at random, by what they are called; they are of the first size.
-        document: file that is written besides, and in "pictures" beside it how verdicts go with the strength of effects; None
-            for none.
+        document: file that is written besides, and in "pictures" beside it how verdicts go with the strength of effects, where
+            all scenes were asked for, and recordings of each kind: seeds, unseen and drawn. None for none.
         jobs: recordings that are worked on side by side, with one thread each; None: one for each core.
 
     Raises:
-        SceneError: there is no size, or nothing to decide on.
+        SceneError: there is no size, or nothing to decide on, or a verdict is of other settings of the data.
     """
+    whole = (
+        scenes is None and bool(listed(seeds) and listed(unseen)) and any(count for _, count in (drawn or {}).values())
+    )
+    scenes = SCENES if scenes is None else scenes
+    if jobs is not None:
+        check_count("study.jobs", jobs)
     sizes, scenes, seeds, unseen = filled("study.sizes", sizes), listed(scenes), listed(seeds), listed(unseen)
     numbers = {name: range(first, first + count) for name, (first, count) in (drawn or {}).items()}
     cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
@@ -255,9 +263,14 @@ def run(
     folder = Path(output_dir) / "verdicts"
     folder.mkdir(parents=True, exist_ok=True)
     known = {case: folder / f"{'_'.join(map(str, case))}.json" for case in cases}
+    settings = [f"data.{key}={value}" for key, value in getattr(data, "keywords", {}).items()]
     waiting = [case for case in cases if not known[case].exists()]
+    for path in (known[case] for case in cases if case not in waiting):
+        refuse_others(path, json.loads(path.read_text(encoding="utf-8")).get("settings", ()), settings)
     for done, outcome in enumerate(_outcomes(data, waiting, cores() if jobs is None else jobs), start=1):
-        write_atomically(known[outcome.scene, outcome.size, outcome.seed], json.dumps(_plain(outcome), indent=1))
+        write_atomically(
+            known[outcome.scene, outcome.size, outcome.seed], json.dumps(_plain(outcome, settings), indent=1)
+        )
         log.info("%d of %d: %s %s %d", done, len(waiting), outcome.scene, outcome.size, outcome.seed)
         for name in sorted(outcome.missed | outcome.taken):
             log.info("    %s is %s", name, "missed" if name in outcome.present else "not there")
@@ -265,7 +278,7 @@ def run(
     outcomes = [_read(path) for path in known.values()]
     text = written(outcomes, frozenset(unseen), numbers)
     figure = picture([one for one in outcomes if one.strengths])
-    for path in (Path(output_dir) / "effects.md", *([Path(document)] if document else [])):
+    for path in (Path(output_dir) / "effects.md", *([Path(document)] if document and whole else [])):
         path.write_text(text, encoding="utf-8")
         if figure is not None:
             (path.parent / "pictures").mkdir(exist_ok=True)
@@ -307,12 +320,13 @@ def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Ou
     return Outcome(scene, size, seed, frozenset(recorded.notes["effects"]), verdicts, seconds, conditions, strong)
 
 
-def _plain(outcome: Outcome) -> dict[str, Any]:
-    return {**asdict(outcome), "present": sorted(outcome.present)}
+def _plain(outcome: Outcome, settings: Sequence[str]) -> dict[str, Any]:
+    return {**asdict(outcome), "present": sorted(outcome.present), "settings": settings}
 
 
 def _read(path: Path) -> Outcome:
     said = json.loads(path.read_text(encoding="utf-8"))
+    said.pop("settings", None)
     verdicts = {name: Verdict(**verdict) for name, verdict in said["verdicts"].items()}
     sets = {"present": frozenset(said["present"]), "conditions": tuple(said["conditions"])}
     return Outcome(**{**said, "verdicts": verdicts, **sets})
@@ -329,6 +343,7 @@ def written(
         for name, numbers in (drawn or {}).items()
     }
     outcomes = [one for one in outcomes if not one.scene.startswith(DRAWN)]
+    made_by = f"This page is generated:\n`{_command(outcomes, unseen, drawn or {})}`."
     rows = [
         (
             effect.name, effect.stage, effect.summary, effect.source, ", ".join(sorted(effect.needs)) or "images",
@@ -336,7 +351,7 @@ def written(
         )
         for effect in CATALOGUE
     ]  # fmt: skip
-    lines = [HEAD, "## The catalogue\n", *markdown_table(COLUMNS, rows)]
+    lines = [TITLE, "", made_by, HEAD, "## The catalogue\n", *markdown_table(COLUMNS, rows)]
     for size in dict.fromkeys(outcome.size for outcome in outcomes):
         for which, wanted in ((size, False), (f"{size}, on recordings not used to set thresholds", True)):
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
@@ -344,6 +359,22 @@ def written(
     for name, these in of_numbers.items():
         lines += _of_drawn(name, these) if these else []
     return "\n".join(lines) + "\n"
+
+
+def _command(outcomes: Sequence[Outcome], unseen: Collection[int], drawn: Mapping[str, Collection[int]]) -> str:
+    """What makes the page: scenes where they are not all, sizes, seeds and numbers of scenes that are drawn at random."""
+    scenes, sizes, seeds = (
+        [*dict.fromkeys(getattr(one, name) for one in outcomes)] for name in ("scene", "size", "seed")
+    )
+    sets = ",".join(f"{name}:[{min(numbers, default=0)},{len(numbers)}]" for name, numbers in drawn.items())
+    lists = {
+        **({} if scenes == [*SCENES] else {"scenes": scenes}), "sizes": sizes,
+        "seeds": [seed for seed in seeds if seed not in unseen], "unseen": sorted(unseen),
+    }  # fmt: skip
+    words = [f"study.{key}=[{','.join(map(str, values))}]" for key, values in lists.items()]
+    return " ".join(
+        ["python src/study.py study=evidence", *words, f'"study.drawn={{{sets}}}"' if sets else "study.drawn=null"]
+    )
 
 
 def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.datamodules.formats.colmap import SparseModel, read_model, write_model
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
@@ -32,9 +32,10 @@ from heatsplat.geometry.alignment import PoseErrors, pose_errors
 from heatsplat.io.command_lines import setting
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import refuse_others, trained
+from heatsplat.studies.options import counted, filled, listed
 
-TABLE_FILE, SPENT_FILE = "found_cameras.md", "spent.json"
+TABLE_FILE, SPENT_FILE, CASE_FILE = "found_cameras.md", "spent.json", "case.json"
 FLIGHT = "flight"  # a case's scene: the synthetic yard from a drone; others are presets
 
 log = logging.getLogger("heatsplat")
@@ -72,9 +73,15 @@ def run(
         seeds: of training; cameras are found once.
 
     Raises:
-        SceneError: prepare.py found no cameras, or a run failed.
+        SceneError: there is no case or seed or no such scene, prepare.py found no cameras, a run failed, or what is done was done
+            with other settings.
     """
-    output_dir = Path(output_dir)
+    output_dir, seeds = Path(output_dir), counted("study.seeds", seeds, least=0)
+    overrides = None if overrides is None else listed(overrides)
+    filled("study.cases", list(cases or {}))
+    for name, case in cases.items():
+        if "files" not in case:
+            check_option(f"study.cases.{name}.scene", case.get("scene"), (FLIGHT, *PRESETS), SceneError)
     cameras, training = [], []
     for name, case in cases.items():
         place = output_dir / name
@@ -135,26 +142,34 @@ def prepared(prepare: str, settings: Sequence[str], target: Path) -> dict[str, f
     """Makes a scene, and returns the seconds of processor cores and the MiB at most that the command took.
 
     Raises:
+        OtherSettingsError: the scene is there, of other settings.
         SceneError: it failed.
     """
     note = target / SPENT_FILE
     if note.is_file():
-        return json.loads(note.read_text())
+        spent = json.loads(note.read_text())
+        refuse_others(target, spent.pop("settings", ()), settings)
+        return spent
     log.info("preparing %s", target)
     command = [sys.executable, prepare, *settings, f"target={target}"]
     target.mkdir(parents=True, exist_ok=True)
     with (target.parent / f"{target.name}.log").open("w+") as said:
         process, most = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT), 0.0
-        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
-            most = max(most, _peak_mib(process.pid))
-            time.sleep(0.05)
+        try:
+            while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+                most = max(most, _peak_mib(process.pid))
+                time.sleep(0.05)
+        except BaseException:  # the study is stopped, and what it started with it
+            process.terminate()
+            process.wait()
+            raise
         _, status, usage = ended  # whose largest size would be at least that of this process
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             said.seek(0)
             raise SceneError(f"{' '.join(command)}\nfailed:\n{said.read()[-2000:]}")
     spent = {"cpu_s": usage.ru_utime + usage.ru_stime, "mib": most}
-    write_atomically(note, json.dumps(spent))
+    write_atomically(note, json.dumps({"settings": list(settings), **spent}))
     return spent
 
 
@@ -174,13 +189,18 @@ def _given(case: Mapping[str, Any], place: Path) -> tuple[Path, Truth]:
         model = read_model(Path(case["model"]))
         stems = [PurePath(name).stem for name in model.names]
         return Path(case["files"]), Truth(dict(zip(stems, model.viewmats, strict=True)), model.lenses[0])
-    scene, field = case.pop("scene"), dict(case)
+    field = dict(case)
+    scene = field.pop("scene")
     size = Size(field.pop("width"), field.pop("height"), field.pop("frames"), points=16)
     recording = flight(size) if scene == FLIGHT else film(Scene(PRESETS[scene]), size)
-    files = place / "files"
-    if not files.is_dir():
+    files, made_from = place / "files", [f"{key}={value}" for key, value in case.items()]
+    if files.is_dir():
+        note = files / CASE_FILE
+        refuse_others(files, json.loads(note.read_text()) if note.exists() else (), made_from)
+    else:
         fresh = place / "files.part"
         write_camera(recording, fresh, Field(**field))
+        write_atomically(fresh / CASE_FILE, json.dumps(made_from))
         fresh.rename(files)
     names = [f"frame_{frame:04d}_T" for frame in range(size.frames)]
     return files / "thermal", Truth(dict(zip(names, recording.viewmats, strict=True)), recording.lens)

@@ -23,6 +23,7 @@ from pathlib import Path
 import yaml
 
 from heatsplat.io.tables import markdown_table
+from heatsplat.studies.options import check_count, named
 
 log = logging.getLogger("heatsplat")
 
@@ -219,8 +220,14 @@ def run(
         document: file that is written too when all mutations were run; None for none.
         only: names of the mutations; None for all.
         processes: how many run at a time.
+
+    Raises:
+        SceneError: there is no such mutation, or no process.
     """
-    chosen = [mutation for mutation in MUTATIONS if only is None or mutation.name in only]
+    check_count("study.processes", processes)
+    names = [mutation.name for mutation in MUTATIONS]
+    wanted = names if only is None else named("study.only", only, names)
+    chosen = [mutation for mutation in MUTATIONS if mutation.name in wanted]
     # A child of this process would inherit OpenMP threads that do not run in it, and die of its first parallel kernel.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(LIBRARIES))

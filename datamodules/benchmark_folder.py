@@ -22,6 +22,7 @@ from heatsplat.datamodules.weather import write_weather
 log = logging.getLogger("heatsplat")
 
 SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
+UNTOLD = {"scene_seed": 0}  # of folders of before it was told
 META, FILES = "meta.json", {"train": "transforms_train.json", "test": "transforms_test.json"}
 OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # from camera axes of OpenCV to those of OpenGL and back
 
@@ -45,30 +46,31 @@ def write_scenes(
         real: further scenes by name, as their data modules.
 
     Raises:
-        SceneError: there is no such scene, or the folder holds scenes of another size.
+        SceneError: there is no such scene, or the folder holds scenes of another size, seed or other options.
     """
     target = Path(target or output_dir).expanduser()
-    known = {
-        name: partial(
-            Synthetic, size=size or protocol["size"], scene_seed=protocol["scene_seed"], split="parts",
-            **{**entry["data"], "parts": {**protocol["parts"], **entry.get("parts", {})}},
-        )
+    told = {
+        name: {"size": size or protocol["size"], "scene_seed": protocol["scene_seed"]}
+        | {"options": {**entry["data"], "parts": {**protocol["parts"], **entry.get("parts", {})}}}
         for name, entry in protocol["scenes"].items()
-    }  # fmt: skip
+    }
+    known = {
+        name: partial(Synthetic, split="parts", size=own["size"], scene_seed=own["scene_seed"], **own["options"])
+        for name, own in told.items()
+    }
     known |= {name: partial(lambda module: module, module) for name, module in (real or {}).items()}
     if unknown := set(scenes or ()) - set(known):
         raise SceneError(f"study.scenes: there is no {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for name in scenes or known:
-        made_from = {
-            "protocol": protocol["version"],
-            "size": None if name in (real or {}) else size or protocol["size"],
-        }
+        made_from = {"protocol": protocol["version"], **({"size": None} if name in (real or {}) else told[name])}
         meta = target / SCENES / name / META
         if meta.exists():
             there = json.loads(meta.read_text())
-            if {key: there.get(key) for key in made_from} != made_from:
+            before = {key: there.get(key, UNTOLD.get(key, value)) for key, value in made_from.items()}
+            if changed := [key for key, value in made_from.items() if before[key] != value]:
                 raise SceneError(
-                    f"{meta.parent} is of another size or protocol: delete it, or give study.target another folder"
+                    f"{meta.parent} was written with another {' and '.join(changed)}: delete it, or give study.target another "
+                    "folder"
                 )
             log.info("%s is there already", meta.parent)
             continue

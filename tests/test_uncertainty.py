@@ -163,13 +163,17 @@ def levels(values, views=5, doubt=None):
     class Levels(dict):
         names = ("level",)
 
+        def __init__(self, tensors):
+            super().__init__({name: tensor.clone().requires_grad_() for name, tensor in tensors.items()})
+
         def __len__(self) -> int:
-            return len(values)
+            return len(self["level"])
 
     module = opaque(len(values))
-    module.splats, module.constants = Levels(level=torch.tensor(values, requires_grad=True)), frozenset()
+    module.splats, module.constants = Levels({"level": torch.tensor(values)}), frozenset()
     module.thermal = SimpleNamespace(
         beside=0.0,
+        inseparable="",
         features=lambda splats, query: splats["level"][:, None] + module.thermal.beside,
         attributes=lambda splats, query: {"double": 2 * splats["level"]},
         doubts=lambda: {} if doubt is None else {"beside": partial(off, module, doubt)},
@@ -205,6 +209,18 @@ def test_what_is_taken_for_granted_is_as_uncertain_as_the_model_says():
     torch.testing.assert_close(doubted.of_attributes(FRAME)["double"], expected.float())
 
 
+@pytest.mark.parametrize("inseparable", ["", "they are not"])
+def test_gaussians_are_as_certain_a_few_at_a_time(monkeypatch, inseparable):
+    told = levels([0.2, 0.4, 0.1, 0.35, 0.3], doubt=0.5)
+    whole = told.of_attributes(FRAME)["double"]
+    monkeypatch.setattr(uncertainty, "BLOCK", 2)
+    told.module.thermal.inseparable = inseparable
+    asked, features = [], told.module.thermal.features
+    told.module.thermal.features = lambda splats, query: asked.append(len(splats)) or features(splats, query)
+    torch.testing.assert_close(told.of_attributes(FRAME)["double"], whole, rtol=1e-6, atol=0)
+    assert set(asked) == ({5} if inseparable else {2, 1})
+
+
 def test_gaussians_of_a_pixel_that_disagree_make_it_less_certain():
     frame = replace(FRAME, frame_id=1)
     told, apart = (levels([0.2 + by, 0.4 - by]) for by in (0.1, -0.2))
@@ -228,6 +244,31 @@ def test_views_whose_errors_are_alike_count_as_fewer(kept, expected):
     for draw in draws[1:]:
         chain.append(kept * chain[-1] + (1 - kept**2) ** 0.5 * draw)
     assert redundancy(torch.stack(chain), torch.ones_like(draws)) == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.4, "once", "never"])
+@pytest.mark.parametrize("block", [1, uncertainty.BLOCK])
+def test_views_are_alike_as_products_of_one_lag_after_another_tell(monkeypatch, seen, block):
+    monkeypatch.setattr(uncertainty, "BLOCK", block)
+    views, count = 41, 60
+    draws = torch.randn(2, views, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    residuals = 0.3 * draws[0] + draws[0, :1]
+    if seen == "once":
+        weights = (torch.arange(views)[:, None] == torch.arange(count) % views).double()
+    else:
+        weights = 5 * draws[1].abs() * (draws[1].abs() < (0.0 if seen == "never" else seen)).double()
+    expected, alone, scaled = 1.0, 0.0, residuals * weights.sqrt()
+    for lag in range(views // 2):
+        both = (weights[lag:] * weights[: views - lag]).sqrt().sum().clamp(min=1e-12)
+        alike = float((scaled[lag:] * scaled[: views - lag]).sum() / both)
+        if lag == 0:
+            alone = max(alike, 1e-12)
+        elif alike <= 0:
+            break
+        else:
+            expected += 2 * alike / alone
+    assert (expected > 3) == (seen in (1.0, 0.4))
+    assert redundancy(residuals, weights) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_pixel_that_is_met_exactly_leaves_the_others_their_intervals():

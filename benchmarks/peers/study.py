@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,6 +24,7 @@ from benchmarks.peers.scenes import SharedScene, shared
 from benchmarks.peers.training import score, train_heatsplat, train_opensplat
 from benchmarks.renderer.peers import from_path
 from heatsplat.contracts import SceneError
+from heatsplat.studies.options import check_count, counted
 
 log = logging.getLogger("heatsplat")
 
@@ -60,13 +62,18 @@ def run(
         rounds: of the rasterisers, in turns.
 
     Raises:
-        SceneError: there is nothing to compare with, or a run failed.
+        SceneError: there is nothing to compare with, an option cannot be used as it is, or a run failed.
     """
     if opensplat is None and not rasteriser:
         raise SceneError(
             "nothing to compare with: give study.opensplat=/path/to/its/executable, or a renderer with "
             "+study.rasteriser.NAME=module:function, or both"
         )
+    if opensplat is not None and shutil.which(opensplat) is None:
+        raise SceneError(f"study.opensplat={opensplat} is no program: give the path of its executable")
+    check_count("study.rounds", rounds)
+    steps, threads = counted("study.steps", steps), counted("study.threads", threads)
+    renderers = {name: from_path(path) for name, path in rasteriser.items()}
     output_dir = Path(output_dir).resolve()
     begin, load = time.perf_counter(), os.getloadavg()[0]
     written = {
@@ -79,7 +86,6 @@ def run(
         write(tables, output_dir, f"The machine's load was {load:.1f}; the study took {seconds:.0f} s.")
 
     if rasteriser:
-        renderers = {name: from_path(path) for name, path in rasteriser.items()}
         drawn = {name: partial(rasterisers.of_points, scene) for name, scene in written.items()}
         drawn |= {f"made up, {case[0]:,}": rasterisers.made_up(case) for case in cases}
         tables["agreement"] = rasterisers.agreement(rasterisers.made_up(agreement)(3), renderers)

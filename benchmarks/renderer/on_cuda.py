@@ -14,12 +14,13 @@ import torch
 from benchmarks.renderer.scenes import Case, build
 from benchmarks.renderer.steps import STILL, at_home, still_scene
 from heatsplat.composition import compose
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels import gpu
 from heatsplat.renderers import rasterization
 from heatsplat.runs.run import build_module
 from heatsplat.runs.stepping import Stepper
+from heatsplat.studies.options import check_count
 
 VIEWS = 10  # that steps and renders take in turn
 WARM_UP = 8  # rounds in which kernels are compiled and memory is found
@@ -46,11 +47,13 @@ def run(
         cases: Gaussians, width and height.
         rounds: of each figure.
         methods: name -> what the command line of the run says.
-        device: where; on "cpu" both ways of a step are the same, and gsplat is left out.
+        device: "cuda" or "cpu", where both ways of a step are the same, and gsplat is left out.
 
     Raises:
-        SceneError: PyTorch sees no such device.
+        SceneError: there is no such device, or PyTorch sees none, or an option counts nothing.
     """
+    check_option("study.device", device, ("cuda", "cpu"), SceneError)
+    check_count("study.rounds", rounds)
     if device == "cuda" and not torch.cuda.is_available():
         raise SceneError(
             "study=cuda times steps on CUDA, and PyTorch sees no CUDA device here; study=steps is for the CPU"

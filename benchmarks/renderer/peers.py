@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.contracts import SceneError
 from heatsplat.geometry.projection import project_gaussians
 from heatsplat.losses.photometric import C1, C2, WINDOW, l1, ssim_map, window
 from heatsplat.renderers.base import ALPHA_MAX, ALPHA_MIN, EPS2D, FOV_MARGIN, rasterization
@@ -37,9 +38,12 @@ def _render(name, means, quats, scales, opacities, features, viewmats, Ks, width
 
 
 def from_path(path: str) -> Renderer:
-    """The function that "module:function" names."""
-    module, _, name = path.partition(":")
-    return getattr(import_module(module), name)
+    """The function that "module:function" names. Raises SceneError where it names none."""
+    module, _, name = str(path).partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SceneError(f"a renderer is given as module:function, got {path} ({error})") from error
 
 
 def render_torch_tiles(means, quats, scales, opacities, features, viewmats, Ks, width, height, tile=16) -> Tensor:

@@ -18,6 +18,7 @@ import torch
 
 from benchmarks.stability.case import TYPES, Case, measured
 from heatsplat.io.tables import markdown_table
+from heatsplat.studies.options import named
 
 log = logging.getLogger("heatsplat")
 
@@ -57,7 +58,11 @@ def run(output_dir: Path | str, document: str | None = None, families: Sequence[
         output_dir: folder of the results.
         document: file whose numbers stay where they still hold, and that is written; None for none.
         families: which of FAMILIES; None for all. Only a whole document is written to ``document``.
+
+    Raises:
+        SceneError: there is no such family.
     """
+    families = None if families is None else named("study.families", families, FAMILIES)
     torch.set_num_threads(1)  # tiny tensors
     committed = Path(document).read_text(encoding="utf-8") if document and Path(document).exists() else ""
     text = written(measurements(families), committed)

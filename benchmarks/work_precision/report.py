@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator
 
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import write_atomically
-from heatsplat.io.tables import markdown_table
+from heatsplat.io.tables import NONE, markdown_table
 from heatsplat.physics.responses import RATES
 
 LEVELS_K = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-6)
@@ -260,7 +260,7 @@ def markdown(rows: Sequence[Any], titles: dict[str, str]) -> list[str]:
                 [
                     f"**{solver}**" if any(r.ours for r in points) else solver,
                     *(_least(points, level) for level in LEVELS_K),
-                    _error(least),
+                    _error(least) if points else NONE,
                     "; ".join(dict.fromkeys(f"{r.setting}: {r.given_up}" for r in lost)),
                 ]
             )

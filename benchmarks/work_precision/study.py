@@ -22,8 +22,10 @@ from torch import Tensor
 from benchmarks.work_precision import report
 from benchmarks.work_precision.problems import Problem, problems
 from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, OverLimit, integrate
+from heatsplat.composition import compose
 from heatsplat.io.tables import write_csv
 from heatsplat.kernels.scheduling import thread_count, use_threads
+from heatsplat.studies.options import listed, named
 
 log = logging.getLogger("heatsplat")
 
@@ -70,7 +72,8 @@ def run(output_dir: Path | str, document: str | None = None, pictures: str | Non
         output_dir: folder of the results.
         document: Markdown file to write as well, or None.
         pictures: folder for the document's pictures, or None.
-        settings: of ``measurements``. The document is written only where all problems and solvers are.
+        settings: of ``measurements``. The document is written only with those of conf/study/work_precision.yaml: it says that
+            its command has none, and few Gaussians or problems replace no whole page.
     """
     begin, load = time.perf_counter(), os.getloadavg()[0]
     rows, titles = measurements(**settings)
@@ -78,7 +81,8 @@ def run(output_dir: Path | str, document: str | None = None, pictures: str | Non
     output_dir.mkdir(parents=True, exist_ok=True)
     write_csv(output_dir / "work_precision.csv", map(asdict, rows), [field.name for field in fields(Row)])
     load, seconds = max(load, os.getloadavg()[0]), time.perf_counter() - begin
-    whole = settings.get("only") is None and settings.get("solvers") is None  # half a table replaces no whole one
+    usual = compose(["study=work_precision"], "study")["study"]
+    whole = all(usual[key] == value for key, value in settings.items())
     rules = report.rules(settings, load, seconds)
     text = report.write(rows, titles, rules, output_dir, document if whole else None, pictures if whole else None)
     log.info("%s", text)
@@ -115,16 +119,14 @@ def measurements(
         once_above_s: what takes longer runs only once.
         limit_s, adaptive_limit_s: an integration is given up after so many seconds of the processor.
         only: names of problems; None for all.
-        solvers: names of time-stepping solvers; None for all.
+        solvers: names of time-stepping solvers; None for all, [] for none.
 
     Raises:
-        ValueError: a name is unknown.
+        SceneError: a name is unknown, or there is no problem.
     """
     makers = problems(gaussians, frames, frequencies)
-    for label, names, known in (("only", only, makers), ("solvers", solvers, NAMES)):
-        for name in names or ():
-            if name not in known:
-                raise ValueError(f"{label} must name some of {', '.join(known)}, got '{name}'")
+    only = list(makers) if only is None else named("study.only", only, makers)
+    solvers = list(NAMES) if solvers is None else listed(solvers) and named("study.solvers", solvers, NAMES)
     before = thread_count(), torch.get_num_threads()
     use_threads(1)
     torch.set_num_threads(1)
@@ -132,12 +134,12 @@ def measurements(
     try:
         with torch.no_grad(), warnings.catch_warnings(), np.errstate(over="ignore", invalid="ignore"):
             warnings.filterwarnings("ignore", "Functional iteration did not converge")  # it shows in the error
-            for name in only or makers:
+            for name in only:
                 problem = makers[name]()
                 titles[name] = problem.title
                 truth = problem.reference(sample)
                 timed, given_up = _forms(problem, tuple(types), tuple(rates)), []
-                for solver in NAMES if solvers is None else solvers:
+                for solver in solvers:
                     adaptive = solver in ADAPTIVE
                     knobs, limit = (tolerances, adaptive_limit_s) if adaptive else (steps[name], limit_s)
                     of_type = [kind for kind in types if solver != RADAU or kind == "float64"]  # scipy has no other
@@ -168,15 +170,17 @@ def _integrations(
     problem: Problem, solver: str, types: Sequence[str], knobs: Sequence[float], limit_s: float
 ) -> Iterator[_Timed | Row]:
     """The integrations by a solver from the coarsest setting on, until one is given up; that one as a row alone."""
-    adaptive, hopeless = solver in ADAPTIVE, False
+    adaptive, hopeless = solver in ADAPTIVE, ""
     for kind in types:
         expected = 0.0
         for i, knob in enumerate(knobs):
             row = _row(problem, solver, f"tolerance {knob:g} K" if adaptive else f"{knob:g} s", kind)
+            row.given_up = hopeless
             try:
-                if hopeless or expected > limit_s:
+                if expected > limit_s:
                     raise OverLimit
-                found = _timed(row, integrate(problem, solver, knob, getattr(torch, kind), limit_s))
+                if not hopeless:
+                    found = _timed(row, integrate(problem, solver, knob, getattr(torch, kind), limit_s))
             except OverLimit:
                 row.given_up = f"over {limit_s:g} s"
             except AssertionError:  # torchdiffeq says so
@@ -185,7 +189,7 @@ def _integrations(
                 log.warning("%s", missing)
                 row.given_up = str(missing)
             if row.given_up:
-                hopeless = adaptive and i == 0  # in the other type too
+                hopeless = row.given_up if adaptive and i == 0 else ""  # in the other type too
                 yield row
                 break
             yield found

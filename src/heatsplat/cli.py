@@ -76,6 +76,8 @@ NO_PLACE |= dict.fromkeys(
     (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
 )
 
+ALL_OF_IT = "HYDRA_FULL_ERROR"  # the environment variable with which errors come with all that Hydra knows of them
+
 EXAMPLES = {
     "train": (
         "method=etgs",
@@ -94,11 +96,25 @@ EXAMPLES = {
 
 def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
     """The command of a job: without arguments it says how it is used, and what cannot be composed is told in a sentence."""
-    name = job.__name__
-    main = hydra.main(version_base="1.3", config_path=CONF, config_name=name)(job)
+    name, all_of_it = job.__name__, False
+
+    @functools.wraps(job)
+    def undisturbed(config: DictConfig) -> Any:
+        """The job, in the environment that the user gave it: commands that it starts say what fails in a sentence, too."""
+        if all_of_it:
+            return job(config)
+        ours = os.environ.pop(ALL_OF_IT, None)  # none in a process of a launcher that does not hand it on
+        try:
+            return job(config)
+        finally:
+            if ours is not None:
+                os.environ[ALL_OF_IT] = ours
+
+    main = hydra.main(version_base="1.3", config_path=CONF, config_name=name)(undisturbed)
 
     @functools.wraps(main)
     def command() -> Any:
+        nonlocal all_of_it
         if len(sys.argv) == 1:
             script = sys.argv[0] if sys.argv[0].endswith(".py") else f"heatsplat-{name}"
             script = f"python {script}" if script.endswith(".py") else script
@@ -109,8 +125,8 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             ]
             print("\n".join([*lines, "", f"{script} --help lists what can be set."]))
             sys.exit(2)
-        all_of_it = "HYDRA_FULL_ERROR" in os.environ
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print otherwise
+        all_of_it = ALL_OF_IT in os.environ
+        os.environ[ALL_OF_IT] = "1"  # Hydra raises what it would print otherwise
         try:
             return main()
         except (CompactHydraException, OmegaConfBaseException) as error:
@@ -134,7 +150,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             sys.exit(_sentence(cause))
         finally:
             if not all_of_it:
-                del os.environ["HYDRA_FULL_ERROR"]
+                del os.environ[ALL_OF_IT]
 
     return command
 
@@ -156,6 +172,8 @@ def _meant(error: Exception, name: str) -> str:
             settings = OmegaConf.to_container(composed(given, name))
         except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
             return ""
+        if inner := _of_dotted_name(settings, wrong):
+            return inner
         keys = [*_keys(settings), *(path.name for path in Path(CONF).iterdir() if path.is_dir())]
         parent, _, leaf = wrong.rpartition(".")
         beside = {
@@ -168,6 +186,17 @@ def _meant(error: Exception, name: str) -> str:
     else:
         return ""
     return f"Did you mean {' or '.join(form.format(one) for one in near)}?" if near else ""
+
+
+def _of_dotted_name(settings: dict[str, Any], wrong: str) -> str:
+    """How a key is set whose name has dots in it, which a path cannot reach; empty where ``wrong`` looks like none."""
+    above, inside, rest = "", settings, wrong
+    while isinstance(inside.get(rest.partition(".")[0]), dict):
+        first, _, rest = rest.partition(".")
+        above, inside = f"{above}.{first}".lstrip("."), inside[first]
+    near = difflib.get_close_matches(rest, [name for name in inside if "." in name], 1)
+    value = next((text.partition("=")[2] for text in sys.argv[1:] if text.partition("=")[0] == wrong), "...")
+    return f"{near[0]} is one name, dots and all: {typed(f'{above}={{{near[0]}:{value}}}')}" if near else ""
 
 
 def _quoted(override: str) -> str:

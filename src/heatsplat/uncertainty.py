@@ -34,6 +34,8 @@ STRETCHES = tuple(10.0**power for power in range(7))
 GEOMETRY = ("means", "log_scales", "quats", "opacity_logits")  # tensors of Gaussians that heat is not told by
 DRAWS = 32  # of signs, by which Gaussians that disagree are weighed: deviations are then known to an eighth
 MOST_NUMBERS = 64  # of each Gaussian, of which intervals are made: their matrices have its square
+BLOCK = 1 << 24  # numbers (128 MB) in the matrices of the Gaussians that are worked on together
+UNALIKE = 1e-7  # what spectra tell of sums of products is exact to 1e-15 of that at lag 0: less than this is none
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Evidence:
 
     weight: Tensor
     misfit: Tensor
+
+
+def _query(frame: Frame) -> Query:
+    """What a frame asks of a thermal model."""
+    return Query(None, frame.camera, frame.time_s, frame.frame_id)
 
 
 def _pixels(view: View, modality: str) -> Tensor:
@@ -82,20 +89,26 @@ def redundancy(residuals: Tensor, weights: Tensor) -> float:
     """How many views tell as much as one would if their errors were independent, 1 or more: the integrated autocorrelation
     time of residuals, up to the first lag at which they are not alike.
 
+    Sums of products at all lags come from spectra (Wiener and Khinchin), so that it takes as long as there are views.
+
     Args:
         residuals: [V, N] of each Gaussian in each view, in the order of time.
         weights: [V, N] by which they count.
     """
-    scaled, found = residuals * weights.sqrt(), 1.0
-
-    def alike(lag: int) -> float:
-        ahead, behind = scaled[lag:], scaled[: len(scaled) - lag]
-        both = (weights[lag:] * weights[: len(weights) - lag]).sqrt()
-        return float((ahead * behind).sum() / both.sum().clamp(min=LEAST))
-
-    for lag in range(1, len(residuals) // 2):
-        share = alike(lag) / max(alike(0), LEAST)
-        if share <= 0.0:
+    views = len(residuals)
+    columns, spectra = max(1, BLOCK // (8 * views)), 0.0
+    for residual, weight in zip(residuals.split(columns, dim=1), weights.split(columns, dim=1), strict=True):
+        roots = weight.double().T.sqrt()
+        rows = torch.stack([residual.double().T * roots, roots])
+        # With as many zeros behind them, or their end would meet their start.
+        spectra = spectra + torch.fft.rfft(rows, n=2 * views).abs().square().sum(1)
+    products, weighed = torch.fft.irfft(spectra, n=2 * views)
+    found, alone = 1.0, products[0] / weighed[0].clamp(min=LEAST)
+    for lag in range(1, views // 2):
+        if weighed[lag] <= UNALIKE * weighed[0]:  # no Gaussian is seen in both
+            break
+        share = float(products[lag] / weighed[lag] / alone.clamp(min=LEAST))
+        if share <= UNALIKE:
             break
         found += 2.0 * share
     return found
@@ -223,8 +236,8 @@ class Uncertainty:
             )  # fmt: skip
             return {}
 
-        def slopes(values: Tensor) -> Tensor:
-            """Derivatives [N, K] of values [N] by the numbers of each."""
+        def slopes(values: Tensor, tensors: Sequence[Tensor]) -> Tensor:
+            """Derivatives [n, K] of values [n] by the numbers of each."""
             if not values.requires_grad:
                 return torch.zeros(len(values), numbers, dtype=torch.float64)
             found = torch.autograd.grad(values.sum(), tensors, allow_unused=True)
@@ -232,7 +245,7 @@ class Uncertainty:
             return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
         def wrong(tell: Callable[[], Tensor], now: Tensor) -> Tensor:
-            """What becomes of values [N] that the model tells where each of its doubts comes true, [N, D]."""
+            """What becomes of values [n] that the model tells where each of its doubts comes true, [n, D]."""
             found = []
             for doubt in module.thermal.doubts().values():
                 with torch.no_grad(), doubt():
@@ -245,41 +258,51 @@ class Uncertainty:
             .double()
             .var(0, correction=min(1, len(module.splats) - 1))  # one alone has no spread
         )
-        known, pulled, weights, residuals = 0.0, 0.0, [], []
-        views = module.scene.train
-        for view in views.subset(sorted(range(len(views)), key=lambda k: views.frames[k].time_s or 0.0)):
-            view = view.to(module.device)
-            weight, residual = _residual(module, view)
-            tells = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
-            query = Query(None, view.camera, view.time_s, view.frame.frame_id)
+        views, count = module.scene.train, len(module.splats)
+        order = sorted(range(len(views)), key=lambda k: views.frames[k].time_s or 0.0)
+        # In float32, as the gradients that tell them: they are all that is kept of every view.
+        weights, residuals = (torch.zeros(len(order), count) for _ in range(2))
+        for i, view in enumerate(views.subset(order)):
+            weight, residuals[i] = _residual(module, view.to(module.device))
+            weights[i] = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
+        repeated = redundancy(residuals, weights)
+        del residuals
+        most = count if module.thermal.inseparable else max(1, BLOCK // numbers**2)
+        found = {name: torch.zeros(count) for name in told}
+        for first in range(0, count, most):
+            part = slice(first, first + most)
+            splats = module.splats
+            if most < count:  # of its own, for the gradient of a part would be as large as the whole
+                splats = type(splats)({name: splats[name].detach()[part] for name in splats.names})
+            tensors = [splats[name] for name in trained]
+            known = torch.zeros(len(splats), numbers, numbers, dtype=torch.float64)
+            pulled = torch.zeros(len(splats), numbers, len(module.thermal.doubts()), dtype=torch.float64)
+            for k, weight in zip(order, weights[:, part], strict=True):
 
-            def sends(query: Query = query) -> Tensor:
-                return module.thermal.features(module.splats, query)[:, 0]
+                def sends(splats: Any = splats, seen: Frame = views.frames[k]) -> Tensor:
+                    return module.thermal.features(splats, _query(seen))[:, 0]
 
-            with torch.enable_grad():
-                now = sends()
-                by = slopes(now)
-            known = known + tells[:, None, None] * by[:, :, None] * by[:, None, :]
-            pulled = pulled + (tells[:, None] * by)[:, :, None] * wrong(sends, now.detach())[:, None, :]
-            weights.append(tells)
-            residuals.append(residual)
-        repeated = redundancy(torch.stack(residuals), torch.stack(weights))
-        precision = known / repeated + torch.diag_embed((1 / (4 * spread).clamp(min=LEAST)).expand(len(known), -1))
-        factor = torch.linalg.cholesky(precision)
-        moved = -torch.cholesky_solve(pulled / repeated, factor) if pulled.shape[2] else pulled
-        now = Query(None, frame.camera, frame.time_s, frame.frame_id)
-        found = {}
-        for name in told:
+                with torch.enable_grad():
+                    now = sends()
+                    by = slopes(now, tensors)
+                weighed = (weight[:, None] * by)[:, :, None]
+                known.addcmul_(weighed, by[:, None, :])
+                pulled.addcmul_(weighed, wrong(sends, now.detach())[:, None, :])
+            known /= repeated
+            known.diagonal(dim1=1, dim2=2).add_(1 / (4 * spread).clamp(min=LEAST))
+            factor = torch.linalg.cholesky(known)
+            moved = -torch.cholesky_solve(pulled / repeated, factor) if pulled.shape[2] else pulled
+            for name in told:
 
-            def tells(name: str = name) -> Tensor:
-                return module.thermal.attributes(module.splats, now)[name]
+                def tells(splats: Any = splats, name: str = name) -> Tensor:
+                    return module.thermal.attributes(splats, _query(frame))[name]
 
-            with torch.enable_grad():
-                values = tells()
-                by = slopes(values)
-            variance = torch.linalg.solve_triangular(factor, by[..., None], upper=False).square().sum((1, 2))
-            off = wrong(tells, values.detach()) + (by[:, None] @ moved)[:, 0]
-            found[name] = (variance + off.square().sum(1)).sqrt().float()
+                with torch.enable_grad():
+                    values = tells()
+                    by = slopes(values, tensors)
+                variance = torch.linalg.solve_triangular(factor, by[..., None], upper=False).square().sum((1, 2))
+                off = wrong(tells, values.detach()) + (by[:, None] @ moved)[:, 0]
+                found[name][part] = (variance + off.square().sum(1)).sqrt().float()
         return found
 
     @torch.no_grad()

@@ -43,7 +43,8 @@ def test_the_grid_becomes_curves_and_rivals_of_planned_runs(tmp_path):
     ]  # fmt: skip
     planned = RunResults(run={"budget": {"train_s": 29.0, "calibration_s": 0.7, "off_percent": -1.0, "steps": 900}})
     planned.put("test", "psnr", 26.0)
-    text = tables(grid, [("etgs", "heated", 30.0, planned)])
+    text = tables(grid, [("etgs", "heated", 30.0, planned)], "All rows: `data.size=demo`.")
+    assert "All rows: `data.size=demo`." in text
     assert "| etgs | heated | 30 | 29.7 | -1.0 % | 900 | 26.00 | 1,000 steps, 8,000, decay 1 | 25.00 | 32.0 |" in text
     assert len(picture(points).axes) == 2
 
@@ -64,7 +65,9 @@ def test_what_settings_cost_is_told_at_equal_gaussians():
     assert costs([few, half]) == pytest.approx([1.0, 5 / 6])  # one number of Gaussians says nothing of others
     found = {point.settings: point.cost for point in means([few, many, half])}
     assert found[half.settings] == pytest.approx(0.5) and found[()] == 1.0
-    assert "| etgs | heated | 1,000 | free | 1 | schedule=coarse_to_fine | 0 | 0.50 |" in tables([few, many, half], [])
+    assert "| etgs | heated | 1,000 | free | 1 | schedule=coarse_to_fine | 0 | 0.50 |" in tables(
+        [few, many, half], [], ""
+    )
 
 
 def test_further_settings_are_measured_beside_the_same_without(tmp_path, monkeypatch):
@@ -163,7 +166,62 @@ def test_planned_runs_read_the_curves_just_written_on_the_threads_asked_for(tmp_
     (grid, none), (planned, points) = asked.values()
     assert none == [] and "budget=30s" in planned and "threads=1" in planned and "threads=1" in grid
     assert all(place.is_absolute() for place in asked)  # whatever the run's working directory
+    assert "All rows: `threads=1 data.size=demo`." in (tmp_path / "study" / "budget.md").read_text()
     assert [point.steps for point in points] == ([250, 4000] if named else [250])
+
+
+def test_other_curves_plan_other_runs(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides, study):
+        asked.append(place)
+        place.mkdir(parents=True, exist_ok=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        results = a_run(0, None, 0, 20.0, 5.0).results
+        results.run["budget"] = {"train_s": 5.0, "calibration_s": 0.1, "off_percent": 0.0, "steps": 250}
+        return results
+
+    monkeypatch.setattr(budget_grid, "trained", trained)
+    settings = {"train": None, "caps": [None], "decays": [1.0], "seeds": [0], "overrides": [], "curves": None}
+    for steps in ([250], [250], [250, 500]):
+        budget_grid.run(tmp_path, scenes=["etgs/heated"], steps=steps, budgets=[30.0], **settings)
+    planned = [place for place in asked if "planned" in place.parts]
+    assert planned[0] == planned[1] != planned[2]
+
+
+def test_settings_of_all_runs_choose_what_a_cap_turns_off(tmp_path, monkeypatch):
+    asked = []
+
+    def trained(place, train, overrides, study):
+        asked.append(overrides)
+        place.mkdir(parents=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        return a_run(0, None, 0, 20.0, 5.0).results
+
+    monkeypatch.setattr(budget_grid, "trained", trained)
+    settings = {"train": None, "steps": 250, "caps": 8000, "decays": 1.0, "seeds": 0, "budgets": [], "curves": None}
+    budget_grid.run(tmp_path, scenes="etgs/heated", overrides="density=mcmc", **settings)
+    (overrides,) = asked
+    running.compose_run(tmp_path, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"scenes": []}, r"study.scenes=\[\] has nothing in it"),
+        ({"steps": ["long"]}, "study.steps must be a whole number, 1 or more, got long"),
+        ({"caps": [0]}, "study.caps must be a whole number, 1 or more, got 0"),
+        ({"decays": ["a"]}, "study.decays must be a number, got a"),
+        ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
+        ({"budgets": ["1min"]}, "study.budgets must be a number, got 1min"),
+        ({"further": [{"set": ["dtype=float64"], "steps": []}]}, r"study.steps=\[\] has nothing in it"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_trained(wrong, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(budget_grid, "trained", lambda *_: pytest.fail("trained"))
+    options = {"scenes": ["etgs/heated"], "steps": [250], "caps": [None], "decays": [1.0], "seeds": [0], "budgets": []}
+    with pytest.raises(SceneError, match=message):
+        budget_grid.run(tmp_path, None, **options | {"overrides": [], "curves": None} | wrong)
 
 
 def test_threads_of_the_study_are_those_of_its_runs(tmp_path):

@@ -1,5 +1,6 @@
 """Runs beside each other: how the study times them. (The ratio itself is measured on an idle machine.)"""
 
+import subprocess
 import sys
 
 import pytest
@@ -27,6 +28,22 @@ def test_what_counts_nothing_is_refused_before_the_first_run(tmp_path, monkeypat
     monkeypatch.setattr(company, "seconds_of", lambda *_: pytest.fail("it ran"))
     with pytest.raises(SceneError, match=f"study.{key} must be a whole number, 1 or more, got {value}"):
         company.run(tmp_path, "train.py", [], **{key: value})
+
+
+def test_a_folder_with_runs_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(company, "seconds_of", lambda *_: pytest.fail("it ran"))
+    (tmp_path / "first").mkdir()
+    with pytest.raises(SceneError, match="holds runs, and a finished one is not run again: give a new folder"):
+        company.run(tmp_path, "train.py", [])
+
+
+def test_no_run_outlives_one_that_failed(tmp_path, monkeypatch):
+    start, started = subprocess.Popen, []
+    monkeypatch.setattr(company.subprocess, "Popen", lambda *a, **b: started.append(start(*a, **b)) or started[-1])
+    program = "import sys, time; 'slow' in sys.argv[1] or sys.exit('no such thing'); time.sleep(60)"
+    with pytest.raises(SceneError, match="no such thing"):
+        company.seconds_of([sys.executable, "-S", "-c", program], [tmp_path / "quick", tmp_path / "slow"])
+    assert started[1].wait(30) != 0
 
 
 @pytest.mark.parametrize("side_by_side", [2.0, 3.0])

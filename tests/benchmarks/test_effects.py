@@ -23,7 +23,7 @@ SETTINGS = {
     "selections": ["auto", "none", "all", "oracle"],
     "leave_one_out": True,
     "seeds": [0, 1],
-    "overrides": ["max_steps=5"],
+    "overrides": ["max_steps=5", "data.size=tiny"],
 }
 
 
@@ -49,7 +49,7 @@ def commands(monkeypatch):
                 on -= dependents(word.removeprefix("effects.").partition("=")[0])
         seed = next(int(word.partition("=")[2]) for word in command if word.startswith("seed="))
         results = RunResults(
-            run={"parameters": 1000 + 100 * len(on), "steps": 5},
+            run={"parameters": 1000 + 100 * len(on), "steps": 5, "threads": 2},
             test={"psnr": 30.0 + seed + len(on & truth), "mae_c": 1.0 - 0.1 * len(on & truth), "clean_psnr": 40.0},
             cost={"train_seconds": 5e-3 * (10 + len(on)), "cpu_seconds": 10e-3 * (10 + len(on))},
             effects={name: {"on": name in on} for name in ("relaxation", "harmonic_source", "conduction", "agc")},
@@ -68,6 +68,7 @@ def test_every_selection_runs_and_each_chosen_effect_is_left_out(commands, tmp_p
     oracle = [command for command in commands if "effects.relaxation=on" in command]
     assert len(oracle) == 2 and all("effects=none" in c and "effects.conduction=on" in c for c in oracle)
     table = (tmp_path / study.TABLE_FILE).read_text()
+    assert "All rows: `data.size=tiny seed=0,1 threads=2 max_steps=5`." in table
     every = "relaxation, harmonic_source"
     assert f"| heated | auto | {every} | 32.50 ± 0.71 | 40.00 ± 0.00 | 0.800 ± 0.000 | 1,200 | 12.0 |" in table
     assert f"| static | all | {every}, agc | 30.50 ± 0.71 | 40.00 ± 0.00 | 1.000 ± 0.000 | 1,300 | 13.0 |" in table
@@ -99,6 +100,8 @@ def test_some_presets_run_and_nothing_is_refused(commands, tmp_path):
         ({"presets": {}}, r"study.presets=\[\] has nothing in it"),
         ({"only": []}, r"study.only=\[\] has nothing in it"),
         ({"only": ["hot"]}, "each of study.only must be one of static, heated, sheets, got 'hot'"),
+        ({"selections": ["nope"]}, "each of study.selections must be one of auto, none, all, oracle, got 'nope'"),
+        ({"seeds": ["a"]}, "study.seeds must be a whole number, 0 or more, got a"),
         ({"selections": []}, r"study.selections=\[\] has nothing in it"),
         ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
     ):

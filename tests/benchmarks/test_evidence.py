@@ -3,6 +3,7 @@
 import json
 import math
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +15,9 @@ from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE
+from heatsplat.studies.child_runs import OtherSettingsError
 
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("static", "cooling", "drifting")
 
 
@@ -64,6 +67,7 @@ def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
     ("wrong", "message"),
     [
         ({"sizes": []}, r"study.sizes=\[\] has nothing in it"),
+        ({"jobs": 0}, "study.jobs must be a whole number, 1 or more, got 0"),
         ({"scenes": [], "drawn": None}, "study.scenes, study.seeds and study.drawn name no recording"),
     ],
 )
@@ -93,6 +97,55 @@ def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path, m
     (tmp_path / "verdicts" / "drawn_9_tiny_9.json").unlink()
     assert run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1).split("took")[0] == text.split("took")[0]
     assert asked[3:] == ["drawn_9"]
+
+
+@pytest.fixture
+def undecided(monkeypatch):
+    """Stands in for what decides: nothing is found."""
+    nothing = {effect.name: Verdict(effect.name, False, None, None, "") for effect in CATALOGUE}
+
+    def outcome(data, scene, size, seed):
+        return Outcome(scene, size, seed, frozenset(), nothing, 0.1, (), {})
+
+    monkeypatch.setattr(evidence, "outcome_of", outcome)
+
+
+def test_verdicts_on_other_data_are_refused(tmp_path, undecided):
+    for _ in range(2):
+        run(tmp_path, partial(Synthetic, noise_k=0.1), ["static"], seeds=[0])
+    with pytest.raises(
+        OtherSettingsError, match=r"static_tiny_0.json was made .*\(data.noise_k=0.1, data.noise_k=0.2\)"
+    ):
+        run(tmp_path, partial(Synthetic, noise_k=0.2), ["static"], seeds=[0])
+
+
+def test_the_document_is_written_of_all_scenes_and_kinds_and_says_how_it_was_made(tmp_path, undecided):
+    document = tmp_path / "page.md"
+    whole = {
+        "seeds": [0],
+        "unseen": [20],
+        "drawn": {"tuned on": [0, 0], "looked at": [4, 1]},
+        "document": str(document),
+    }
+    for part in (
+        {"scenes": ["static"]},
+        {"seeds": []},
+        {"unseen": []},
+        {"drawn": {"tuned on": [0, 0]}},
+        {"drawn": None},
+    ):
+        run(tmp_path, Synthetic, **whole | part)
+        assert not document.exists(), part
+    run(tmp_path, Synthetic, **whole)
+    command = "python src/study.py study=evidence study.sizes=[tiny] study.seeds=[0] study.unseen=[20]"
+    assert f'\n`{command} "study.drawn={{tuned on:[0,0],looked at:[4,1]}}"`.\n' in document.read_text()
+    assert set(evidence.SCENES) <= set(PRESETS | OUTDOOR)
+
+
+def test_the_committed_page_begins_as_it_would_be_written_now():
+    page = (ROOT / "docs" / "effects.md").read_text()
+    assert page.startswith(f"{evidence.TITLE}\n\nThis page is generated:\n`python src/study.py study=evidence ")
+    assert f"`.\n{evidence.HEAD}\n## The catalogue\n" in page
 
 
 def test_verdicts_are_counted_by_the_strength_of_effects():

@@ -1,5 +1,6 @@
 """The study of found cameras: what it hands to prepare.py and train.py, and what it says of either."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.io.results import RunResults
+from heatsplat.studies.child_runs import OtherSettingsError
 
 LENS = ("PINHOLE", (30.0, 30.0, 16.0, 12.0), 32, 24)
 CASE = {"scene": "cooling", "width": 32, "height": 24, "frames": 5, "dead_pixels": 3}
@@ -89,8 +91,49 @@ def test_what_a_command_takes_is_kept_and_what_it_says_where_it_fails(tmp_path):
     assert 0.05 < spent["cpu_s"] < 60.0 and 4.0 < spent["mib"] < 60.0  # not those of the tests
     works.write_text("raise SystemExit('no cameras')")
     assert prepared(str(works), ["a=1"], tmp_path / "one") == spent
+    with pytest.raises(OtherSettingsError, match=r"one was made with other settings \(a=1, a=2\)"):
+        prepared(str(works), ["a=2"], tmp_path / "one")
     with pytest.raises(SceneError, match=f"(?s){Path(sys.executable).name}.*target=.*no cameras"):
         prepared(str(works), ["a=1"], tmp_path / "two")
+
+
+def test_a_study_that_is_stopped_leaves_nothing_running(tmp_path, monkeypatch):
+    started = []
+
+    def stop(process):
+        started.append(process)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(found_cameras, "_peak_mib", stop)
+    (tmp_path / "prepare.py").write_text("import time; time.sleep(60)")
+    with pytest.raises(KeyboardInterrupt):
+        prepared(str(tmp_path / "prepare.py"), [], tmp_path / "one")
+    with pytest.raises(ProcessLookupError):
+        os.kill(started[0], 0)
+
+
+def test_files_of_another_recording_are_refused(tmp_path):
+    found_cameras._given(CASE, tmp_path)
+    found_cameras._given(CASE | {"settings": ["poses.clip=2"]}, tmp_path)  # of prepare.py
+    with pytest.raises(
+        OtherSettingsError, match=r"files was made with other settings \(dead_pixels=3, dead_pixels=4\)"
+    ):
+        found_cameras._given(CASE | {"dead_pixels": 4}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"cases": {}}, r"study.cases=\[\] has nothing in it"),
+        ({"cases": {"room": CASE | {"scene": "nope"}}}, "study.cases.room.scene must be one of flight, .*got 'nope'"),
+        ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_prepared(wrong, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(found_cameras, "prepared", lambda *_: pytest.fail("it ran"))
+    options = {"cases": {"room": CASE}, "overrides": None} | wrong
+    with pytest.raises(SceneError, match=message):
+        found_cameras.run(tmp_path, "prepare.py", "train.py", **options)
 
 
 def test_its_configuration_names_cases_that_there_are():

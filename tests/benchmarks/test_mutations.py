@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutations import MUTATIONS, SURVIVED, Mutation
+from benchmarks.mutations import MUTATIONS, SURVIVED, Mutation, run
+from heatsplat.contracts import SceneError
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,6 +24,12 @@ def test_what_is_mutated_still_stands_in_the_source(mutation):
 def test_a_place_that_is_gone_is_named():
     with pytest.raises(ValueError, match=r"mutation 'none' looks for one place in units.py, found 0"):
         Mutation("none", "physics.units", "no such line", "", "tests/physics/test_units.py").source()
+
+
+def test_names_that_there_are_not_are_told_before_anything_runs(tmp_path):
+    with pytest.raises(SceneError, match="each of study.only must be one of .*got 'nope'"):
+        run(tmp_path, only=["nope"])
+    assert list(tmp_path.iterdir()) == []
 
 
 PROBE = """

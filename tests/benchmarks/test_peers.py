@@ -261,3 +261,28 @@ def test_nothing_to_compare_with_is_an_error(tmp_path):
             agreement=[9, 8, 8],
             **SETTINGS,
         )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rounds": 0}, "study.rounds must be a whole number, 1 or more, got 0"),
+        ({"threads": []}, r"study.threads=\[\] has nothing in it"),
+        ({"steps": ["long"]}, "study.steps must be a whole number, 1 or more, got long"),
+        ({"opensplat": "/nonexistent"}, "study.opensplat=/nonexistent is no program: give the path of its executable"),
+        ({"rasteriser": {"mine": "module"}}, "a renderer is given as module:function, got module"),
+        ({"rasteriser": {"mine": "math:nope"}}, "a renderer is given as module:function, got math:nope"),
+    ],
+)
+def test_what_is_wrong_is_said_before_scenes_are_written(wrong, message, garden, tmp_path):
+    options = {
+        "opensplat": None,
+        "theirs": {},
+        "ours": {},
+        "steps": [1],
+        "threads": [1],
+        "rasteriser": {"tiles": TILES},
+    }
+    with pytest.raises(SceneError, match=message):
+        study.run(tmp_path, scenes={"garden": garden}, agreement=[9, 8, 8], **SETTINGS | options | wrong)
+    assert list(tmp_path.iterdir()) == []

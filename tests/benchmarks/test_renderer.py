@@ -70,6 +70,8 @@ def test_the_study_of_cuda_times_steps_and_refuses_a_machine_without(tmp_path, m
     (row,) = tables["steps"]
     assert row["method"] == "etgs" and row["ms"] > 0 and row["plain torch ms"] > 0 and tables["renderer"] == []
     assert "etgs" in (tmp_path / "cuda.md").read_text()
+    with pytest.raises(SceneError, match="study.device must be one of cuda, cpu, got 'gpu'"):
+        on_cuda.run(tmp_path, [(300, 32, 24)], 2, {}, device="gpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SceneError, match="study=cuda times steps on CUDA.*study=steps is for the CPU"):
         on_cuda.run(tmp_path, [(300, 32, 24)], 2, {})

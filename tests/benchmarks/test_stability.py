@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.stability.study import COLUMNS, FAMILIES, cases, cell, holds, measurements, numbers_of, written
+from benchmarks.stability.study import COLUMNS, FAMILIES, cases, cell, holds, measurements, numbers_of, run, written
+from heatsplat.contracts import SceneError
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
 
@@ -40,6 +41,12 @@ def test_the_printed_form_is_worse_in_every_case(rows, family):
         if name == family:
             ratios = [forms["printed"][c] / forms["ours"][c] for c in COLUMNS if forms["ours"][c]]
             assert max(ratios) > 10, case.name
+
+
+def test_a_word_is_a_list_of_one_and_a_family_that_there_is_not_is_named(tmp_path):
+    assert run(tmp_path, families="images").count("\n## ") == 1
+    with pytest.raises(SceneError, match="each of study.families must be one of closed_form, .*got 'nope'"):
+        run(tmp_path, families=["nope"])
 
 
 def test_names_of_cases_are_unique():

@@ -12,6 +12,8 @@ from running import compose_run
 from benchmarks.work_precision import problems, report, solvers
 from benchmarks.work_precision import study as work_precision
 from heatsplat import cli
+from heatsplat.composition import compose
+from heatsplat.contracts import SceneError
 
 TINY = {
     "gaussians": 48, "frames": 4, "frequencies": 24, "sample": 4, "types": ["float32", "float64"], "steps": {},
@@ -96,17 +98,22 @@ def test_what_is_given_up_is_said(monkeypatch):
         only=["cooling"],
         solvers=["dopri5 (torchdiffeq)", "RK4"],
         steps={"cooling": [50.0, 1e-4]},
-        types=["float32"],
         tolerances=[1.0],
         limit_s=0.5,
     )
-    given_up = {r.solver: r.given_up for r in rows if r.given_up}
+    given_up = {(r.solver, r.type): r.given_up for r in rows if r.given_up}
+    missing = "dopri5 (torchdiffeq) is left out: pip install torchdiffeq"
     assert given_up == {
-        "dopri5 (torchdiffeq)": "dopri5 (torchdiffeq) is left out: pip install torchdiffeq",
-        "RK4": "over 0.5 s",
+        ("dopri5 (torchdiffeq)", "float32"): missing,
+        ("dopri5 (torchdiffeq)", "float64"): missing,
+        ("RK4", "float32"): "over 0.5 s",
+        ("RK4", "float64"): "over 0.5 s",
     }
     text = "\n".join(report.markdown(rows, {"cooling": "Cooling"}))
-    assert "pip install torchdiffeq" in text and "0.0001 s: over 0.5 s" in text
+    assert (
+        "| – | tolerance 1 K: dopri5 (torchdiffeq) is left out: pip install torchdiffeq |" in text
+    )  # no smallest error
+    assert "0.0001 s: over 0.5 s" in text
     equation = solvers._Clocked(problems.problems(4, 3, 0)["cooling"]().equation(torch.float64), limit_s=-1.0)
     with pytest.raises(solvers.OverLimit):
         equation.slope(0.0, torch.zeros(4).double())
@@ -136,5 +143,19 @@ def test_the_study_runs_from_its_configuration(tmp_path):
     text = (tmp_path / "table.md").read_text()
     assert "## Rules" in text and "the front consists of" in text and "nan" not in text
     assert not document.exists()  # half a table does not replace a whole one
-    with pytest.raises(ValueError, match="solvers must name some of explicit Euler.*got 'RK5'"):
+    with pytest.raises(SceneError, match="each of study.solvers must be one of explicit Euler.*got 'RK5'"):
         measured(solvers=["RK5"])
+    assert {row.problem for row in measured(only="cooling", solvers=[])} == {"cooling"}
+
+
+def test_the_page_is_written_only_with_the_settings_that_it_states(tmp_path, monkeypatch):
+    rows = measured(only=["cooling"], solvers=[], types=["float32"])
+    monkeypatch.setattr(work_precision, "measurements", lambda **_: (rows, {"cooling": "Cooling"}))
+    usual = compose(["study=work_precision"], "study")["study"]
+    usual = {key: value for key, value in usual.items() if key not in ("_target_", "document", "pictures")}
+    page = tmp_path / "page.md"
+    for changed in ({"gaussians": 16}, {"types": ["float32"]}, {"solvers": ["RK4"]}):
+        work_precision.run(tmp_path, str(page), str(tmp_path), **usual | changed)
+        assert not page.exists()
+    work_precision.run(tmp_path, str(page), str(tmp_path), **usual)
+    assert page.exists()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from weathered import HOUR_S, make_weather
 
+from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.weathered import (
     ALBEDO,
     EXCHANGE_W_M2_K,
@@ -20,6 +21,7 @@ from heatsplat.effects.weathered import (
     Weathered,
     around,
     judged,
+    weighed,
 )
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN, kelvin
@@ -158,3 +160,10 @@ def test_points_that_follow_the_weather_are_no_levels_and_need_no_neighbours():
     weathered = recorded(lit=lambda sun: torch.ones(POINTS), **seen)
     assert weathered.follows.sigmas > SIGMAS and weathered.follows.db > 1.0
     assert weathered.flow.db < MIN_DB and recorded().flow is None
+
+
+def test_a_certain_gain_that_is_too_small_does_not_ask_for_more_frames():
+    for gain, large in ((HeldOut(2.5, 5.0, 48), False), (HeldOut(0.1, 5.0, 48), True)):
+        evidence = weighed(gain, "found", large)
+        assert not evidence.told and "too small" in evidence.reason and "frames" not in evidence.reason
+    assert "from 48 frames, about 108 would tell" in weighed(HeldOut(2.5, 2.0, 48), "found").reason

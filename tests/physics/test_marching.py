@@ -118,6 +118,21 @@ def test_splits_and_a_checkpoint_find_the_bits_that_were_there(climate, surface)
     assert (found - here).abs().max() > 1
 
 
+def test_of_moments_that_do_not_fit_in_memory_the_latest_are_kept(climate, surface, monkeypatch):
+    names = parameters(surface)
+    whole, marched_at = Kept(climate, MOMENTS), torch.zeros(COUNT, len(names))
+    monkeypatch.setattr(marching, "KEPT_BYTES", 4 * COUNT * (1 + len(names)) * marched_at.element_size())
+    some = Kept(climate, MOMENTS)
+    for count, fit in ((COUNT, 4), (COUNT // 2, 8), (COUNT // 20, len(MOMENTS)), (COUNT, 4)):  # as they come and go
+        ids = torch.arange(count)
+        near, at = rows(moved(surface, 0.02), ids), learned(rows(surface, ids))
+        assert [some.has(t, at) for t in MOMENTS.tolist()] == [False] * (len(MOMENTS) - fit) + [True] * fit
+        for time in MOMENTS[-fit:].tolist():
+            found, expected = (kept.temperature(near, time, ids, (near.normals,), at) for kept in (some, whole))
+            assert torch.equal(found, expected)
+        assert some._table.shape[0] == fit
+
+
 def test_derivatives_reach_the_parameters_through_what_is_kept(climate, surface):
     ids, names = torch.arange(COUNT), parameters(surface)
     columns = [value.clone().requires_grad_() for value in names.values()]

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import hydra
 import numpy as np
 import pytest
 from commands import succeeds
-from hydra.errors import InstantiationException, OverrideParseException
+from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
 from omegaconf import OmegaConf
 
 from heatsplat import cli, composition
@@ -221,6 +222,19 @@ def test_a_list_is_told_its_quotes(wrong, meant):
     assert cli._quoted("a=[x,[y=1]]") == cli._quoted("a=['b=c',d=e]") == ""
 
 
+@pytest.mark.parametrize("typed", ["lr_source", "lr_sorce"])
+def test_a_key_with_dots_in_its_name_is_told_as_it_can_be_typed(typed, monkeypatch):
+    wrong = ["study=tune", f"study.cases.etgs.knobs.thermal.{typed}=[0.1,1]"]
+    monkeypatch.setattr(cli.sys, "argv", ["study.py", *wrong])
+    with pytest.raises(ConfigCompositionException) as refused:
+        composition.compose(wrong, "study")
+    told, _, argument = cli._meant(refused.value, "study").partition(": ")
+    assert told == "thermal.lr_source is one name, dots and all"
+    assert argument == '"study.cases.etgs.knobs={thermal.lr_source:[0.1,1]}"'
+    knobs = composition.compose(["study=tune", argument.strip('"')], "study")["study"]["cases"]["etgs"]["knobs"]
+    assert knobs["thermal.lr_source"] == [0.1, 1] and len(knobs) == 3
+
+
 def test_a_group_set_to_null_is_told_its_options(tmp_path):
     output = command("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
     assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
@@ -272,6 +286,21 @@ def command_that_raises(error, monkeypatch):
         raise error
 
     return cli._command(train)
+
+
+def test_what_a_job_starts_has_the_environment_that_the_user_gave_it(monkeypatch):
+    monkeypatch.setattr(cli.hydra, "main", lambda **_: lambda job: lambda: job(None))
+    monkeypatch.setattr(cli.sys, "argv", ["study", "study=tune"])
+    seen = []
+    command = cli._command(lambda config: seen.append(os.environ.get("HYDRA_FULL_ERROR")))
+    for given in (None, "1"):
+        if given is None:
+            monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+        else:
+            monkeypatch.setenv("HYDRA_FULL_ERROR", given)
+        command()
+        assert os.environ.get("HYDRA_FULL_ERROR") == given
+    assert seen == [None, "1"]
 
 
 def failed(**settings):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import OtherSettingsError, all_rows, trained
 
 SCRIPT = """import json, sys
 from pathlib import Path
@@ -38,16 +38,25 @@ def script(tmp_path) -> str:
 @pytest.mark.parametrize("name", ["one", "thermal.frequencies=8, it's"])
 def test_a_run_is_trained_once(script, tmp_path, name):
     place = tmp_path / "study" / name
-    for threads in (1, 2):
-        assert trained(place, script, ["seed=3", f"threads={threads}"], tmp_path / "study").run["seed"] == "3"
+    for curves in ("here", "there"):  # where a file lies says nothing of what it holds
+        assert trained(place, script, ["seed=3", f"budget_curves={curves}"], tmp_path / "study").run["seed"] == "3"
     assert (place / "times").read_text() == "once\n"
 
 
 def test_a_folder_with_a_run_of_other_settings_is_refused(script, tmp_path):
     place = tmp_path / "study" / "one"
     trained(place, script, ["seed=3", "max_steps=5"], tmp_path / "study")
-    with pytest.raises(SceneError, match=r"one holds a run with other settings \(max_steps=5, max_steps=9\): delete"):
+    message = r"one was made with other settings \(max_steps=5, max_steps=9\): give the former ones, delete it"
+    with pytest.raises(OtherSettingsError, match=message):
         trained(place, script, ["seed=3", "max_steps=9"], tmp_path / "study")
+    with pytest.raises(OtherSettingsError, match=r"\(threads=2\)"):  # whose seconds stand in no table beside others
+        trained(place, script, ["seed=3", "max_steps=5", "threads=2"], tmp_path / "study")
+
+
+def test_a_report_says_what_all_of_its_runs_have():
+    line = all_rows(["data.size=tiny", "threads=null"], seed=[1, 0, 1], threads=[2, 2], max_steps=[None])
+    assert line == "All rows: `data.size=tiny seed=0,1 threads=2`."
+    assert all_rows(["threads=1"], threads=[None]) == "All rows: `threads=1`."
 
 
 def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):

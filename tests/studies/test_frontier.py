@@ -36,7 +36,8 @@ def made(
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"method={method}", *overrides]))
     rows = ["step,train_seconds,gaussians,psnr,mae_c", *(f"1,{s},10,{v},{40 - v}" for s, v in course), "9,,10,99,0"]
     (folder / "curve.csv").write_text("\n".join(rows) + "\n")
-    results = RunResults(run={"scene": "cooling", "method": method}, data=data)
+    seed = next((int(text[5:]) for text in overrides if text.startswith("seed=")), 0)
+    results = RunResults(run={"scene": "cooling", "method": method, "seed": seed, "threads": 2}, data=data)
     results.put("test", "psnr", psnr)
     results.put("test", "mae_c", 40 - psnr)
     results.put("cost", "train_seconds", seconds)
@@ -87,6 +88,7 @@ def test_tables_pictures_and_a_page_that_needs_nothing_else(runs, tmp_path):
     run(tmp_path / "out", [str(runs), str(runs / "sweep")], **LEVELS)  # a run counts once
     text = (tmp_path / "out" / "frontier.md").read_text()
     assert "| etgs | 2 | 5.0 | 31.00 ± 1.41 |" in text and "| PSNR, MAE |" in text
+    assert "All rows: `max_steps=9 seed=0,1 threads=2`.\n" in text
     assert re.search(r"\| seconds to \|.* 25 dB \|.* 30 dB \|", text) and "| 3dgs |" in text
     with open(tmp_path / "out" / "frontier.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -289,6 +291,7 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
     assert asked[0] == [
         "data.size=tiny", "method=etgs", "data.scene=heated", "seed=0", "dtype=float32", "thermal.frequencies=8"
     ]  # fmt: skip
+    assert "All rows: `data.size=tiny seed=0,1 threads=2`." in (tmp_path / "out" / "frontier.md").read_text()
     assert {recipe.count for recipe in recipes} == {2} and len(recipes) == 2 * 6  # the stand-in says cooling of all
 
 

@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.options import check_count, filled, listed
+from heatsplat.studies.options import check_count, counted, filled, listed, named
 
 
 @pytest.mark.parametrize(
@@ -28,6 +28,17 @@ def test_an_option_without_a_value_is_named(empty):
     with pytest.raises(SceneError, match=r"^study\.seeds=.* has nothing in it: give at least one value$"):
         filled("study.seeds", empty)
     assert filled("study.seeds", 0) == [0]
+
+
+def test_a_name_that_there_is_not_and_a_number_that_counts_nothing_are_told_one_by_one():
+    assert named("study.only", "hot", ["hot", "cold"]) == ["hot"] and counted("study.seeds", 0, least=0) == [0]
+    with pytest.raises(SceneError, match="each of study.only must be one of hot, cold, got 'warm'"):
+        named("study.only", ["hot", "warm"], ["hot", "cold"])
+    with pytest.raises(SceneError, match="study.steps must be a whole number, 1 or more, got long"):
+        counted("study.steps", [5, "long"])
+    for check in (counted, lambda key, value: named(key, value, ["hot"])):
+        with pytest.raises(SceneError, match="study.only=.* has nothing in it"):
+            check("study.only", [])
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, "abc", None, True])

@@ -80,6 +80,12 @@ def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path
             '{"method": "ours", "scenes": {"cooling": {"seconds": -1}}}',
             "scenes.cooling.seconds is -1; a number of 0 or more",
         ),
+        ('{"method": "ours", "scenes": {}}', 'needs "method": a name, and "scenes"'),
+        ('{"method": "ours", "scenes": {"cooling": {"seconds": true}}}', "seconds is True; a number of 0 or more"),
+        (
+            '{"method": "ours", "scenes": {"cooling": {"secs": 9}}}',
+            "each key of scenes.cooling must be one of seconds, memory_mb, gaussians, got 'secs'",
+        ),
         ('{"method": "ours", "scenes": {"cooling": 12}}', "metrics.json: scenes.cooling is 12; what it cost"),
         ('{"method": "ours", "scenes": {"cooling": [12]}}', r"metrics.json: scenes.cooling is \[12\]; what it cost"),
     ):

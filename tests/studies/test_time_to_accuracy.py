@@ -201,6 +201,30 @@ def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monk
     assert (None, 300, "2") in names and ("other", 200, "0") in names and ("quick", 200, "2") in names
 
 
+def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp_path, monkeypatch):
+    def train(place: Path, train: str | None, overrides: list[str], study: Path) -> None:
+        own = [text for text in overrides if not text.startswith(("method=", "data.scene="))]
+        steps = 800 if "max_steps=800" in overrides else 200
+        made(place, own, steps, steps / 10, 41.0 if "thermal.frequencies=8" in overrides else 40.0)
+
+    monkeypatch.setattr(time_to_accuracy, "trained", train)
+    scene = ["method=etgs", "data.scene=heated"]
+    cases = {
+        "plain": scene,
+        "few": [*scene, "thermal.frequencies=8"],
+        "other": [*scene, "data.scene_seed=1"],
+        "degraded": [*scene, "data.degrade=area4"],
+    }
+    panels = run(tmp_path / "out", None, REFERENCE, RECIPES, cases=cases)
+    assert {panel.title: len(panel.outcomes) for panel in panels} == {
+        "etgs on heated": 2, "etgs on heated, thermal.frequencies=8": 2, "etgs on heated, data.scene_seed=1": 2,
+        "etgs on heated, data.degrade=area4": 2,
+    }  # fmt: skip
+    assert {one.recipe for panel in panels for one in panel.outcomes} == {None, "quick"}
+    few = next(panel for panel in panels if panel.title.endswith("frequencies=8"))
+    assert few.references["0"].scores["psnr"] == 41.0
+
+
 def test_the_configuration_asks_for_what_there_is():
     """Every recipe of the study composes, on the scene of its comment."""
     study = yaml.safe_load(CONFIG.read_text())

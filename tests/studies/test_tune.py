@@ -13,6 +13,7 @@ from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.studies import tune
+from heatsplat.studies.child_runs import OtherSettingsError
 
 optuna = pytest.importorskip("optuna")
 CASES = {
@@ -84,6 +85,41 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(world, tmp_path):
     cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": {"among": [0.95, 0.3]}}}}
     (check,) = tune.run(tmp_path, cases, trials=6)
     assert check.verdict == "better" and "failed: SceneError: the loss is NaN" in (tmp_path / "tune.md").read_text()
+
+
+def test_trials_of_other_settings_are_refused_and_not_taken_for_failed_ones(world, tmp_path, monkeypatch):
+    train = tune.trained
+
+    def refusing(place, *more):
+        if "trial1" in place.name:
+            raise OtherSettingsError("of other settings")
+        return train(place, *more)
+
+    monkeypatch.setattr(tune, "trained", refusing)
+    with pytest.raises(OtherSettingsError, match="of other settings"):
+        tune.run(tmp_path, CASES, trials=3)
+
+
+@pytest.mark.parametrize("which", ["default", "trial"])
+def test_a_run_without_the_score_gives_no_verdict(world, tmp_path, monkeypatch, which):
+    train = tune.trained
+
+    def blind(place, *more):
+        results = train(place, *more)
+        if which in place.name and place.name.endswith("_2"):
+            results.put("test", "psnr", None, "infinite")
+        return results
+
+    monkeypatch.setattr(tune, "trained", blind)
+    (check,) = tune.run(tmp_path, CASES, trials=8)
+    assert check.gains == [] and check.verdict == "failed: a run has no psnr"
+    assert "| failed: a run has no psnr |" in (tmp_path / "tune.md").read_text()
+
+
+def test_the_report_says_what_all_runs_have_and_with_which_seeds_they_are_compared(world, tmp_path):
+    tune.run(tmp_path, CASES, trials=2, seeds=[3, 1], overrides=["data.downscale=2", "threads=1"])
+    text = (tmp_path / "tune.md").read_text()
+    assert "All rows: `data.downscale=2 threads=1`." in text and "beside the default, seeds 3, 1\n" in text
 
 
 def test_a_best_setting_that_fails_on_another_seed_is_told(world, tmp_path):

@@ -28,6 +28,8 @@ STRICT = 0.999  # quantile of the differences that is reported beside their root
 STEP = 0.4  # share of what may still be lost that a round may lose
 DEARER = 4.0  # factor on the price of Gaussians whose pair was taken apart again
 WEIGHT, CHANGE = "weight", "change"  # statistics of the cloud that is worked on: see _weigh
+PAIRS = 1 << 15  # that are priced together: what is worked out of each takes 2 KB
+VIEWS = 16  # that are compared together, for every change of what is shown may cost a look at all cameras
 ORIGIN = "origin"  # statistic of the cloud that is worked on: 1 + place before merging, 0 for merged Gaussians
 
 
@@ -221,47 +223,52 @@ class _Search:
         """Mean squared difference [count] of the images of a trial from those before it, dealt out to its last Gaussians by
         their blending weights."""
         module, blame, total, pixels = self.module, 0.0, 0.0, 0
-        for frame in self.frames:
+        for first in range(0, len(self.frames), VIEWS):
+            frames = self.frames[first : first + VIEWS]
             with module.showing(self.cloud.splats):
-                before = module.render(frame).features
+                before = [module.render(frame).features for frame in frames]
             with module.showing(trial.splats), torch.enable_grad():
-                values = module.emissions(trial.splats, frame).requires_grad_()
-                image = module.render(frame, values=values).features
-                squares = (image.detach() - before).square()
-                (weighted,) = torch.autograd.grad((image * squares).sum(), [values])
-            blame = blame + weighted[-count:].double().sum(1)
-            total, pixels = total + squares.double().sum().item(), pixels + squares.numel()
+                for frame, was in zip(frames, before, strict=True):
+                    values = module.emissions(trial.splats, frame).requires_grad_()
+                    image = module.render(frame, values=values).features
+                    squares = (image.detach() - was).square()
+                    (weighted,) = torch.autograd.grad((image * squares).sum(), [values])
+                    blame = blame + weighted[-count:].double().sum(1)
+                    total, pixels = total + squares.double().sum().item(), pixels + squares.numel()
         return blame * (total / pixels / blame.sum().clamp(min=1e-300))
 
     # Which pairs -----------------------------------------------------------------------------------------------------
 
     def _candidates(self) -> tuple[Tensor, dict[str, Tensor]]:
         """Pairs [n, 2] of Gaussians that agree, each in one pair, the cheapest of all; with them what each becomes."""
-        splats, module, state = self.cloud.splats, self.module, self.cloud.state
+        splats, module = self.cloud.splats, self.module
         shapes, pairs = Shapes.of(splats), self._neighbours()
-        told = torch.stack([module.emissions(splats, frame).double() for frame in self.moments])  # [F, N, C]
+        told = torch.stack([module.emissions(splats, frame) for frame in self.moments])  # [F, N, C]
         limits = self._limits(told)
-        one = merged(shapes[pairs[:, 0]], shapes[pairs[:, 1]])
-        apart = ((told[:, pairs[:, 0]] - told[:, pairs[:, 1]]).abs().amax(0) / limits).amax(1)
-        # Each is off the mean by the other's share of what is between them, and shows it by its opacity.
-        shown = shapes.opacities.amax(1)
-        seen = torch.maximum((1 - one.shares) * shown[pairs[:, 0]], one.shares * shown[pairs[:, 1]])
-        may = (apart * seen <= 1).nonzero().squeeze(1)
-        pairs, one = pairs[may], one[may]
+        prices = torch.cat([self._prices(part, shapes, told, limits) for part in pairs.split(PAIRS)])
+        chosen = pairs[_mutual(pairs, prices, len(splats))[: math.ceil(self.options.share * len(splats))]]
+        rows, agrees = self._rows(chosen, merged(shapes[chosen[:, 0]], shapes[chosen[:, 1]]), told, limits)
+        return chosen[agrees], {name: row[agrees] for name, row in rows.items()}
+
+    def _prices(self, pairs: Tensor, shapes: Shapes, told: Tensor, limits: Tensor) -> Tensor:
+        """What merging each of some pairs [n, 2] would change, [n]; infinite where they do not agree at all times."""
         a, b = pairs.unbind(1)
-        far = (told[:, a] - told[:, b]).square().mean(0).sum(1)
+        first, second, state = shapes[a], shapes[b], self.cloud.state
+        one = merged(first, second)
+        apart = told[:, a].double() - told[:, b].double()
+        # Each is off the mean by the other's share of what is between them, and shows it by its opacity.
+        seen = torch.maximum((1 - one.shares) * first.opacities.amax(1), one.shares * second.opacities.amax(1))
+        agree = (apart.abs().amax(0) / limits).amax(1) * seen <= 1
         heat = state[WEIGHT][a] * (1 - one.shares).square() + state[WEIGHT][b] * one.shares.square()
-        prices = far * heat + one.distances * (state[CHANGE][a] + state[CHANGE][b])
-        chosen = _mutual(pairs, prices, len(splats))[: math.ceil(self.options.share * len(splats))]
-        pairs, one = pairs[chosen], one[chosen]
-        rows, agrees = self._rows(pairs, one, told, limits)
-        return pairs[agrees], {name: row[agrees] for name, row in rows.items()}
+        prices = apart.square().mean(0).sum(1) * heat + one.distances * (state[CHANGE][a] + state[CHANGE][b])
+        return prices.where(agree, torch.inf)
 
     def _limits(self, told: Tensor) -> Tensor:
         """How far the features [F, N, C] of a pair may lie apart, [C]."""
         own = self.module.thermal.modality_channels[0]
         agree = self.options.agree_c
-        limits = told.new_full((told.shape[2],), self.options.companion_tolerance * agree / self.options.tolerance_c)
+        other = self.options.companion_tolerance * agree / self.options.tolerance_c
+        limits = told.new_full((told.shape[2],), other, dtype=torch.float64)
         limits[:own] = agree / self.span_k
         return limits
 
@@ -271,9 +278,9 @@ class _Search:
         count = min(self.options.neighbours + 1, len(means))
         _, near = cKDTree(means).query(means, k=count)
         near = torch.from_numpy(near).reshape(len(means), count)
-        pairs = torch.stack([torch.arange(len(means))[:, None].expand_as(near), near]).flatten(1)
-        low, high = pairs[:, pairs[0] != pairs[1]].sort(dim=0).values
-        keys = (low * len(means) + high).unique()  # of rows it would take a hundred times as long
+        here = torch.arange(len(means))[:, None]
+        keys = torch.minimum(here, near).mul_(len(means)).add_(torch.maximum(here, near))[here != near]
+        keys = keys.unique()  # of rows it would take a hundred times as long
         return torch.stack([keys // len(means), keys % len(means)], dim=1).to(self.cloud.splats.means.device)
 
     def _rows(self, pairs: Tensor, one: Merged, told: Tensor, limits: Tensor) -> tuple[dict[str, Tensor], Tensor]:
@@ -297,9 +304,9 @@ class _Search:
         """How far the features of rows are from those of both of their pair, times the opacity of either, at the worst time,
         [n] in limits."""
         if not len(pairs):
-            return told.new_zeros(0)
+            return limits.new_zeros(0)
         splats = Splats(rows)
-        worst = told.new_zeros(len(pairs))
+        worst = limits.new_zeros(len(pairs))
         shown = self.cloud.splats.opacities.double().amax(0)
         for at, frame in zip(told, self.moments, strict=True):
             here = self.module.emissions(splats, frame).double()
@@ -333,19 +340,21 @@ class _Search:
         return {name: images[name].cpu() for name in ("clean", *self.module.thermal.companions)}
 
     def _loss(self, splats: Splats) -> _Loss:
-        differences: dict[str, list[Tensor]] = {}
+        """What other splats lose, of one view after another: of single pixels only the largest differences are kept."""
+        names = ("clean", *self.module.thermal.companions)
+        pixels = {name: sum(wanted[name].numel() for wanted in self.wanted) for name in names}
+        squares, largest = dict.fromkeys(names, 0.0), torch.zeros(0)
+        most = pixels["clean"] - math.ceil(STRICT * pixels["clean"]) + 1
         with self.module.showing(splats):
             for frame, wanted in zip(self.frames, self.wanted, strict=True):
                 for name, image in self._images(frame).items():
-                    differences.setdefault(name, []).append((image - wanted[name]).abs().flatten())
-        off = {name: torch.cat(parts).double() for name, parts in differences.items()}
-        clean = off.pop("clean")
-        rank = math.ceil(STRICT * len(clean))
-        return _Loss(
-            self.span_k * clean.square().mean().sqrt().item(),
-            self.span_k * clean.kthvalue(rank).values.item(),
-            {name: other.square().mean().sqrt().item() for name, other in off.items()},
-        )
+                    off = (image - wanted[name]).abs().flatten()
+                    squares[name] += off.double().square().sum().item()
+                    if name == "clean":
+                        largest = torch.cat([largest.to(off), off])
+                        largest = largest.topk(min(most, len(largest)), sorted=False).values
+        rms = {name: math.sqrt(squares[name] / pixels[name]) for name in names}
+        return _Loss(self.span_k * rms.pop("clean"), self.span_k * largest.min().item(), rms)
 
 
 def _floored(values: Tensor) -> Tensor:

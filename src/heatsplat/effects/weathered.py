@@ -136,8 +136,11 @@ def weighed(
         return Evidence(gain.sigmas, found, gain_db=gain.db)
     if (gain.sigmas < CHANCE or gain.db < nothing_db) and can_be_none:
         return Evidence(min(gain.sigmas, CHANCE), found, gain_db=gain.db)
-    needed = needed or f"about {math.ceil(gain.images * (sigmas / max(gain.sigmas, CHANCE)) ** 2)}"
-    why = f"cannot be told from {gain.images} frames, {needed} would tell"
+    if gain.sigmas > sigmas and not needed:  # more frames make it more certain, but no larger
+        why = "cannot be told from what balances leave unexplained, for it is too small"
+    else:
+        needed = needed or f"about {math.ceil(gain.images * (sigmas / max(gain.sigmas, CHANCE)) ** 2)}"
+        why = f"cannot be told from {gain.images} frames, {needed} would tell"
     return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.projection import to_camera, to_pixels
 
 
 def sampling_intervals(points: Tensor, cameras: Iterable[Camera], near: float = 0.2, margin: float = 0.15) -> Tensor:
@@ -28,16 +27,16 @@ def sampling_intervals(points: Tensor, cameras: Iterable[Camera], near: float = 
         ValueError: no camera sees any of the points.
     """
     least = points.new_full((len(points),), torch.inf)
-    focal = 0.0
+    columns, focal = points.T.contiguous(), 0.0  # of points in rows every step below would take four times as long
     for camera in cameras:
-        K = camera.K.to(points)
-        seen_from = to_camera(points, camera.viewmat.to(points))
-        z = seen_from[:, 2]
-        size = K.new_tensor([camera.width, camera.height])
-        pixels = to_pixels(seen_from, K)  # nonsense where z is not positive, and not looked at there
-        inside = ((pixels >= -margin * size) & (pixels <= (1 + margin) * size)).all(dim=1)
-        least = torch.where(inside & (z > near), torch.minimum(least, z), least)
-        focal = max(focal, camera.K[0, 0].item(), camera.K[1, 1].item())
+        viewmat, K = camera.viewmat.to(points), camera.K.tolist()
+        *sides, z = torch.addmm(viewmat[:3, 3:], viewmat[:3, :3], columns)
+        seen = z > near
+        for k, (side, size) in enumerate(zip(sides, (camera.width, camera.height), strict=True)):
+            pixels = (side / z).mul_(K[k][k]).add_(K[k][2])  # nonsense where z is not positive, and not looked at there
+            seen &= (pixels >= -margin * size) & (pixels <= (1 + margin) * size)
+        least = torch.minimum(least, z.masked_fill_(~seen, torch.inf))
+        focal = max(focal, K[0][0], K[1][1])
     seen = least.isfinite()
     if not seen.any():
         raise ValueError(

@@ -32,7 +32,7 @@ UNITS = {
     "start": 40.0, "log_rate": 1.0, "share": 0.5, "sun": 40.0, "wind": 0.5, "inner": 40.0,  # K, 1, 1, K m²/kW, 1, K
     "core_start": 40.0, "core_log_rate": 1.0, "log_coupling": 1.0,  # K, 1, 1
 }  # fmt: skip
-KEPT_BYTES = 4 << 30  # of tables of all moments; what needs more is marched for every view
+KEPT_BYTES = 4 << 30  # of tables of moments, the latest; earlier ones, which need more, are marched for every view
 COURSE_BYTES = 256 << 20  # of states at samples; what needs more keeps only some of the samples
 
 
@@ -144,6 +144,9 @@ def unchanged(before: Sequence[tuple[Tensor, int]], now: Sequence[Tensor]) -> bo
 class Kept:
     """Temperatures of all N surfaces at the moments that training asks for, with their derivatives.
 
+    Where memory does not hold all moments, it holds the latest: to march to one of the others takes as long as it is from the
+    start. How many depends on nothing but KEPT_BYTES, or a run that goes on elsewhere would not find the same bits.
+
     A surface is marched when it is first asked for and whenever a parameter has moved since by more than CHANGE. At which
     parameters is told by ``marched_at``, which belongs to the Gaussians: a run that goes on from a checkpoint marches at the same
     parameters and finds the same bits, and what a split makes of one inherits them.
@@ -158,18 +161,23 @@ class Kept:
         self._table: Tensor | None = None
 
     def has(self, time_s: float, marched_at: Tensor) -> bool:
-        """Whether a moment is one of those kept, and all of them fit in memory."""
-        count, columns = marched_at.shape
-        size = len(self.moments_s) * count * (1 + columns) * marched_at.element_size()
-        return time_s in self._places and size <= KEPT_BYTES
+        """Whether a moment is one of those kept, for surfaces [N, Q] that were marched last at these parameters."""
+        return self._places.get(time_s, -1) >= self._first(marched_at)
+
+    def _first(self, marched_at: Tensor) -> int:
+        """Number of the first moment that is kept: that and all after it fit in memory."""
+        size = len(marched_at) * (1 + marched_at.shape[1]) * marched_at.element_size()
+        return max(0, len(self.moments_s) - KEPT_BYTES // max(size, 1))
 
     @torch.no_grad()
     def _refresh(self, surface: Surface, now: Tensor, ids: Tensor, given: Sequence[Tensor], marched_at: Tensor) -> None:
         """Marches those of ``ids`` that have moved, or that came, were turned or shaded since."""
         same = self._marched_at is not None and torch.equal(self._marched_at, marched_at)
+        moments_s = self.moments_s[self._first(marched_at) :]
         if not same or not unchanged(self._given, given):
             if self._table is None or self._table.shape[1] != len(marched_at):
-                self._table = now.new_empty(len(self.moments_s), len(marched_at), 1 + now.shape[1])
+                self._table = None  # two of them may not fit
+                self._table = now.new_empty(len(moments_s), len(marched_at), 1 + now.shape[1])
             self._known = torch.zeros(len(marched_at), dtype=torch.bool, device=now.device)
             self._marched_at = marched_at.detach().clone()
             self._given = [(tensor, tensor._version) for tensor in given]
@@ -183,7 +191,7 @@ class Kept:
             rows = ids[stale]
             columns = dict(zip(names, self._marched_at[rows].unbind(1), strict=True))
             there = with_parameters(rows_of(surface, stale), columns)
-            march(self.climate, there, self.moments_s, into=(self._table, rows))
+            march(self.climate, there, moments_s, into=(self._table, rows))
             self._known[rows] = True
 
     def temperature(
@@ -198,7 +206,8 @@ class Kept:
         """
         now = learned(surface)
         self._refresh(surface, now.detach(), ids, given, marched_at)
-        found = self._table[self._places[time_s]].index_select(0, ids)
+        place = self._places[time_s] - self._first(marched_at)
+        found = self._table[place].index_select(0, ids)
         return _first_order(found, now, self._marched_at.index_select(0, ids))
 
 

@@ -18,7 +18,11 @@ from heatsplat.studies.recorded import OVERRIDES, overrides_of
 log = logging.getLogger("heatsplat")
 
 INSTALLED = "from heatsplat.cli import train; train()"  # what heatsplat-train does
-WHERE_IT_RUNS = ("threads", "budget_curves")  # overrides of which a run's results do not tell
+WHERE_IT_LIES = ("budget_curves",)  # overrides that say where a file is, and not what it holds
+
+
+class OtherSettingsError(SceneError):
+    """A folder of the study holds what was made with other settings than are asked for."""
 
 
 def trained(place: Path, train: str | None, overrides: Sequence[str], study: Path) -> RunResults:
@@ -31,10 +35,13 @@ def trained(place: Path, train: str | None, overrides: Sequence[str], study: Pat
         study: folder of the study, which goes on where it was stopped.
 
     Raises:
-        SceneError: the run failed, or the folder holds a run of other settings.
+        OtherSettingsError: the folder holds a run of other settings. Threads are some, for seconds are reported of all runs.
+        SceneError: the run failed.
     """
     if (place / METRICS_FILE).exists():
-        _refuse_others(place, overrides)
+        if (place / OVERRIDES).exists():
+            before = [f"{key}={value}" for key, value in overrides_of(place).items()]
+            refuse_others(place, _settings(before), _settings(overrides))
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
     program = [train] if train else ["-c", INSTALLED]
@@ -55,16 +62,27 @@ def spelled(value: Any) -> str:
     return "null" if value is None else str(value)
 
 
-def _refuse_others(place: Path, overrides: Sequence[str]) -> None:
-    if not (place / OVERRIDES).exists():
-        return
-    before, now = _settings(overrides_of(place).items()), _settings(text.partition("=")[::2] for text in overrides)
-    if before != now:
-        raise SceneError(
-            f"{place} holds a run with other settings ({', '.join(sorted(before ^ now))}): delete that folder, or give the "
-            "study a folder of its own with hydra.run.dir"
+def refuse_others(place: Path, before: Iterable[str], now: Iterable[str]) -> None:
+    """Raises OtherSettingsError where the settings ("key=value") with which something was made are not those of now."""
+    if changed := {*before} ^ {*now}:
+        raise OtherSettingsError(
+            f"{place} was made with other settings ({', '.join(sorted(changed))}): give the former ones, delete it, or give "
+            "the study a folder of its own with hydra.run.dir"
         )
 
 
-def _settings(overrides: Iterable[tuple[str, str]]) -> frozenset[str]:
-    return frozenset(f"{key}={value}" for key, value in overrides if key not in WHERE_IT_RUNS)
+def all_rows(overrides: Iterable[str], **found: Iterable[Any]) -> str:
+    """The line of a report that says what all of its runs have.
+
+    Args:
+        overrides: of all of them.
+        found: key -> its values in their results; they take the place of overrides of this key, and None tells nothing.
+    """
+    told = {key: sorted({value for value in values if value is not None}) for key, values in found.items()}
+    kept = [text for text in overrides if not told.get(text.partition("=")[0])]
+    words = [*kept, *(f"{key}={','.join(map(str, values))}" for key, values in told.items() if values)]
+    return f"All rows: `{' '.join(words)}`."
+
+
+def _settings(overrides: Iterable[str]) -> list[str]:
+    return [text for text in overrides if text.partition("=")[0] not in WHERE_IT_LIES]

@@ -12,6 +12,8 @@ from matplotlib.figure import Figure
 
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table, number
+from heatsplat.studies.child_runs import all_rows
+from heatsplat.studies.finished import NAMES, SEEDS
 from heatsplat.studies.frontier_runs import Recipe, dominated
 
 COLUMNS = {  # digits, and whether the spread stands beside the mean
@@ -92,8 +94,11 @@ def _views_of(recipes: Sequence[Recipe]) -> str:
 
 
 def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -> str:
-    """The tables for people."""
-    lines = ["# Accuracy against training time", ""]
+    """What all runs have, and the tables, for people."""
+    runs = [one for recipe in recipes for one in recipe.table.itertuples()]
+    jobs = [{f"{key}={value}" for key, value in one.overrides.items() if key not in SEEDS | NAMES} for one in runs]
+    found = {key: [one.results.run.get(key) for one in runs] for key in ("seed", "threads")}
+    lines = ["# Accuracy against training time", "", all_rows(sorted(set.intersection(*jobs)), **found), ""]
     for title, head, rows in tables(recipes, levels):
         lines += [f"## {title}", "", *markdown_table(head, rows), ""]
     return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 
 
 def listed(value: Any) -> list[Any]:
@@ -27,6 +27,22 @@ def filled(key: str, value: Any) -> list[Any]:
     """
     if not (found := listed(value)):
         raise SceneError(f"{key}={value} has nothing in it: give at least one value")
+    return found
+
+
+def named(key: str, value: Any, known: Iterable[Any]) -> list[Any]:
+    """``filled``, where every value is one of those that are known. Raises SceneError where one is not."""
+    found, known = filled(key, value), list(known)
+    for one in found:
+        check_option(f"each of {key}", one, known, SceneError)
+    return found
+
+
+def counted(key: str, value: Any, least: int = 1) -> list[int]:
+    """``filled``, where every value is a whole number, ``least`` or more. Raises SceneError where one is not."""
+    found = filled(key, value)
+    for one in found:
+        check_count(key, one, least)
     return found
 
 

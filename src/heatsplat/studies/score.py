@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.contracts import SceneError, ThermalRange, check_option
 from heatsplat.io.results import METRICS_FILE, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.io.tiff import read_temperature
@@ -138,6 +138,7 @@ def read_submission(folder: Path) -> dict[str, Any]:
         not isinstance(told, dict)
         or not isinstance(told.get("method"), str)
         or not isinstance(told.get("scenes"), dict)
+        or not told["scenes"]
     ):
         raise SceneError(
             f'{path} needs "method": a name, and "scenes": {{name: {{"seconds": ..., "memory_mb": ..., "gaussians": ...}}}}'
@@ -145,9 +146,10 @@ def read_submission(folder: Path) -> dict[str, Any]:
     for scene, cost in told["scenes"].items():
         if not isinstance(cost, Mapping | None):
             raise SceneError(f'{path}: scenes.{scene} is {cost!r}; what it cost, {{"seconds": ...}}, or null')
-        for key in COSTS:
-            value = (cost or {}).get(key)
-            if value is not None and not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
+        for key, value in (cost or {}).items():
+            check_option(f"{path}: each key of scenes.{scene}", key, COSTS, SceneError)
+            counts = isinstance(value, int | float) and not isinstance(value, bool)
+            if value is not None and not (counts and math.isfinite(value) and value >= 0):
                 raise SceneError(f"{path}: scenes.{scene}.{key} is {value!r}; a number of 0 or more, or null")
     return told
 

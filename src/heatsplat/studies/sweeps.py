@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from heatsplat.io.pictures import figure_picture, literal, write_png
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
 from heatsplat.studies.recorded import OVERRIDES
 
@@ -116,7 +117,7 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     scenes = ", ".join(sorted({row.scene for row in rows}))
     jobs = [set(settings_of(overrides)) for row in rows for overrides in row.table["overrides"]]
     shared = sorted(set.intersection(*jobs))
-    about = "Mean ± standard deviation over seeds." + (f" All rows: `{' '.join(shared)}`." if shared else "")
+    about = "Mean ± standard deviation over seeds." + (f" {all_rows(shared)}" if shared else "")
     return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
 
 

@@ -58,7 +58,8 @@ def run(
             ``callbacks.timing.CostMeter``.
         psnr_margin_db, mae_margin_c: by how much a run may be worse than the reference and count as its equal.
         cases: name -> overrides that choose method and scene; of each, the reference, the standard schedule of ``lengths``
-            and all recipes are trained with every seed, unless they are among ``runs``. None: nothing is trained.
+            and all recipes are trained with every seed, unless they are among ``runs``. What else a case says is in the title
+            of its panel. None: nothing is trained.
         lengths: steps of shorter standard runs.
         seeds: of the runs that are trained.
         overrides: of the runs that are trained; finished runs count as theirs whether they have them or not.
@@ -87,7 +88,7 @@ def run(
             trained(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
             folders = [*folders, output_dir / "runs" / place]
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
-    panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common)
+    panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common, (cases or {}).values())
     if not panels:
         raise SceneError(
             f"runs={', '.join(map(str, folders))}: there is no finished run of the reference ({' '.join(reference)}) that "

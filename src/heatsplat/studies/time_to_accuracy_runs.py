@@ -11,8 +11,9 @@ from typing import Any
 
 import pandas as pd
 
-from heatsplat.studies.finished import settings_of
+from heatsplat.studies.finished import PLACES, settings_of
 from heatsplat.studies.frontier_runs import panel_titles, seconds_to
+from heatsplat.studies.options import listed
 
 log = logging.getLogger("heatsplat")
 
@@ -138,6 +139,13 @@ def without_length(overrides: Iterable[str]) -> list[str]:
     return [text for text in overrides if not text.startswith("max_steps=")]
 
 
+def further_of(overrides: Mapping[str, str], cases: Iterable[Sequence[str]]) -> list[str]:
+    """What the case of a run says beside method and scene: of the cases that say nothing but what the run has, the longest."""
+    own = {f"{key}={value}" for key, value in overrides.items()}
+    case = max((case for case in cases if own.issuperset(case)), key=len, default=())
+    return [text for text in case if text.partition("=")[0] not in {"method", *PLACES}]
+
+
 def panels_of(
     runs: pd.DataFrame,
     clock: str,
@@ -145,6 +153,7 @@ def panels_of(
     recipes: Mapping[str, Sequence[str]],
     margins: dict[str, float],
     common: Iterable[str] = (),
+    cases: Iterable[str | Sequence[str]] = (),
 ) -> list[Panel]:
     """Finished runs by panel; runs without a reference of their seed, or without the numbers, are left out with a warning.
 
@@ -153,17 +162,21 @@ def panels_of(
         clock, reference, recipes: as in ``run``.
         margins: score -> margin.
         common: settings that make no other recipe.
+        cases: overrides that choose a method and a scene. What else one says makes no other recipe of its runs, and a panel of
+            its own.
     """
     if runs.empty:
         return []
     length = int(parsed(reference)["max_steps"])
     usual = frozenset(settings_of(parsed(without_length(reference))))
     names = {frozenset(settings_of(parsed(texts))): name for name, texts in recipes.items()}
-    scenes = [f"{method} on {scene}" for method, scene in zip(runs["method"], runs["scene"], strict=True)]
+    cases = [listed(case) for case in cases]
+    runs = runs.assign(further=[further_of(overrides, cases) for overrides in runs["overrides"]])
+    scenes = [", ".join([f"{one.method} on {one.scene}", *one.further]) for one in runs.itertuples()]
     panels: dict[str, Panel] = {}
     of_title = runs.assign(title=panel_titles(runs.assign(scene=scenes))).groupby("title", sort=False)
     for title, own in of_title:
-        settings = [set(settings_of(overrides)) - set(common) for overrides in own["overrides"]]
+        settings = [{*settings_of(one.overrides)} - {*common, *one.further} for one in own.itertuples()]
         shared = {text for text in set.intersection(*settings) if text.startswith("data.")}
         panel, seen = Panel(title, margins), set()
         for one, told in zip(own.itertuples(), settings, strict=True):

@@ -18,9 +18,9 @@ from typing import Any
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
-from heatsplat.studies.child_runs import spelled, trained
+from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, trained
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.options import check_count, filled, listed
+from heatsplat.studies.options import check_count, counted, listed
 
 log = logging.getLogger("heatsplat")
 
@@ -71,9 +71,11 @@ class MethodRuns:
         return trained(self._place(name, steps, seed), self.train, wanted, self.folder)
 
     def attempt(self, name: str, settings: Mapping[str, Any], steps: int, seed: int = SEARCH_SEED) -> Trial:
-        """A run that may fail: a rate may be too high to train with."""
+        """A run that may fail: a rate may be too high to train with. Raises OtherSettingsError as ``result`` does."""
         try:
             return Trial(self.method, name, settings, self.result(name, settings, steps, seed))
+        except OtherSettingsError:
+            raise
         except SceneError as error:
             log.warning("%s, %s failed: %s", self.method, " ".join(_words(settings)), error)
             return Trial(self.method, name, settings, None, reason_of(self._place(name, steps, seed)))
@@ -91,7 +93,7 @@ class Check:
         steps: length of the runs.
         default, best: results with each seed; of the best those that there are, where runs failed.
         score: by which they are compared.
-        failed: why a run of the best failed; empty where none did.
+        failed: why a run of the best failed or a run has no score; empty where all have one.
     """
 
     method: str
@@ -116,7 +118,7 @@ class Check:
     def verdict(self) -> str:
         """What all seeds say by more than the default's spread: "better" or "worse"; else "within the spread".
 
-        "failed: " and the reason where a run of the best failed.
+        "failed: " and the reason where a run has no score.
         """
         if self.failed:
             return f"failed: {self.failed}"
@@ -175,11 +177,11 @@ def run(
         tried = [default, *_search(runs, case["knobs"], trials, seconds, search_steps, score)]
         done += tried
         best = _best(tried, score)
-        _write(output_dir, chosen, done, checks, search_steps, score)
+        _write(output_dir, chosen, done, checks, search_steps, score, seeds, overrides)
         for steps in check_steps if best is not default else ():
             checks.append(_check(runs, best, steps, seeds, score))
             log.info("%s at %d steps: %s", method, steps, checks[-1].verdict)
-            _write(output_dir, chosen, done, checks, search_steps, score)
+            _write(output_dir, chosen, done, checks, search_steps, score, seeds, overrides)
     log.info("%s", (output_dir / "tune.md").read_text(encoding="utf-8"))
     return checks
 
@@ -188,8 +190,11 @@ def _check(runs: MethodRuns, best: Trial, steps: int, seeds: Sequence[int], scor
     """The best beside the default, which must not fail."""
     default = [runs.result("default", {}, steps, seed) for seed in seeds]
     tried = [runs.attempt(best.name, best.settings, steps, seed) for seed in seeds]
+    best_of_all = [one.results for one in tried if one.results]
     failed = next((one.why for one in tried if one.results is None), "")
-    return Check(runs.method, steps, default, [one.results for one in tried if one.results], score, failed)
+    if not failed and any(results.test.get(score) is None for results in (*default, *best_of_all)):
+        failed = f"a run has no {score}"
+    return Check(runs.method, steps, default, best_of_all, score, failed)
 
 
 def _checked(
@@ -199,8 +204,7 @@ def _checked(
     if score not in SCORES:
         raise SceneError(f"study.score={score}: give one of {', '.join(SCORES)}")
     check_count("study.trials", trials)
-    for seed in filled("study.seeds", seeds):
-        check_count("study.seeds", seed, least=0)
+    counted("study.seeds", seeds, least=0)
     if SEARCH_SEED in seeds or len({*seeds}) < len(seeds):
         raise SceneError(
             f"study.seeds={seeds}: give every seed once, and not {SEARCH_SEED}, with which the settings were found"
@@ -300,9 +304,13 @@ def _write(
     checks: Sequence[Check],
     steps: int,
     score: str,
+    seeds: Sequence[int],
+    overrides: Sequence[str],
 ) -> None:
+    runs = [trial.results for trial in tried if trial.results] + [one for each in checks for one in each.default]
+    about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
     write_csv(folder / "tune.csv", _records(tried, checks, steps))
-    write_atomically(folder / "tune.md", markdown(cases, tried, checks, steps, score))
+    write_atomically(folder / "tune.md", markdown(cases, tried, checks, steps, score, seeds, about))
 
 
 def _records(tried: Sequence[Trial], checks: Sequence[Check], steps: int) -> Iterator[dict[str, Any]]:
@@ -329,10 +337,17 @@ def _values(results: RunResults | None) -> dict[str, Any]:
 
 
 def markdown(
-    cases: Mapping[str, Mapping[str, Any]], tried: Sequence[Trial], checks: Sequence[Check], steps: int, score: str
+    cases: Mapping[str, Mapping[str, Any]],
+    tried: Sequence[Trial],
+    checks: Sequence[Check],
+    steps: int,
+    score: str,
+    seeds: Sequence[int],
+    about: str,
 ) -> str:
-    """The report: the comparisons of all methods first, then every method's search."""
-    lines = ["# Tuning", "", "## The best settings of each search beside the default, other seeds", ""]
+    """The report: what all runs have, the comparisons of all methods with their seeds, then every method's search."""
+    which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
+    lines = ["# Tuning", "", about, "", f"## The best settings of each search beside the default, {which}", ""]
     head = [
         "method",
         "steps",

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.averaging import Average
+from heatsplat.training.cameras import Cameras
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
 from heatsplat.training.overlap import Overlap
@@ -67,6 +68,7 @@ class SplatTraining(pl.LightningModule):
         merging: what is done to Gaussians after training, before the test; None: nothing.
         resolution: how large images are over the run; None: full size throughout.
         overlap: what is done against many Gaussians in one pixel; None: nothing.
+        cameras: from where training images were taken; None: from where the data say.
         surroundings: what Gaussians are told of the scene around them, of models that ask; None: once, before training.
         max_steps: planned length of a run.
         seed: seed of every random draw.
@@ -94,6 +96,7 @@ class SplatTraining(pl.LightningModule):
         merging: Merging | None = None,
         resolution: Resolution | None = None,
         overlap: Overlap | None = None,
+        cameras: Cameras | None = None,
         surroundings: Surroundings | None = None,
         max_steps: int = 30_000,
         seed: int = 0,
@@ -111,6 +114,7 @@ class SplatTraining(pl.LightningModule):
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
+        self.cameras = cameras or Cameras()
         self.surroundings = surroundings or Surroundings()
         self.seed, self.output_dir = seed, Path(output_dir)
         self.config: dict[str, Any] = {}
@@ -158,6 +162,7 @@ class SplatTraining(pl.LightningModule):
         self.thermal.prepare(scene)
         self.sensor.prepare(scene)
         self.composite.prepare(scene, self.modality)
+        self.cameras.prepare(scene)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.surroundings.prepare(scene, self.renderer, self.splats, self.composited)
@@ -202,6 +207,8 @@ class SplatTraining(pl.LightningModule):
             raise SceneError(
                 f"{model} {what}, whose sizes {type(self.overlap).__name__} would reset: give overlap=none"
             )
+        if rows == NOTHING and self.cameras.learns:
+            raise SceneError(f"{model} {what}, whose rays carry no gradient to cameras: give cameras=given")
         if rows == NOTHING and self.optim.decoupled is not None:
             raise SceneError(f"{model} {what}, whose opacities and sizes optim.decoupled lets decay: give optim=adam")
 
@@ -219,6 +226,7 @@ class SplatTraining(pl.LightningModule):
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
     def configure_optimizers(self):
+        cameras = self.cameras
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
         groups += [
             {
@@ -241,6 +249,15 @@ class SplatTraining(pl.LightningModule):
             {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
             for name, part in self.sensor.parts.items()
             for inner, parameter in part.named_parameters()
+        ]
+        groups += [
+            {
+                "params": [parameter],
+                "name": f"cameras.{name}",
+                "lr": cameras.lr * self.optim.pace,
+                "lr_end": cameras.lr_end,
+            }
+            for name, parameter in cameras.named_parameters()
         ]
         optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
@@ -270,6 +287,8 @@ class SplatTraining(pl.LightningModule):
             self.trainer.should_stop = True
             if self._average:
                 self.results.run["averaged_updates"] = self._average.give(self._learned())
+            if (found := self.cameras.found()) is not None:
+                self.results.run["cameras"] = found
 
     def on_train_epoch_end(self) -> None:
         """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
@@ -291,12 +310,14 @@ class SplatTraining(pl.LightningModule):
         signs: Tensor | None = None,
         values: Tensor | None = None,
         generator: torch.Generator | None = None,
+        camera: Camera | None = None,
     ) -> RenderOutput:
         """The clean image that the splats send to the camera of ``frame`` at its time.
 
         Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
         [N, C] are what rows of the splats emit in place of what the thermal model makes of them.
-        ``generator`` draws where samples along rays lie, of fields.
+        ``generator`` draws where samples along rays lie, of fields. A ``camera`` that is given takes the image from where it
+        stands, while what the splats emit stays that towards the camera of ``frame``.
         """
 
         channels = self.thermal.modality_channels[0]
@@ -316,7 +337,7 @@ class SplatTraining(pl.LightningModule):
         output = self.renderer(
             *(self._raw_shapes() if raw else self._shapes(moved)),
             emitted,
-            frame.camera,
+            camera or frame.camera,
             self.background,
             self.thermal.opacity_channels,
             absgrad=absgrad,
@@ -373,7 +394,10 @@ class SplatTraining(pl.LightningModule):
         signs = self.overlap.signs_at(here, len(self.splats) * self.thermal.per_row, self.seed)
         maps = self.density.maps_at(here)
         drawn = generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None
-        output = self.render(frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn)
+        stood = self.cameras.of(frame, progress)
+        output = self.render(
+            frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn, camera=stood
+        )
         image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
@@ -388,6 +412,7 @@ class SplatTraining(pl.LightningModule):
             ratio,
         )
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
+        terms |= self.cameras.regularisers()
         if signs is not None:
             terms["entropy"] = self.overlap.entropy(output, here)
         self._rendered = (output, camera)
@@ -552,8 +577,18 @@ class SplatTraining(pl.LightningModule):
         )
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
+        return self._scored(view, view.frame)
+
+    def test_step(self, view: View, batch_idx: int) -> dict[str, Any]:
+        if self.cameras.align_steps == 0:
+            return self._scored(view, view.frame)
+        self.results.data["test_cameras_aligned"] = f"each to its image, in {self.cameras.align_steps} steps"
+        return self._scored(view, self.cameras.aligned(view.frame, partial(self._error, view)))
+
+    def _scored(self, view: View, frame: Frame) -> dict[str, Any]:
+        """What is scored of a view, from the camera and at the time of ``frame``."""
         start = time.perf_counter()
-        images = self.predict_all(view.frame)
+        images = self.predict_all(frame)
         if view.clean is None and not self.sensor.parts:
             del images["clean"]  # it is the recorded image, judged against the same target
         if images[self.modality].is_cuda:
@@ -561,7 +596,15 @@ class SplatTraining(pl.LightningModule):
         seconds = time.perf_counter() - start
         return {"view": view, "prediction": images.pop(self.modality), "companions": images, "seconds": seconds}
 
-    test_step = validation_step
+    def _error(self, view: View, camera: Camera) -> Tensor:
+        """Mean squared error of the image of a view as seen from a camera, over the pixels that count."""
+        output = self.render(view.frame, self.sensor.needs_depth, camera=camera)
+        image = self.sensor(self._images(output)[0], view.frame, output.seen_depth)
+        target = view.image(self.modality)
+        if view.mask is not None:
+            counts = view.mask.clone()  # autograd keeps no tensor of Lightning's inference mode
+            image, target = image[counts], target[counts]
+        return (image - target).square().mean()
 
     def transfer_batch_to_device(self, batch: View, device: torch.device, dataloader_idx: int) -> View:
         return batch.to(device)

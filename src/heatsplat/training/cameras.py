@@ -1,0 +1,217 @@
+"""Where training images were taken from: as the data say, or a little beside, as the images say while the scene is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
+from heatsplat.same_bits import mean
+
+FEWEST = 3  # images: of two, the common movement of all leaves nothing to learn
+ALIGN_PX = (
+    0.1,
+    0.01,
+)  # rate in pixels of the first and of the last step in which the camera of a test image is aligned
+
+
+class Cameras(nn.Module):
+    """Takes cameras as they are given: nothing is learned, and nothing is computed.
+
+    Attributes:
+        lr: learning rate of its parameters at the papers' length of a run; shorter runs pace it (``Optimisation.pace``).
+        lr_end: factor on it at the last step, log-linear in between.
+        learns: whether gradients reach cameras.
+        align_steps: in which the camera of each test image is aligned to its image before that is scored.
+    """
+
+    lr: float = 0.0
+    lr_end: float = 1.0
+    learns: bool = False
+    align_steps: int = 0
+
+    def prepare(self, scene: SceneData) -> None:
+        """Takes the cameras of the training images. Called once, before training."""
+        return
+
+    def of(self, frame: Frame, progress: float) -> Camera:
+        """The camera that took a training image, after ``progress`` of the run; the data's own."""
+        return frame.camera
+
+    def aligned(self, frame: Frame, error: Callable[[Camera], Tensor]) -> Frame:
+        """A frame with the camera from which its image differs least, as far as ``align_steps`` go.
+
+        Args:
+            error: what the image from a camera differs by, a scalar with a gradient to the view matrix.
+        """
+        return frame
+
+    def regularisers(self) -> dict[str, Tensor]:
+        """Terms of the loss by name."""
+        return {}
+
+    def found(self) -> dict[str, Any] | None:
+        """What was learned, for metrics.json; None for nothing."""
+        return None
+
+
+class RefinedCameras(Cameras):
+    """Learns six numbers for each training image: by what its camera was turned, and moved, from where the data have it.
+
+    Structure from motion finds few points in thermal images, and leaves cameras off by a pixel or more: edges blur, and
+    temperatures mix across them. The gradient of an image with respect to its camera costs little beside that of the Gaussians.
+
+    **Convention:** the numbers are pixels of the training images. A turn is about the centre of the camera, by the angle of a
+    pixel, an offset by what moves the image of the middle of the scene (the median depth of its points) by a pixel; both along
+    the axes of the world. What all cameras do together belongs to the scene, which would drift away from cameras that are
+    not trained on: no common movement, rotation or scale of the cameras is learned, to first order.
+
+    Cameras of test images, and of all that is rendered after training, stay as they are given. Where those of test images are off
+    as well, scores tell what is wrong with them, not with the scene. ``align_steps`` then aligns each to its image first, with
+    the scene as it is, as is usual for methods that learn cameras; such scores are not those of cameras that are known.
+
+    Args:
+        start: share of the run after which cameras are learned: before, there is nothing to compare images with, and what they
+            learn misleads.
+        weight: of the mean square of the numbers in the loss, in 1/pixel².
+        lr, lr_end: learning rate in pixels per step at the papers' length of a run, and the factor on it at the last step.
+        align_steps: of Adam, in which the camera of each test image is aligned; 40 reach 1.5 pixels, 100 reach 4. 0: none is.
+
+    Raises:
+        ValueError: an option is out of its range.
+
+    Source: bundle-adjusting with the scene, BARF (Lin et al., ICCV 2021), whose evaluation aligns test cameras likewise.
+    """
+
+    learns = True
+
+    def __init__(
+        self, start: float = 0.1, weight: float = 1e-3, lr: float = 5e-3, lr_end: float = 0.01, align_steps: int = 0
+    ) -> None:
+        super().__init__()
+        if not isinstance(align_steps, int) or align_steps < 0:
+            raise ValueError(f"cameras need align_steps of 0 or more, a whole number, got {align_steps}")
+        for name, value in (("start", start), ("weight", weight), ("lr", lr), ("lr_end", lr_end)):
+            check_numbers(name, value)
+        if not 0 <= start < 1 or weight < 0 or lr < 0:
+            raise ValueError(
+                f"cameras need start in [0, 1), and weight and lr of 0 or more, got {start}, {weight} and {lr}"
+            )
+        self.start, self.weight, self.lr, self.lr_end, self.align_steps = start, weight, lr, lr_end, align_steps
+        self.moves = nn.Parameter(torch.zeros(0, 6))
+        self.register_buffer(
+            "common", torch.zeros(0, 0), persistent=False
+        )  # what all may do together, rows of unit length
+        self._rows: dict[int, int] = {}
+        self._pixels: list[tuple[float, float]] = []  # of each image: radians, and world units, that are one
+
+    def prepare(self, scene: SceneData) -> None:
+        frames = scene.train.frames
+        if len(frames) < FEWEST:
+            raise SceneError(
+                f"scene '{scene.name}' has {len(frames)} training images, and cameras are learned from {FEWEST} on: give "
+                "cameras=given"
+            )
+        self._rows = {frame.frame_id: row for row, frame in enumerate(frames)}
+        focals = [float(frame.camera.K[:2, :2].diagonal().mean()) for frame in frames]
+        depths = _depths(scene)
+        self._pixels = [(1.0 / focal, depth / focal) for focal, depth in zip(focals, depths, strict=True)]
+        self.moves = nn.Parameter(torch.zeros(len(frames), 6))
+        centres = torch.stack([frame.camera.center for frame in frames])
+        self.common = _common(centres - centres.mean(0), torch.tensor(self._pixels, dtype=torch.float64)).float()
+
+    def of(self, frame: Frame, progress: float) -> Camera:
+        """The camera that took a training image; its view matrix carries a gradient to ``moves``."""
+        if progress < self.start:
+            return frame.camera
+        with torch.no_grad():
+            flat = self.moves.view(-1)
+            flat -= ((self.common * flat).sum(1, keepdim=True) * self.common).sum(0)
+        row = self._rows[frame.frame_id]
+        return _moved(frame.camera, self.moves[row].to("cpu", torch.float64), *self._pixels[row])
+
+    def aligned(self, frame: Frame, error: Callable[[Camera], Tensor]) -> Frame:
+        if self.align_steps == 0:
+            return frame
+        middle = float(torch.tensor([offset / turn for turn, offset in self._pixels]).median())
+        focal = float(frame.camera.K[:2, :2].diagonal().mean())
+        with torch.inference_mode(False), torch.enable_grad():
+            moves = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+            optimizer = torch.optim.Adam([moves])
+            for step in range(self.align_steps):
+                optimizer.param_groups[0]["lr"] = ALIGN_PX[0] * (ALIGN_PX[1] / ALIGN_PX[0]) ** (step / self.align_steps)
+                (moves.grad,) = torch.autograd.grad(
+                    error(_moved(frame.camera, moves, 1 / focal, middle / focal)), [moves]
+                )
+                optimizer.step()
+        return replace(frame, camera=_moved(frame.camera, moves.detach(), 1 / focal, middle / focal))
+
+    def regularisers(self) -> dict[str, Tensor]:
+        return {"cameras": self.weight * 6 * mean(self.moves.square())} if self.weight > 0 else {}
+
+    @torch.no_grad()
+    def found(self) -> dict[str, Any]:
+        """Root mean squares over the images: of turns and offsets in pixels, of turns in degrees, of offsets in world units."""
+        turns, offsets = self.moves.cpu().double().view(-1, 2, 3).unbind(1)
+        pixels = torch.tensor(self._pixels, dtype=torch.float64)
+        sizes = {
+            "turned_px": turns, "moved_px": offsets,
+            "turned_deg": torch.rad2deg(turns * pixels[:, :1]), "moved": offsets * pixels[:, 1:],
+        }  # fmt: skip
+        return {name: values.square().sum(1).mean().sqrt().item() for name, values in sizes.items()}
+
+
+def _depths(scene: SceneData) -> list[float]:
+    """How far away what each training camera sees lies: the median depth of the scene's points in its image. Where there are
+    none, that of all others, and of a scene without points its extent."""
+    depths = []
+    for frame in scene.train.frames:
+        camera = frame.camera
+        pixels, z = camera.project(scene.points.double())
+        size = pixels.new_tensor([camera.width, camera.height])
+        seen = z[(z > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)]
+        depths.append(float(seen.median()) if len(seen) else float("nan"))
+    known = torch.tensor(depths).nanmedian().item()
+    return [depth if depth == depth else known if known == known else scene.extent for depth in depths]
+
+
+def _common(centres: Tensor, pixels: Tensor) -> Tensor:
+    """Movements of all cameras that leave every image as it is if the scene follows, to first order.
+
+    Args:
+        centres: [F, 3] of the cameras, about their mean.
+        pixels: [F, 2], radians and world units that are a pixel.
+
+    Returns:
+        [7, 6 F], orthonormal rows in pixels (fewer where some say the same): three translations, three rotations and the scale.
+    """
+    count, axes = len(centres), torch.eye(3, dtype=torch.float64)
+    none = torch.zeros(count, 3, dtype=torch.float64)
+    ways = [(none, axis.expand(count, 3)) for axis in axes]
+    ways += [(axis.expand(count, 3), torch.linalg.cross(axis.expand(count, 3), centres)) for axis in axes]
+    ways += [(none, centres)]
+    rows = torch.stack(
+        [torch.cat([turns / pixels[:, :1], moves / pixels[:, 1:]], 1).flatten() for turns, moves in ways]
+    )
+    _, sizes, found = torch.linalg.svd(rows / rows.norm(dim=1, keepdim=True).clamp_min(1e-300), full_matrices=False)
+    return found[sizes > 1e-6]
+
+
+def _moved(camera: Camera, moves: Tensor, per_turn: float, per_offset: float) -> Camera:
+    """A camera that is turned about its centre and moved, along the axes of the world.
+
+    Args:
+        moves: [6] in pixels: three of a turn, as axis times twice the tangent of half the angle (Cayley's form), which is the
+            angle where it is small; three of an offset.
+        per_turn, per_offset: radians, and world units, that are a pixel.
+    """
+    half, offset = 0.5 * per_turn * moves[:3], per_offset * moves[3:]
+    axes = torch.eye(3, dtype=moves.dtype)
+    across = torch.linalg.cross(half.expand(3, 3), axes)  # rows half × axis: its matrix, transposed
+    rotation = camera.viewmat[:3, :3] @ (axes + 2.0 / (1.0 + half @ half) * (across + across @ across))
+    upper = torch.cat([rotation, -(rotation @ (camera.center + offset))[:, None]], 1)
+    return replace(camera, viewmat=torch.cat([upper, camera.viewmat[3:]]))
