@@ -20,7 +20,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, SceneError, View, check_numbers
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ViewSet, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
@@ -109,13 +109,15 @@ def corrected(
     there = metres.isfinite()
     near = replace(wanted, distance_m=torch.where(there, metres, wanted.distance_m))
     cosine = cosines(camera, depth)
-    full = near
+
+    def under(conditions: Conditions) -> Tensor:
+        return surface_temperature(signal, response, conditions) - KELVIN_AT_0_C
+
+    one, distance_only = under(wanted), under(near)
+    all_of_it = distance_only
     if index is not None:
         seen = cosine.nan_to_num(1.0).clamp(min=GRAZING)
-        full = replace(near, emissivity=directional_emissivity(wanted.emissivity, seen, index))
-    one, distance_only, all_of_it = (
-        surface_temperature(signal, response, conditions) - KELVIN_AT_0_C for conditions in (wanted, near, full)
-    )
+        all_of_it = under(replace(near, emissivity=directional_emissivity(wanted.emissivity, seen, index)))
     angle = torch.rad2deg(torch.arccos(cosine))
     return Corrected(one, distance_only, all_of_it, metres.where(there, torch.nan), angle)
 
@@ -201,12 +203,13 @@ def correct_scene(
         )
     place = Target(target, CORRECTED)
     place.claim()
-    views = sorted([*scene.train, *scene.test], key=lambda view: view.frame.name)
-    far = typical_distance(views, depth_of) * metres_per_unit
-    doubts = [_doubt(views, depth_of, scene.points), "" if index is None else _unsettled(views, depth_of, scene.points)]
+    views = _by_name(scene)
+    few = views.frames[:: max(1, len(views) // 8)]
+    far = typical_distance(few, depth_of) * metres_per_unit
+    doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
     for doubt in filter(None, doubts):
         log.warning("%s", doubt)
-    changes: dict[str, list[np.ndarray]] = {"distance": [], "angle": [], "both": []}
+    changes = {"distance": Spread(), "angle": Spread(), "both": Spread()}
     rows, cameras, shown, known_of, without = [], {}, None, _told(folders), []
     low, high = np.inf, -np.inf
     for number, view in enumerate(track(views, "correcting")):
@@ -220,10 +223,10 @@ def correct_scene(
             celsius = celsius.where(view.mask, torch.nan)
         depth = depth_of(view.frame)
         found = corrected(celsius, view.camera, depth, metres_per_unit, own or response, done, wanted, index)
-        changes["distance"].append(_known(found.distance_only - found.one))
-        changes["angle"].append(_known(found.celsius - found.distance_only))
-        without.append(found.angle_deg.isnan().double().mean())
-        changes["both"].append(_known(found.celsius - found.one))
+        changes["distance"].add(found.distance_only - found.one)
+        changes["angle"].add(found.celsius - found.distance_only)
+        without.append(float(found.angle_deg.isnan().double().mean()))
+        changes["both"].add(found.celsius - found.one)
         name = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
         image = found.celsius.float().numpy()
         write_temperature(target / "images" / name, image)
@@ -247,17 +250,59 @@ def correct_scene(
     if assumed:
         doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
         log.warning("%s", doubts[-1])
-    section = _section(changes, far, wanted, index, float(torch.stack(without).mean()), len(views), doubts)
+    section = _section(changes, far, wanted, index, float(np.mean(without)), len(views), doubts)
     page = write_report(target, [section], f"{CORRECTED} by the trained scene {scene.name}")
     log.info("%s", page.with_suffix(".html"))
     return page
 
 
-def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
+class Spread:
+    """Mean size and percentiles of numbers that come image by image, in memory that does not grow with the images.
+
+    Numbers are counted by the nearest of 16 bits, which is right to one part in 2048, and are taken to lie evenly about it.
+    """
+
+    def __init__(self) -> None:
+        self.count, self._sizes = 0, 0.0
+        self._counts = np.zeros(1 << 16, dtype=np.int64)
+
+    def add(self, values: Tensor) -> None:
+        """Counts those that are finite."""
+        known = values[values.isfinite()].float().numpy()
+        self.count += known.size
+        self._sizes += float(np.abs(known).sum(dtype=np.float64))
+        self._counts += np.bincount(known.astype(np.float16).view(np.uint16), minlength=len(self._counts))
+
+    @property
+    def mean_size(self) -> float:
+        """NaN where nothing was counted."""
+        return self._sizes / self.count if self.count else float("nan")
+
+    def percentiles(self, shares: Sequence[float]) -> np.ndarray:
+        """Of shares in per cent; NaN where nothing was counted."""
+        if not self.count:
+            return np.full(len(shares), np.nan)
+        values = np.arange(len(self._counts), dtype=np.uint16).view(np.float16).astype(np.float64)
+        finite = np.flatnonzero(np.isfinite(values))
+        rising = finite[np.argsort(values[finite], kind="stable")]
+        middles = values[rising]
+        ends = np.concatenate([middles[:1], 0.5 * (middles[1:] + middles[:-1]), middles[-1:]])
+        below = np.concatenate([[0], self._counts[rising].cumsum()])
+        return np.round(np.interp(np.asarray(shares) / 100 * self.count, below, ends), 4) + 0.0  # no -0
+
+
+def _by_name(scene: SceneData) -> ViewSet:
+    """All views of a scene, each decoded when it is asked for: together they may be more than memory holds."""
+    places = [(part, k) for part in (scene.train, scene.test) for k in range(len(part))]
+    places.sort(key=lambda place: place[0].frames[place[1]].name)
+    return ViewSet([part.frames[k] for part, k in places], lambda i: places[i][0][places[i][1]])
+
+
+def _doubt(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     """What to say where the splats lie elsewhere than the points that the reconstruction measured; empty where they do not."""
     found = []
-    for view in _few(views):
-        camera, depth = view.camera, depth_of(view.frame)
+    for frame in few:
+        camera, depth = frame.camera, depth_of(frame)
         at, within = _pixels(camera, points)
         far = camera.project(points[within])[1]
         found.append(depth[at[:, 1], at[:, 0]] / far)
@@ -272,12 +317,12 @@ def _doubt(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
     )
 
 
-def _unsettled(views: Sequence[View], depth_of: Any, points: Tensor) -> str:
+def _unsettled(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     """What to say where views disagree on the normals of the same points; empty where they do not."""
     seen = []
-    for view in _few(views):
-        camera = view.camera
-        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth_of(view.frame))
+    for frame in few:
+        camera = frame.camera
+        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth_of(frame))
         at, within = _pixels(camera, points)
         own = torch.full((len(points), 3), torch.nan, dtype=torch.float64)
         own[within] = found[at[:, 1], at[:, 0]] @ turn
@@ -315,21 +360,13 @@ def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
     }
 
 
-def _known(values: Tensor) -> np.ndarray:
-    return values[values.isfinite()].float().numpy()
-
-
-def typical_distance(views: Sequence[View], depth_of: Any) -> float:
-    """Median distance in world units over a few views; what one would give for all pixels. Raises SceneError without surfaces."""
-    found = [distances(view.camera, depth_of(view.frame)) for view in _few(views)]
+def typical_distance(few: Sequence[Frame], depth_of: Any) -> float:
+    """Median distance over a few frames in world units, what one would give for all pixels. SceneError without surfaces."""
+    found = [distances(frame.camera, depth_of(frame)) for frame in few]
     known = torch.cat([d[d.isfinite()] for d in found])
     if not len(known):
         raise SceneError("the trained scene shows no surface to any of its cameras; train it longer")
     return float(known.median())
-
-
-def _few(views: Sequence[View]) -> Sequence[View]:
-    return views[:: max(1, len(views) // 8)]
 
 
 def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None, Conditions]:
@@ -384,7 +421,7 @@ def _picture(found: Corrected) -> np.ndarray:
 
 
 def _section(
-    changes: Mapping[str, list[np.ndarray]],
+    changes: Mapping[str, Spread],
     far: float,
     c: Conditions,
     index: float | None,
@@ -398,12 +435,10 @@ def _section(
         names |= {"angle": "angle of each pixel", "both": "both"}
     table, values = [], {}
     for key, name in names.items():
-        found = np.concatenate(changes[key]) if changes[key] else np.zeros(0)
-        quantiles = np.percentile(found, PERCENT) if found.size else np.full(len(PERCENT), np.nan)
-        spread = float(np.abs(found).mean()) if found.size else float("nan")
-        table.append([name, f"{spread:.3f}", *(f"{q:+.3f}" for q in quantiles)])
+        size, quantiles = changes[key].mean_size, changes[key].percentiles(PERCENT)
+        table.append([name, f"{size:.3f}", *(f"{q:+.3f}" for q in quantiles)])
         values[key] = {
-            "mean_abs_c": spread,
+            "mean_abs_c": size,
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [

@@ -146,6 +146,19 @@ def test_panels_without_logger_and_bounds(tmp_path):
     assert not (none / "renders").exists()
 
 
+def test_views_that_are_rendered_again_give_the_same_panels(tmp_path, monkeypatch):
+    def drawn(folder):
+        module = FakeModule(wall(), folder)
+        evaluate(module, trainer(folder, [ImagePanels(test_views=-1)], logger=False))
+        return module.calls, {path.name: path.read_bytes() for path in (folder / "renders" / "test").glob("*.png")}
+
+    calls, at_once = drawn(tmp_path / "kept")
+    monkeypatch.setattr("heatsplat.callbacks.images.KEPT", 1)
+    more_calls, again = drawn(tmp_path / "again")
+    assert len(again) == 4 and again == at_once
+    assert (calls, more_calls) == (4, 7)
+
+
 def test_a_clean_image_is_compared_with_what_it_is_compared_with():
     scene = wall()
     view, image = scene.test[0], scene.test[0].thermal

@@ -169,6 +169,9 @@ def test_pictures_show_what_they_say(run):
     for path in drawn:
         picture = cv2.imread(str(folder / path))
         assert picture.shape[1] > 3 * picture.shape[0] > 600
+        event = events(folder).Images(path.removeprefix("renders/").removesuffix(".png"))[-1]
+        assert event.encoded_image_string == (folder / path).read_bytes() and event.step == 24
+        assert (event.height, event.width) == picture.shape[:2]
 
 
 def test_a_view_s_companions_come_after_it_and_take_no_other_view_s_place(tmp_path):

@@ -17,11 +17,8 @@ def clean(scene: str = "static", size: str = "tiny") -> Material:
 
 
 def changed(material: Material, images: torch.Tensor, **others) -> Material:
-    """The material with other images, in its views too."""
-    views = [
-        replace(view, thermal=image[..., None].float()) for view, image in zip(material.views, images, strict=True)
-    ]
-    return replace(material, images=images, views=views, **others)
+    """The material with other images."""
+    return replace(material, images=images, **others)
 
 
 def checks(material: Material) -> list[str]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from materials import checks, clean
 
-from heatsplat.doctor.base import Material
+from heatsplat.doctor.base import Material, coarse
 from heatsplat.doctor.examination import examine
 
 
@@ -13,16 +13,16 @@ def test_photos_of_other_moments_and_photos_that_lie_beside_are_found():
     # A hand that sweeps: each frame shows what the one before did from a little further on.
     steps = [torch.roll(clean().images[0], 3 * f, 1) for f in range(10)]
     images = torch.stack(steps)
-    photos = [image[..., None].expand(-1, -1, 3).float() for image in steps]
+    photos = [coarse(image) for image in steps]
     about = {"names": [f"{i}" for i in range(10)], "times_s": None, "chosen": list(range(10)), "images": images}
-    assert "pairing" not in checks(Material(**about, rgb=photos))
+    assert "pairing" not in checks(Material(**about, photos=photos))
     assert "2 frame(s)" in next(
-        f.what for f in examine(Material(**about, rgb=photos[2:] + photos[:2])) if f.check == "pairing"
+        f.what for f in examine(Material(**about, photos=photos[2:] + photos[:2])) if f.check == "pairing"
     )
     mixed = [photos[k] for k in (7, 3, 9, 0, 5, 8, 1, 4, 2, 6)]
-    assert "do not fit" in next(f.what for f in examine(Material(**about, rgb=mixed)) if f.check == "pairing")
+    assert "do not fit" in next(f.what for f in examine(Material(**about, photos=mixed)) if f.check == "pairing")
     aside = [torch.roll(photo, 5, 0) for photo in photos]
-    assert "beside" in next(f.what for f in examine(Material(**about, rgb=aside)) if f.check == "pairing")
+    assert "beside" in next(f.what for f in examine(Material(**about, photos=aside)) if f.check == "pairing")
 
 
 def test_clocks_of_two_cameras_that_disagree_are_found():
@@ -34,12 +34,12 @@ def test_clocks_of_two_cameras_that_disagree_are_found():
 
 def test_a_black_photo_or_a_closed_shutter_says_nothing_of_the_others():
     images = torch.stack([torch.roll(clean().images[0], 3 * f, 1) for f in range(10)])
-    photos = [image[..., None].expand(-1, -1, 3).float() for image in images]
+    photos = [coarse(image) for image in images]
     dark = [torch.zeros_like(photos[0]), *photos[1:]]
     shut = torch.cat([images[:5], torch.full_like(images[:1], 0.3), images[6:]])
     about = {"names": [f"{i}" for i in range(10)], "times_s": None, "chosen": list(range(10))}
     for heat, light in ((images, dark), (shut, photos), (shut, dark)):
-        assert "pairing" not in checks(Material(**about, images=heat, rgb=light))
-        late = Material(**about, images=heat, rgb=light[2:] + light[:2])
+        assert "pairing" not in checks(Material(**about, images=heat, photos=light))
+        late = Material(**about, images=heat, photos=light[2:] + light[:2])
         (found,) = (one.what for one in examine(late) if one.check == "pairing")
         assert "2 frame(s)" in found or "do not fit" in found

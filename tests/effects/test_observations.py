@@ -1,12 +1,21 @@
-"""Frames that observations look at: evenly spread where points are seen again, else runs of frames that follow each other."""
+"""Frames that observations look at: evenly spread where points are seen again, else runs of frames that follow each other; each
+is decoded once, and only what is shown at points is kept of photos."""
 
+import weakref
+from dataclasses import replace
+
+import pytest
 import torch
+from torch.nn import functional
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.doctor.base import material_of
 from heatsplat.doctor.examination import examine
 from heatsplat.effects.catalogue import decide
-from heatsplat.effects.observations import frames_to_follow, observe
+from heatsplat.effects.observations import _steepest, between, frames_to_follow, observe, slopes
+from heatsplat.effects.physical.point_spread import CLEAR, REACH, _widths
+from heatsplat.effects.physical.thermal_opacity import _votes
+from heatsplat.effects.swept_points import swept_points
 
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
 AHEAD = 0.1 * WIDTH / FOCAL  # of a flight at height 1: nine tenths of an image are in the next one
@@ -58,3 +67,57 @@ def test_images_of_nothing_have_no_effects():
     black = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], torch.zeros(HEIGHT, WIDTH, 1)))
     dark = SceneData("dark", black, scene.val, scene.test, scene.points)
     assert not [name for name, verdict in decide(dark).items() if verdict.on and verdict.statistic is not None]
+
+
+@pytest.mark.parametrize(("look", "frames"), [(observe, 64), (material_of, 32), (_votes, 64), (swept_points, 64)])
+def test_views_are_decoded_once_and_one_after_the_other(look, frames):
+    """What is held of photos, the largest part of a view, does not grow with the number of views."""
+    scene, photos, held = flight(80), [], []
+
+    def decode(i: int) -> View:
+        held.append(sum(photo() is not None for photo in photos))
+        view = scene.train[i]
+        view = replace(view, rgb=view.thermal.repeat(1, 1, 3), mask=torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+        photos.append(weakref.ref(view.rgb))
+        return view
+
+    look(replace(scene, train=ViewSet(scene.train.frames, decode)))
+    assert len(held) == frames
+    assert max(held) <= 1  # the one before, until the next takes its name
+
+
+def test_images_are_held_as_they_were_decoded():
+    scene = flight(12)
+    images = observe(scene).images
+    assert images.dtype == material_of(scene).images.dtype == torch.float32
+    assert torch.equal(images[3], scene.train[3].thermal[..., 0])
+
+
+def test_the_steepest_slope_is_looked_for_at_the_points_alone():
+    image = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    line, column = (grid.flatten() for grid in torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij"))
+    wide = functional.pad(image[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    across, down = 0.5 * (wide[1:-1, 2:] - wide[1:-1, :-2]), 0.5 * (wide[2:, 1:-1] - wide[:-2, 1:-1])
+    steep = (across**2 + down**2 - 0.1**2).clamp_min(0.0).sqrt()
+    steepest = functional.max_pool2d(steep[None, None], 3, stride=1, padding=1)[0, 0]
+    torch.testing.assert_close(_steepest(image, line, column, 0.1).reshape(HEIGHT, WIDTH), steepest)
+
+    everywhere = torch.rand(500, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2.2 - 1.1
+    expected = between(torch.stack([across, down], 2), everywhere)
+    torch.testing.assert_close(slopes(image, everywhere), expected)
+
+
+def test_edges_are_those_of_all_windows():
+    image = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 0.01
+    image[:, 20:] += 0.5
+    image[10:, 33:] += 0.3
+    image[20, 22] = torch.nan
+    noise, expected = 0.01, []
+    for row in image:
+        for window in row.diff().unfold(0, 2 * REACH + 1, 1):
+            step, sizes = window.sum(), window.abs()
+            if step.abs() > max(CLEAR * noise, 0.9 * sizes.sum() - 2 * noise) and sizes[REACH] == sizes.max():
+                share, at = window / step, torch.arange(-REACH, REACH + 1)
+                expected.append((share * (at - (share * at).sum()) ** 2).sum().clamp_min(0.0).sqrt())
+    assert len(expected) == 2 * HEIGHT - 10 - 1
+    torch.testing.assert_close(_widths(image, noise), torch.stack(expected))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.coverage import Sighting, covered, gap_free, seen_means, surface_depth
+from heatsplat.geometry.coverage import FAR, Sighting, _sees, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.projection import look_at
 
 K = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -72,6 +72,37 @@ def test_masked_pixels_of_training_images_cover_nothing():
 def test_depth_maps_may_be_coarser_than_the_image():
     fine = camera(0.0)
     assert covered(fine, wall(), [Sighting(fine.resized(8, 6), wall()[:6, :8])]).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_pixel_is_missed_where_tiles_are_looked_for_first(seed):
+    """Against all pixels in all images: cameras of other sizes all around, depths with jumps and holes, and masks."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def seen_from(width: int, height: int) -> tuple[Camera, torch.Tensor]:
+        eye, target = torch.randn(2, 3, generator=generator, dtype=torch.float64) * torch.tensor([[4.0], [1.0]])
+        focal = 10.0 + 60.0 * torch.rand(1, generator=generator).item()
+        K = torch.tensor([[focal, 0, 0.4 * width], [0, 1.1 * focal, 0.6 * height], [0, 0, 1]], dtype=torch.float64)
+        depth = 1.0 + 6.0 * torch.rand(height // 8 + 1, width // 8 + 1, generator=generator)
+        depth = depth.repeat_interleave(8, 0).repeat_interleave(8, 1)[:height, :width].contiguous()
+        depth[depth > 5.5] = torch.inf
+        viewmat = look_at(eye, target, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        return Camera(viewmat, K, width, height), depth
+
+    sightings = []
+    for width in range(20, 44, 2):
+        taken, depth = seen_from(width, 30)
+        mask = torch.rand(30, width, generator=generator) > 0.2 if width % 4 else None
+        sightings.append(Sighting(taken, depth, mask))
+    new, depth = seen_from(101, 67)
+    rows, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (67, 101)), indexing="ij")
+    rays = torch.stack([columns, rows, torch.ones_like(rows)], 2).reshape(-1, 3) @ torch.linalg.inv(new.K).T
+    apart = max((one.camera.center - new.center).norm() for one in sightings)
+    far = torch.where(depth.isinf(), FAR * max(apart, 1.0), depth.double()).reshape(-1, 1)
+    points = (rays * far - new.viewmat[:3, 3]) @ new.viewmat[:3, :3]
+    truth = torch.stack([_sees(one, points, depth.isinf().reshape(-1)) for one in sightings]).any(0).reshape(67, 101)
+    found = covered(new, depth, sightings)
+    assert torch.equal(found, truth) and 0.05 < found.double().mean() < 0.95
 
 
 def test_surface_depth_is_infinite_where_a_pixel_is_open():

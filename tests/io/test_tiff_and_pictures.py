@@ -126,7 +126,8 @@ def test_comparison_without_range_or_pixels(channels):
 
 def test_png_round_trip(tmp_path):
     picture = picture_of(np.linspace(0, 1, 600).reshape(20, 30), 0, 1, unit="")
-    write_png(tmp_path / "a" / "p.png", picture)
+    content = write_png(tmp_path / "a" / "p.png", picture)
+    assert content == (tmp_path / "a" / "p.png").read_bytes()
     assert (cv2.imread(str(tmp_path / "a" / "p.png"))[..., ::-1] == picture).all()
 
 

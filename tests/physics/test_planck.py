@@ -50,6 +50,20 @@ def test_the_inverse_finds_the_temperature_again_and_has_the_inverse_slope(dtype
     assert radiance.grad.item() == pytest.approx(1 / slope, rel=20 * EPSILON[dtype])
 
 
+def test_an_image_is_what_its_pixels_are_and_comes_back_to_far_below_a_float32():
+    kelvins = torch.linspace(200.0, 1500.0, 70_000, dtype=torch.float64).view(200, 350)
+    band = Band(nodes=16)
+    sent = band.radiance(kelvins)
+    assert torch.equal(sent, band.with_slope(kelvins)[0])  # however many are worked out at once
+    found = band.temperature(sent)
+    assert (found / kelvins - 1).abs().max() < 2e-14 and (found.diff(dim=1) > 0).all()
+    learning = sent.clone().requires_grad_()
+    assert torch.equal(band.temperature(learning), found)
+    turned = band.temperature(sent.T)
+    assert torch.equal(turned, found.T) and torch.equal(band.radiance(kelvins.T), sent.T)
+    assert band.radiance(kelvins[:0]).shape == band.temperature(sent[:0]).shape == (0, 350)
+
+
 def test_gradients_of_both_are_those_of_finite_differences():
     kelvins = double(200.0, 300.0, 450.0).requires_grad_()
     assert torch.autograd.gradcheck(Band(nodes=16).radiance, kelvins)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 from recordings import write_flir
 
-from heatsplat.contracts import Camera, Frame, SceneError, ThermalRange, View
+from heatsplat.contracts import Camera, Frame, SceneError, ThermalRange, View, ViewSet
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.geometry.projection import look_at
 from heatsplat.geometry.sight_lines import cosines, distances, rays
@@ -24,7 +25,7 @@ from heatsplat.physics.radiometry import (
     surface_temperature,
 )
 from heatsplat.preparation.conditions import Given
-from heatsplat.preparation.correction import _unsettled, correct_scene, corrected, preparation_of
+from heatsplat.preparation.correction import PERCENT, Spread, _unsettled, correct_scene, corrected, preparation_of
 from heatsplat.preparation.prepare import prepare
 
 CAMERA = Camera(
@@ -73,11 +74,10 @@ def scene():
     celsius = surface_temperature(filmed(BandResponse(), 1.5), BandResponse(), Conditions()) - 273.15
     span = ThermalRange(0.0, 60.0)
     image = span.to_unit(celsius).float()[..., None]
-    views = [View(Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i), thermal=image) for i in range(3)]
-    points = torch.rand(30, 3)
-    return SimpleNamespace(
-        name="floor", thermal_range=span, train=views[:2], test=views[2:], points=points, point_colors=None
-    )
+    frames = [Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i) for i in range(3)]
+    views = ViewSet(frames, lambda i: View(frames[i], thermal=image))
+    train, test, points = views.subset([0, 1]), views.subset([2]), torch.rand(30, 3)
+    return SimpleNamespace(name="floor", thermal_range=span, train=train, test=test, points=points, point_colors=None)
 
 
 def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
@@ -96,6 +96,42 @@ def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
     assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
     torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
     assert module.scene.metres_per_unit == METRES
+
+
+def test_images_are_held_one_at_a_time(tmp_path):
+    floor, alive, held = scene(), [], []
+    thermal = floor.train[0].thermal
+
+    def decode(i):
+        held.append(sum(image() is not None for image in alive))
+        image = thermal.clone()
+        alive.append(weakref.ref(image))
+        return View(frames[i], thermal=image)
+
+    frames = [Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i) for i in (4, 0, 3, 1, 2)]
+    floor.train, floor.test = ViewSet(frames, decode), ViewSet([], decode)
+    correct_scene(floor, lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), 1.5, METRES)
+    assert len(held) == 5 and max(held) <= 1
+    rows = list(csv.DictReader((tmp_path / "frames.csv").open()))
+    assert [row["file"] for row in rows] == sorted(row["file"] for row in rows)
+
+
+def test_percentiles_of_what_comes_in_parts_are_those_of_all():
+    generator = torch.Generator().manual_seed(0)
+    parts = [torch.randn(300, 400, generator=generator, dtype=torch.float64) * scale for scale in (0.01, 1.0, 20.0)]
+    parts[1][:50] = torch.nan
+    parts[2][:100] = 0.0
+    spread = Spread()
+    for part in parts:
+        spread.add(part)
+    known = torch.cat([part[part.isfinite()] for part in parts]).numpy()
+    assert spread.count == known.size and spread.mean_size == pytest.approx(np.abs(known).mean(), rel=1e-6)
+    truth = np.percentile(known, PERCENT)
+    np.testing.assert_allclose(spread.percentiles(PERCENT), truth, rtol=1 / 2048, atol=1e-4)
+    assert np.isnan(Spread().percentiles(PERCENT)).all() and np.isnan(Spread().mean_size)
+    nothing = Spread()
+    nothing.add(-torch.zeros(5))
+    assert [f"{value:+.3f}" for value in nothing.percentiles(PERCENT)] == ["+0.000"] * len(PERCENT)
 
 
 def test_places_of_the_preparation_stay(tmp_path):
@@ -143,15 +179,15 @@ def test_cameras_that_are_turned_against_each_other_agree_on_the_normals_of_a_fl
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     eyes = torch.tensor([[0.0, -8.0, 6.0], [2.0, 0.0, 9.0], [9.0, 6.0, 4.0]], dtype=torch.float64)
     poses = [look_at(eye, 0.0 * up, up) for eye in eyes]
-    views = [View(Frame(f"{i}", i, replace(CAMERA, viewmat=pose))) for i, pose in enumerate(poses)]
+    frames = [Frame(f"{i}", i, replace(CAMERA, viewmat=pose)) for i, pose in enumerate(poses)]
 
     def floor(frame):  # z = 0
         along = rays(frame.camera) @ frame.camera.viewmat[:3, :3].double()
         return (-frame.camera.center[2] / along[..., 2]).where(along[..., 2] < 0, torch.inf)
 
     spots = 2.0 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 1.0
-    assert _unsettled(views, floor, spots * torch.tensor([1.0, 1.0, 0.0])) == ""
-    assert "Too few points" in _unsettled(views, floor, spots[:5])
+    assert _unsettled(frames, floor, spots * torch.tensor([1.0, 1.0, 0.0])) == ""
+    assert "Too few points" in _unsettled(frames, floor, spots[:5])
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.02])

@@ -190,17 +190,15 @@ def quadratic(errors: Sequence[float]) -> bool:
     return len(factors) >= 2 and max(factors) < 10 * min(factors)
 
 
-def test_corrections_of_a_temperature_found_in_a_table(monkeypatch):
-    """Newton's steps square the error of the table they start from."""
-    monkeypatch.setattr(planck, "ENTRIES", 6)
-    kelvins = torch.tensor([260.0], dtype=DOUBLE)
+def test_the_table_of_temperatures_by_radiance(monkeypatch):
+    kelvins = torch.logspace(1.5, 3.5, 500, dtype=DOUBLE)
     sent = planck.Band().radiance(kelvins)
 
-    def error(steps: int) -> float:
-        monkeypatch.setattr(planck, "POLISH", steps)
-        return abs(planck.Band().temperature(sent) / kelvins - 1).item()
+    def error(entries: int) -> float:
+        monkeypatch.setattr(planck, "ENTRIES", entries)
+        return (planck.Band().temperature(sent) / kelvins - 1).abs().max().item()
 
-    assert quadratic([error(steps) for steps in range(5)])
+    assert order([64, 128, 256, 512], error) == pytest.approx(4.0, abs=0.2)
 
 
 def test_corrections_of_the_mean_balance(monkeypatch):

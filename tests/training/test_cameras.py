@@ -7,6 +7,7 @@ import torch
 from running import TINY, run
 from scipy.spatial.transform import Rotation
 
+from heatsplat.callbacks.camera_check import OFF
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneError
 from heatsplat.training.cameras import Cameras, RefinedCameras, _common, _moved
@@ -119,7 +120,7 @@ def test_cameras_that_are_given_stay_and_have_nothing_to_learn():
     cameras = Cameras()
     cameras.prepare(scene)
     frame = scene.frames[1]
-    assert cameras.of(frame, 0.5) is frame.camera and cameras.aligned(frame, None) is frame
+    assert cameras.of(frame, 0.5) is frame.camera and cameras.align_steps == 0
     assert not list(cameras.parameters()) and cameras.found() is None and cameras.regularisers() == {}
 
 
@@ -155,7 +156,14 @@ def test_fields_are_refused(tmp_path):
         run(tmp_path, *TINY, "method=thermonerf", "max_steps=3", "cameras=refined")
 
 
-WRONG = (*TINY, "method=3dgs", "data.scene=static", "data.pose_error_px=1", "max_steps=300")
+WRONG = (
+    *TINY,
+    "method=3dgs",
+    "data.scene=static",
+    "data.pose_error_px=1",
+    "max_steps=300",
+    "callbacks.camera_check.least_steps=300",
+)
 
 
 def off(frames: list[Frame], cameras: list[Camera], points: torch.Tensor) -> float:
@@ -182,13 +190,17 @@ def test_a_run_finds_cameras_that_are_a_pixel_off(tmp_path):
     assert "40 steps" in module.results.data["test_cameras_aligned"]
     left, _ = run(tmp_path / "left", *WRONG)
     assert module.results.test["psnr"] > left.results.test["psnr"] + 1.0, (module.results.test, left.results.test)
+    fits = [one.results.run["camera_check"]["error_falls"] for one in (module, left)]
+    assert fits[0] < 0.8 * fits[1] and fits[1] > OFF, fits
     assert "cameras" not in left.results.run and "test_cameras_aligned" not in left.results.data
 
 
 def test_a_run_that_was_stopped_goes_on_with_its_cameras(tmp_path):
     settings = (*WRONG, "cameras=refined", "max_steps=60", "test=false")
     whole, _ = run(tmp_path / "whole", *settings, "callbacks.checkpoint.every_n_train_steps=30")
-    found = torch.load(tmp_path / "whole" / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]["cameras.moves"]
+    found = torch.load(tmp_path / "whole" / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"][
+        "cameras.moves"
+    ]
     assert torch.equal(found, whole.cameras.moves) and float(found.abs().max()) > 0
     ckpt = tmp_path / "whole" / "checkpoints" / "step_000030.ckpt"
     again, _ = run(tmp_path / "again", *settings, f"ckpt={ckpt}")

@@ -80,7 +80,7 @@ def test_the_floor_of_a_street_sees_the_sky_that_geometry_leaves_it(width, heigh
     assert truth - 0.06 < seen[middle].mean().item() < truth + 0.02
 
 
-def test_the_yard_is_lit_as_rays_say():
+def test_the_yard_is_lit_as_rays_say(monkeypatch):
     """Of a yard's points, against its boxes by ray tracing: shadows that are found outweigh those that are not there."""
     scene, world = Synthetic(scene="outdoor", size="demo").scene, OutdoorScene(OUTDOOR["outdoor"])
     normals, exposure = Normals(views=12), Exposure(side=192)
@@ -88,6 +88,8 @@ def test_the_yard_is_lit_as_rays_say():
     exposure.prepare(scene, Renderer("cpu"), normals.discs, ["sun_seen"])
     found = exposure.look(scene.points)
     assert set(found) == {"sun_seen"}
+    monkeypatch.setattr("heatsplat.training.exposure.TOGETHER", len(scene.points))
+    assert torch.equal(exposure.look(scene.points)["sun_seen"], found["sun_seen"])  # however many are looked up at once
     exposure.prepare(scene, Renderer("cpu", near=1.0, far=30.0), normals.discs, ["sun_seen"])  # of the run's views
     assert torch.equal(exposure.look(scene.points)["sun_seen"], found["sun_seen"])
     directions = sun_directions(scene.weather.sun, scene.weather.up)

@@ -10,7 +10,7 @@ import numpy as np
 import pytorch_lightning as pl
 from torch import Tensor
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_png, board
 from heatsplat.contracts import Frame, SceneData, SceneError, ThermalRange, View, check_option, evenly_spread
 from heatsplat.io.pictures import (
     Panel,
@@ -27,7 +27,8 @@ from heatsplat.metrics.mae import mae_c
 from heatsplat.metrics.psnr import psnr
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
-RANGE_PIXELS = 20_000  # of each of them, at most
+RANGE_PIXELS = 20_000  # of each of them, at most, and of each test view for the ends of the errors
+KEPT = 12  # test views that wait in memory for the errors of all; what is beyond is rendered again
 
 
 class ImagePanels(pl.Callback):
@@ -48,7 +49,9 @@ class ImagePanels(pl.Callback):
         check_option("callbacks.images.figures", figures, (None, "pdf", "svg"), SceneError)
         self.val_views, self.test_views, self.figures = val_views, test_views, figures
         self._bounds: tuple[float, float] | None = None
-        self._kept: list[dict[str, Any]] = []
+        self._chosen: list[int] = []
+        self._kept: dict[int, dict[str, Any]] = {}
+        self._errors: dict[str, list[np.ndarray]] = {}
 
     def on_validation_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: Any
@@ -62,18 +65,22 @@ class ImagePanels(pl.Callback):
     ) -> None:
         count = min(len(module.scene.test), int(trainer.num_test_batches[0]))
         if batch_idx in evenly_spread(count, count if self.test_views < 0 else self.test_views):
-            self._kept.append(outputs)
+            self._chosen.append(batch_idx)
+            for modality, image in _images(module, outputs).items():
+                found = magnitudes(outputs["view"], modality, image, module.scene)
+                self._errors.setdefault(modality, []).append(found[:: max(1, len(found) // RANGE_PIXELS)].copy())
+            if len(self._kept) < KEPT:
+                self._kept[batch_idx] = outputs
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        """Draws what was kept, now that the errors of all are known."""
-        errors: dict[str, list[np.ndarray]] = {}
-        for outputs in self._kept:
-            for modality, image in _images(module, outputs).items():
-                errors.setdefault(modality, []).append(magnitudes(outputs["view"], modality, image, module.scene))
-        limits = {modality: error_limit_of(np.concatenate(found)) for modality, found in errors.items()}
-        for outputs in self._kept:
+        """Draws the views, now that the errors of all are known."""
+        limits = {modality: error_limit_of(np.concatenate(found)) for modality, found in self._errors.items()}
+        for i in self._chosen:
+            outputs = self._kept.pop(i, None)
+            if outputs is None:
+                outputs = module.test_step(module.transfer_batch_to_device(module.scene.test[i], module.device, 0), i)
             self._draw("test", module, outputs, trainer.global_step, limits)
-        self._kept = []
+        self._chosen, self._errors = [], {}
 
     def _draw(
         self,
@@ -90,11 +97,11 @@ class ImagePanels(pl.Callback):
             shown, title = panels(view, modality, image, module.scene, self._bounds, (limits or {}).get(modality))
             path = module.output_dir / "renders" / split / f"{name}.png"
             picture = compose(shown, title)
-            write_png(path, picture)
+            png = write_png(path, picture)
             if self.figures is not None and split == "test":
                 write_figure(path.with_suffix(f".{self.figures}"), shown, title)
             if writer is not None:
-                writer.add_image(f"{split}/{name}", picture, step, dataformats="HWC")
+                add_png(writer, f"{split}/{name}", png, *picture.shape[:2], step)
 
 
 def _images(module: pl.LightningModule, outputs: Mapping[str, Any]) -> dict[str, Tensor]:

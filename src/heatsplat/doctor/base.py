@@ -9,9 +9,10 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from heatsplat.contracts import Camera, Frame, SceneData, View
-from heatsplat.effects.observations import Tracks, frames_to_follow, tracks_of
+from heatsplat.effects.observations import Tracks, frames_to_follow, read, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -21,6 +22,7 @@ NAMED = 3  # frames that a finding names
 # Correlation from which two images are one: 0.998 from a tripod; where cameras move no recording has 0.9 in all frames.
 SAME = 0.95
 MAX_PIXELS = 1500  # of a camera that stands still
+COARSE = 64  # pixels of the shorter side of images whose edges are compared
 FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
 
 
@@ -51,17 +53,17 @@ class Material:
     Args:
         names, times_s: of all frames, in the order of the recording; times in seconds, None where there are none.
         chosen: positions in them of the frames whose images are here.
-        images: [F, H, W] float64 of those frames: image values, or °C where there is no range yet; NaN does not count.
+        images: [F, H, W] of those frames, as they were read: image values, or °C where there is no range yet; NaN does not
+            count. ``image`` and ``known`` give one of them in float64.
         unit_k: kelvin per image value, None where they are no temperatures.
         masks: [F, H, W] bool, or None where all pixels count.
-        rgb: visible images [H, W, 3] of the same frames and cameras, or None.
+        photos: brightness [h, w] of visible images of the same frames and cameras, no finer than ``coarse``, or None.
         rgb_times_s: when the photos of all frames were taken, on their own camera's clock, or None.
         cameras: of the same frames, or None.
         all_cameras: of all training frames, or None.
         points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
-        views: the views of ``images``, for tracks; empty without cameras.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
         lenses: for every frame, the number of the camera that took it; empty where one took all.
     """
@@ -72,14 +74,13 @@ class Material:
     images: Tensor
     unit_k: float | None = None
     masks: Tensor | None = None
-    rgb: Sequence[Tensor] | None = None
+    photos: Sequence[Tensor] | None = None
     rgb_times_s: Sequence[float] | None = None
     cameras: Sequence[Camera] | None = None
     all_cameras: Sequence[Camera] | None = None
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
     clipped: float | None = None
-    views: Sequence[View] = ()
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
 
@@ -102,7 +103,7 @@ class Material:
         """Scene points through the images, or None where there are no cameras and points, or too few."""
         if self.cameras is None or self.points is None or not len(self.points):
             return None
-        return tracks_of(self.points.double(), list(self.views), self.images, self.noise)
+        return tracks_of(self.points.double(), self.cameras, self.images, self.masks, self.noise)
 
     @cached_property
     def followed(self) -> tuple[Tensor, Tensor] | None:
@@ -113,9 +114,10 @@ class Material:
         if self.cameras is not None or not self.still:
             return None
         every = max(1, math.ceil(math.sqrt(self.images[0].numel() / MAX_PIXELS)))
-        counts = self.images.isfinite() if self.masks is None else self.images.isfinite() & self.masks
-        values, weights = (x[:, every // 2 :: every, every // 2 :: every].flatten(1).T for x in (self.images, counts))
-        return values.nan_to_num(), weights.double()
+        grid = (slice(None), slice(every // 2, None, every), slice(every // 2, None, every))
+        values = self.images[grid].flatten(1).T.double()
+        counts = values.isfinite() if self.masks is None else values.isfinite() & self.masks[grid].flatten(1).T
+        return values.nan_to_num(), counts.double()
 
     @cached_property
     def still(self) -> bool:
@@ -125,11 +127,8 @@ class Material:
 
     def _alike(self, frame: int, other: int) -> float:
         """Correlation of two images, without what noise takes of it; 0 where one shows nothing beside noise."""
-        pair = self.images[[frame, other]]
-        counts = pair.isfinite().all(0)
-        if self.masks is not None:
-            counts = counts & self.masks[frame] & self.masks[other]
-        values = pair[:, counts]
+        counts = self.counts(frame) & self.counts(other)
+        values = torch.stack([self.image(frame)[counts], self.image(other)[counts]])
         if values.shape[1] < 2:
             return 0.0
         shown = values - values.mean(1, keepdim=True)
@@ -138,11 +137,18 @@ class Material:
             return 0.0
         return float((shown[0] * shown[1]).mean() / size.prod().sqrt())
 
+    def image(self, frame: int) -> Tensor:
+        """The image [H, W] float64 of a frame."""
+        return self.images[frame].double()
+
+    def counts(self, frame: int) -> Tensor:
+        """Which pixels [H, W] bool of a frame count."""
+        finite = self.images[frame].isfinite()
+        return finite if self.masks is None else finite & self.masks[frame]
+
     def known(self, frame: int) -> Tensor:
-        """Values [n] of the pixels of a frame that count."""
-        image = self.images[frame]
-        counts = image.isfinite() if self.masks is None else image.isfinite() & self.masks[frame]
-        return image[counts]
+        """Values [n] float64 of the pixels of a frame that count."""
+        return self.image(frame)[self.counts(frame)]
 
     def name(self, frame: int) -> str:
         """Name of a frame of ``images``."""
@@ -173,36 +179,41 @@ def material_of(scene: SceneData) -> Material:
     frames = scene.train.frames
     points = None if "points_random" in scene.notes else scene.points
     chosen = frames_to_follow(frames, scene.points[:0] if points is None else points, MAX_FRAMES)
-    views = [scene.train[i] for i in chosen]
-    kept = [(i, view) for i, view in zip(chosen, views, strict=True) if view.thermal is not None]
-    shape = kept[0][1].thermal.shape[:2] if kept else (0, 0)
-    kept = [(i, view) for i, view in kept if view.thermal.shape[:2] == shape]
-    views = [view for _, view in kept]
-    masks = None
-    if any(view.mask is not None for view in views):
-        everywhere = torch.ones(shape, dtype=torch.bool)
-        masks = torch.stack([everywhere if view.mask is None else view.mask for view in views])
+    looked, images, masks = read(scene.train, chosen, _looked)
+    kept, cameras, photos = map(list, zip(*looked, strict=True)) if looked else ([], [], [])
     times = [frame.time_s for frame in frames]
     timed = all(time is not None for time in times)
-    seen_s = torch.tensor([times[i] for i, _ in kept], dtype=torch.float64) if timed else None
+    seen_s = torch.tensor([times[i] for i in kept], dtype=torch.float64) if timed else None
     bounds = scene.thermal_range
     return Material(
         names=[frame.name for frame in frames],
         times_s=times if timed else None,
-        chosen=[i for i, _ in kept],
-        images=torch.stack([view.thermal.mean(2) for view in views]).double() if views else torch.zeros(0, 1, 1),
+        chosen=kept,
+        images=images,
         unit_k=None if bounds is None else bounds.span_k,
         masks=masks,
-        rgb=[view.rgb for view in views] if views and all(view.rgb is not None for view in views) else None,
-        cameras=[view.camera for view in views],
+        photos=None if any(photo is None for photo in photos) else photos,
+        cameras=cameras,
         all_cameras=[frame.camera for frame in frames],
         points=points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
         clipped=scene.notes.get("clipped_fraction"),
-        views=views,
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
         lenses=_lenses(frames),
     )
+
+
+def _looked(position: int, view: View) -> tuple[int, Camera, Tensor | None]:
+    """What is kept of a view beside its thermal image: its position, its camera and its photo."""
+    return position, view.camera, None if view.rgb is None else coarse(view.rgb.mean(2))
+
+
+def coarse(image: Tensor) -> Tensor:
+    """An image [h, w] float64 with COARSE pixels along its shorter side, by means over areas of [H, W]; as it is where it has
+    no more, and 0 where nothing is known."""
+    scale = max(1.0, min(image.shape) / COARSE)
+    size = (round(image.shape[0] / scale), round(image.shape[1] / scale))
+    return functional.interpolate(image[None, None].double().nan_to_num(), size, mode="area")[0, 0]
 
 
 def _lenses(frames: Sequence[Frame]) -> list[int]:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from heatsplat.effects.observations import Observations, Tracks, between
+from heatsplat.effects.observations import Observations, Tracks, between, slopes
 from heatsplat.geometry.motion import screen_velocity, twists
 from heatsplat.geometry.projection import to_camera
 
@@ -62,10 +61,10 @@ class Delays:
         size = self.velocities.new_tensor([width, height])
         positions = obs.tracks.positions + self.velocities * (2.0 * seconds[1] * self.rows[..., None] / size)
         values = []
-        for f, image in enumerate(obs.images):
-            here = torch.cat([image[..., None], gradient(image)], 2)
-            value, slope = between(here, positions[:, f]).split([1, 2], dim=1)
-            values.append(value[:, 0] - seconds[0] * (slope * self.velocities[:, f]).sum(1))
+        for f in range(len(obs.images)):
+            image = obs.images[f].double()
+            value = between(image[..., None], positions[:, f])[:, 0]
+            values.append(value - seconds[0] * (slopes(image, positions[:, f]) * self.velocities[:, f]).sum(1))
         return replace(obs.tracks, values=torch.stack(values, 1))
 
 
@@ -93,18 +92,11 @@ def delays(obs: Observations) -> Delays | None:
         nearness = 1.0 / to_camera(tracks.points, frame.camera.viewmat)[:, 2].clamp_min(1e-9)
         velocities.append(screen_velocity(pixels, nearness, frame.camera.K, turning[frame.frame_id]))
         rows.append(0.5 * position[:, 1])
-        columns.append((between(gradient(image), position) * velocities[-1]).sum(1))
+        columns.append((slopes(image.double(), position) * velocities[-1]).sum(1))
     velocities, rows, columns = (torch.stack(found, 1) for found in (velocities, rows, columns))
     fast = velocities.norm(dim=2)[tracks.weights > 0].quantile(FAST)
     found = _fitted(obs, torch.stack([columns, -rows * columns], 2))
     return None if found is None else Delays(*found, float(fast), velocities, rows)
-
-
-def gradient(image: Tensor) -> Tensor:
-    """Slopes [H, W, 2] along x and y of an image [H, W], per pixel."""
-    wide = functional.pad(image[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    across, down = wide[1:-1, 2:] - wide[1:-1, :-2], wide[2:, 1:-1] - wide[:-2, 1:-1]
-    return 0.5 * torch.stack([across, down], 2)
 
 
 def _fitted(obs: Observations, columns: Tensor) -> tuple[Tensor, Tensor] | None:

@@ -1,20 +1,22 @@
 """What all evidence shares: training images as tracks of scene points over time, and the noise of the sensor.
 
-A track is what the training views show at the projections of one scene point. Everything is read once, subsampled to a
-size at which all evidence takes a few seconds, and held in float64.
+A track is what the training views show at the projections of one scene point. Everything is read once, one view after the
+other, and subsampled to a size at which all evidence takes a few seconds. Images are held as they were decoded, in float32;
+what is worked out from them is float64.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import Camera, Frame, SceneData, View, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet, evenly_spread
 from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
 
@@ -31,6 +33,8 @@ MIN_FRAMES = 4  # a track of fewer observations says nothing about time
 NEARER = 0.08
 STILL_PX = 0.25  # in the median over points; less is no parallax to learn from
 
+Made = TypeVar("Made")
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -45,7 +49,6 @@ class Tracks:
         directions: [P, F, 3] unit vectors from the point to the camera.
         positions: [P, F, 2] in the image: from -1 (left, top) to 1 (right, bottom).
         radii: [P, F] squared distance from the middle of the image, 1 in its corners.
-        rgb: [P, F, 3] visible image values, or None.
     """
 
     points: Tensor
@@ -56,11 +59,10 @@ class Tracks:
     directions: Tensor
     positions: Tensor
     radii: Tensor
-    rgb: Tensor | None = None
 
     def of(self, keep: Tensor) -> Tracks:
         """The tracks of the points that ``keep`` [P] (bool or positions) selects."""
-        return Tracks(**{name: value if value is None else value[keep] for name, value in self.__dict__.items()})
+        return Tracks(**{name: value[keep] for name, value in self.__dict__.items()})
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Observations:
     Args:
         scene: where it comes from.
         frames: [F] of the images.
-        images: [F, H, W] thermal training images (mean over channels), at most MAX_FRAMES (``frames_to_follow``).
+        images: [F, H, W] float32 thermal training images (mean over channels), at most MAX_FRAMES (``frames_to_follow``).
         masks: [F, H, W] bool, where a pixel of them counts, or None where all do.
         times_s: [F] float64, or None where a frame has no time.
         noise: standard deviation of the noise of a pixel, in image units.
@@ -108,44 +110,60 @@ class Observations:
 
 def observe(scene: SceneData) -> Observations:
     """The observations of a scene; never fails for lack of data: what cannot be had is None, with the reason."""
-    frames = scene.train.frames
-    chosen = frames_to_follow(frames, scene.points, MAX_FRAMES)
-    views = [view for i in chosen if (view := scene.train[i]).thermal is not None]
-    nothing = torch.zeros(0, 1, 1)
-    if not views:
+    chosen = frames_to_follow(scene.train.frames, scene.points, MAX_FRAMES)
+    frames, images, masks = read(scene.train, chosen, lambda _, view: view.frame)
+    if not frames:
         return Observations(
-            scene, (), nothing, None, None, math.nan, False, None, "no training view has a thermal image"
+            scene, (), images, None, None, math.nan, False, None, "no training view has a thermal image"
         )
-    shape = views[0].thermal.shape[:2]
-    views = [view for view in views if view.thermal.shape[:2] == shape]
-    images = torch.stack([view.thermal.mean(2) for view in views]).double()
-    masks = None
-    if any(view.mask is not None for view in views):
-        everywhere = torch.ones(shape, dtype=torch.bool)
-        masks = torch.stack([everywhere if view.mask is None else view.mask for view in views])
-    times = [view.time_s for view in views]
+    cameras, shape = [frame.camera for frame in frames], images.shape[1:]
+    times = [frame.time_s for frame in frames]
     times_s = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float64)
-    still = len(views) > 1 and _stands_still(views, scene.points.double())
+    still = len(frames) > 1 and _stands_still(cameras, scene.points.double())
     step = max(quantum_of(images[i] if masks is None else images[i][masks[i]]) for i in (0, -1))
     noise = noise_of(images, step, masks)
     if still:
         noise = max(noise_of_repeats(images, masks), step / math.sqrt(12.0), 1e-6)
     tracks, why = None, ""
-    if len(views) < MIN_FRAMES:
-        why = f"{len(views)} training view(s) are too few to follow anything over"
+    if len(frames) < MIN_FRAMES:
+        why = f"{len(frames)} training view(s) are too few to follow anything over"
     elif min(shape) < MIN_PX:
         why = f"images of {shape[1]} x {shape[0]} pixels are too small to follow a point through"
     elif still:
-        tracks = _pixels(views, images, masks)
+        tracks = _pixels(cameras[0], images, masks)
     elif len(scene.points) < 1:
         why = "the scene has no points to follow through the images"
         if "points_random" in scene.notes:
             why = "cannot be told: the scene has no points of its own, and its images too little texture to find some"
     else:
-        tracks = tracks_of(scene.points.double(), views, images, noise)
+        tracks = tracks_of(scene.points.double(), cameras, images, masks, noise)
         if tracks is None:
-            why = f"no scene point is seen in {MIN_FRAMES} or more of {len(views)} training views"
-    return Observations(scene, tuple(view.frame for view in views), images, masks, times_s, noise, still, tracks, why)
+            why = f"no scene point is seen in {MIN_FRAMES} or more of {len(frames)} training views"
+    return Observations(scene, tuple(frames), images, masks, times_s, noise, still, tracks, why)
+
+
+def read(
+    views: ViewSet, chosen: Sequence[int], make: Callable[[int, View], Made]
+) -> tuple[list[Made], Tensor, Tensor | None]:
+    """What ``make`` returns for the position and view of each chosen view with a thermal image, of the first one's size; these
+    images [F, H, W] float32, mean over channels; and their masks [F, H, W] bool, None where all pixels count.
+
+    One view is decoded after the other and let go: with photos they take several times the memory of what is kept.
+    """
+    made: list[Made] = []
+    images, masks = torch.zeros(0, 1, 1), None
+    for i in chosen:
+        view = views[i]
+        if view.thermal is None or (made and view.thermal.shape[:2] != images.shape[1:]):
+            continue
+        if not made:
+            images = torch.empty(len(chosen), *view.thermal.shape[:2])
+        images[len(made)] = view.thermal.mean(2)
+        if view.mask is not None:
+            masks = torch.ones(images.shape, dtype=torch.bool) if masks is None else masks
+            masks[len(made)] = view.mask
+        made.append(make(i, view))
+    return made, images[: len(made)], None if masks is None else masks[: len(made)]
 
 
 def frames_to_follow(frames: Sequence[Frame], points: Tensor, limit: int) -> list[int]:
@@ -177,12 +195,11 @@ def in_view(points: Tensor, camera: Camera) -> Tensor:
     return (depth > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
 
 
-def _stands_still(views: list[View], points: Tensor) -> bool:
-    """Whether the views were taken from one place: seen from all of them, points move by less than STILL_PX.
+def _stands_still(cameras: Sequence[Camera], points: Tensor) -> bool:
+    """Whether views were taken from one place: seen from all of them, points move by less than STILL_PX.
 
     A reconstruction gives a tripod a little motion. Where no point is in front of all cameras, their matrices are equal.
     """
-    cameras = [view.camera for view in views]
     points = points[torch.tensor(evenly_spread(len(points), MAX_CANDIDATES), dtype=torch.long)]
     seen = torch.stack([to_camera(points, camera.viewmat)[:, 2] > 1e-9 for camera in cameras]).all(0)
     if not seen.any():
@@ -192,7 +209,7 @@ def _stands_still(views: list[View], points: Tensor) -> bool:
     return bool((pixels - pixels[:1]).norm(dim=2).median(dim=1).values.max() < STILL_PX)
 
 
-def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
+def _pixels(camera: Camera, images: Tensor, masks: Tensor | None) -> Tracks:
     """Tracks of a grid of pixels of a camera that stands still, one unit away."""
     count, height, width = images.shape
     every = max(1, math.ceil(math.sqrt(height * width / MAX_POINTS)))
@@ -200,8 +217,7 @@ def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
         torch.arange(every // 2, height, every), torch.arange(every // 2, width, every), indexing="ij"
     )
     x, y = x.flatten(), y.flatten()
-    values = images[:, y, x].T
-    camera = views[0].camera
+    values = images[:, y, x].T.double()
     rays = torch.stack([(x + 0.5 - camera.K[0, 2]) / camera.K[0, 0], (y + 0.5 - camera.K[1, 2]) / camera.K[1, 1]], 1)
     local = functional.normalize(torch.cat([rays, torch.ones(len(rays), 1, dtype=torch.float64)], 1), dim=1)
     world = local @ camera.viewmat[:3, :3]
@@ -219,17 +235,17 @@ def _pixels(views: list[View], images: Tensor, masks: Tensor | None) -> Tracks:
     )
 
 
-def tracks_of(points: Tensor, views: list[View], images: Tensor, noise: float) -> Tracks | None:
-    """Tracks of scene points; None where too few are seen often enough."""
+def tracks_of(
+    points: Tensor, cameras: Sequence[Camera], images: Tensor, masks: Tensor | None, noise: float
+) -> Tracks | None:
+    """Tracks of scene points through images [F, H, W] with their masks; None where too few are seen often enough."""
     points = points[torch.tensor(evenly_spread(len(points), MAX_IN_FRONT))]
     count, height, width = images.shape
     followed = torch.tensor(evenly_spread(len(points), MAX_CANDIDATES))
     cell = max(2.0, math.sqrt(2.0 * width * height / len(points)))
-    slopes = _steepest(images, noise)
-    has_rgb = all(view.rgb is not None and view.rgb.shape[:2] == (height, width) for view in views)
     columns: dict[str, list[Tensor]] = {name: [] for name in Tracks.__dataclass_fields__ if name != "points"}
-    for image, slope, view in zip(images, slopes, views, strict=True):
-        camera = view.camera
+    for f, camera in enumerate(cameras):
+        image = images[f].double()
         local = to_camera(points, camera.viewmat)
         ahead = local[:, 2] > 1e-9
         pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), camera.K)
@@ -238,23 +254,19 @@ def tracks_of(points: Tensor, views: list[View], images: Tensor, noise: float) -
         inside = inside & ~_hidden(pixels, local[:, 2], inside, cell, width)
         pixels, inside, centre = pixels[followed], inside[followed], camera.center
         line, column = pixels[:, 1].clamp(0, height - 1).long(), pixels[:, 0].clamp(0, width - 1).long()
-        if view.mask is not None:
-            inside = inside & view.mask[line, column]
+        if masks is not None:
+            inside = inside & masks[f, line, column]
         towards = centre - points[followed]
         distance = towards.norm(dim=1)
         position = 2.0 * pixels / extent - 1.0
         columns["values"].append(between(image[..., None], position)[:, 0])
-        columns["slopes"].append(slope[line, column])
+        columns["slopes"].append(_steepest(image, line, column, noise))
         columns["weights"].append(inside.double())
         columns["distances"].append(distance)
         columns["directions"].append(towards / distance[:, None].clamp_min(1e-12))
         columns["positions"].append(position)
         columns["radii"].append(_radii(position, width, height))
-        if has_rgb:
-            columns["rgb"].append(between(view.rgb.double(), position))
-    tracks = Tracks(
-        points[followed], **{name: torch.stack(values, 1) if values else None for name, values in columns.items()}
-    )
+    tracks = Tracks(points[followed], **{name: torch.stack(values, 1) for name, values in columns.items()})
     seen = tracks.weights.sum(1)
     often = seen >= max(MIN_FRAMES, min(0.4 * count, 0.6 * float(seen.quantile(0.9))))
     if not often.any():
@@ -268,13 +280,18 @@ def tracks_of(points: Tensor, views: list[View], images: Tensor, noise: float) -
     return tracks.of(mean.argsort()[:most].sort().values)
 
 
-def _steepest(images: Tensor, noise: float) -> Tensor:
-    """Largest slope [F, H, W] of images within a pixel of each, per pixel; what noise alone makes is taken away."""
-    padded = functional.pad(images[:, None], (1, 1, 1, 1), mode="replicate")
-    horizontal = 0.5 * (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2])
-    vertical = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
+def _steepest(image: Tensor, line: Tensor, column: Tensor, noise: float) -> Tensor:
+    """Largest slope [n] of an image [H, W] within a pixel of each of these, per pixel; what noise alone makes is taken away."""
+    height, width = image.shape
+    around = torch.tensor([-1, 0, 1])
+    line = (line[:, None, None] + around[:, None]).clamp(0, height - 1)
+    column = (column[:, None, None] + around).clamp(0, width - 1)
+    right, left = (column + 1).clamp_max(width - 1), (column - 1).clamp_min(0)
+    below, above = (line + 1).clamp_max(height - 1), (line - 1).clamp_min(0)
+    horizontal = 0.5 * (image[line, right] - image[line, left])
+    vertical = 0.5 * (image[below, column] - image[above, column])
     squared = (horizontal**2 + vertical**2 - noise**2).clamp_min(0.0)  # of white noise it is noise² on average
-    return functional.max_pool2d(squared.sqrt(), 3, stride=1, padding=1)[:, 0]
+    return squared.sqrt().amax((1, 2))
 
 
 def _hidden(pixels: Tensor, depths: Tensor, inside: Tensor, cell: float, width: int) -> Tensor:
@@ -293,6 +310,19 @@ def between(image: Tensor, positions: Tensor) -> Tensor:
         image.permute(2, 0, 1)[None], positions[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )
     return found[0, :, 0].T
+
+
+def slopes(image: Tensor, positions: Tensor) -> Tensor:
+    """Slopes [n, 2] along x and y of an image [H, W] at positions [n, 2] in [-1, 1], per pixel: half of what it changes by from
+    a pixel before to one behind, the image going on beyond its border as it ends there."""
+    size = positions.new_tensor([image.shape[1], image.shape[0]])
+    inside = 1.0 - 1.0 / size  # centres of the outermost pixels
+    positions = positions.clamp(-inside, inside)
+    found = []
+    for step in (2.0 / size).diag():
+        ahead, behind = (between(image[..., None], positions + way * step)[:, 0] for way in (1, -1))
+        found.append(0.5 * (ahead - behind))
+    return torch.stack(found, 1)
 
 
 def _radii(positions: Tensor, width: int, height: int) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.contracts import SceneData, View, evenly_spread
+from heatsplat.contracts import Camera, SceneData, View, evenly_spread
 from heatsplat.geometry.projection import to_camera
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -47,19 +47,22 @@ def swept_points(scene: SceneData) -> Tensor:
     Args:
         scene: whose points, random ones in the cube that the cameras look at, tell where the middle of the scene is.
     """
-    views = [scene.train[i] for i in evenly_spread(len(scene.train), MAX_VIEWS)]
-    views = [view for view in views if view.thermal is not None]
+    cameras, images = [], []
+    for i in evenly_spread(len(scene.train), MAX_VIEWS):
+        view = scene.train[i]
+        if view.thermal is not None:
+            cameras.append(view.camera)
+            images.append(_shrunk(view))
     none = torch.zeros(0, 3, dtype=torch.float64)
-    if len(views) < 3 or len(scene.points) == 0:
+    if len(images) < 3 or len(scene.points) == 0:
         return none
-    images = [_shrunk(view) for view in views]
     noise = noise_of(torch.stack(images), quantum_of(images[0])) if len({i.shape for i in images}) == 1 else 0.0
     middle = scene.points.double().mean(0)
     found = [none]
-    for k in evenly_spread(len(views), REFERENCES):
-        others = _beside(views, k, middle)
+    for k in evenly_spread(len(images), REFERENCES):
+        others = _beside(cameras, k, middle)
         if len(others) >= 3:
-            found.append(_swept(views, images, k, others, noise, middle))
+            found.append(_swept(cameras, images, k, others, noise, middle))
     return torch.cat(found)
 
 
@@ -71,18 +74,18 @@ def _shrunk(view: View) -> Tensor:
     return functional.avg_pool2d(image[None, None], factor)[0, 0]
 
 
-def _beside(views: Sequence[View], k: int, middle: Tensor) -> list[int]:
-    """The views nearest to one, of those that see the scene from elsewhere."""
-    centres = torch.stack([view.camera.center.double() for view in views])
+def _beside(cameras: Sequence[Camera], k: int, middle: Tensor) -> list[int]:
+    """The cameras nearest to one, of those that see the scene from elsewhere."""
+    centres = torch.stack([camera.center for camera in cameras])
     apart = (centres - centres[k]).norm(dim=1) / (middle - centres[k]).norm().clamp_min(1e-9)
     return [int(i) for i in apart.argsort() if apart[i] > TURNED][:BESIDE]
 
 
 def _swept(
-    views: Sequence[View], images: Sequence[Tensor], k: int, others: Sequence[int], noise: float, middle: Tensor
+    cameras: Sequence[Camera], images: Sequence[Tensor], k: int, others: Sequence[int], noise: float, middle: Tensor
 ) -> Tensor:
     """Points [n, 3] of one view."""
-    image, camera = images[k], views[k].camera
+    image, camera = images[k], cameras[k]
     height, width = image.shape
     side = 2 * REACH + 1
     patches = image.unfold(0, side, 1).unfold(1, side, 1).flatten(2)  # [H - 2 REACH, W - 2 REACH, side²]
@@ -104,7 +107,7 @@ def _swept(
     rays = torch.linalg.solve(matrix, torch.cat([at * scale, torch.ones_like(at[..., :1])], 2)[..., None])[..., 0]
     away = float((middle - camera.center.double()).norm())
     depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
-    scores = torch.stack([_alike(own, rays, depths, viewmat, views[i], images[i]) for i in others])
+    scores = torch.stack([_alike(own, rays, depths, viewmat, cameras[i], images[i]) for i in others])
     seen = scores.isfinite()
     half = scores.nan_to_num(-1.0).sort(dim=0, descending=True).values[: len(others) // 2 + 1]  # others may be hidden
     score = torch.where(seen.sum(0) > len(others) // 2, half.mean(0), -1.0)  # [n, D]
@@ -121,9 +124,8 @@ def _swept(
     return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
-def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, view: View, image: Tensor) -> Tensor:
-    """Correlation [n, D] of patches ``own`` [n, q] with what a view shows where they would lie at each depth; nan outside."""
-    camera = view.camera
+def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, camera: Camera, image: Tensor) -> Tensor:
+    """Correlation [n, D] of patches ``own`` [n, q] with what an image shows where they would lie at each depth; nan outside."""
     points = rays[:, None] * depths[:, None, None]  # [n, D, q, 3]
     world = (points - viewmat[:3, 3]) @ viewmat[:3, :3]
     local = to_camera(world.flatten(0, 2), camera.viewmat.double())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from scipy.ndimage import correlate1d
 from torch import Tensor
 
 from heatsplat.contracts import Camera
@@ -53,15 +54,17 @@ def normals(camera: Camera, depth: Tensor) -> Tensor:
 
     def sums(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         """Sums over windows, weighted by rows and columns."""
-        return torch.conv2d(torch.conv2d(image[None, None], rows[None, None, :, None]), columns[None, None, None])[0, 0]
+        # Of a float64 image torch's convolution copies out every window first.
+        down = correlate1d(image.numpy(), rows.numpy(), axis=0, mode="constant")
+        return torch.from_numpy(correlate1d(down, columns.numpy(), axis=1, mode="constant"))[inner]
 
+    inner = (slice(reach, -reach), slice(reach, -reach))
     count, spread = len(steps) ** 2, len(steps) * steps.square().sum()
     mean = sums(inverse, ones, ones) / count
     down, right = sums(inverse, steps, ones) / spread, sums(inverse, ones, steps) / spread  # slopes per pixel
     rest = (
         sums(inverse.square(), ones, ones) / count - mean.square() - (down.square() + right.square()) * spread / count
     )
-    inner = (slice(reach, -reach), slice(reach, -reach))
     sight = rays(camera)[inner]
     # Slopes by X and Y of the ray (X, Y, 1), and what is left for the 1.
     normal = torch.stack([right * camera.K[0, 0], down * camera.K[1, 1], mean], dim=-1).double()

@@ -283,12 +283,16 @@ def figure_picture(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def write_png(path: str | Path, picture: np.ndarray) -> None:
-    """Writes an RGB picture [H, W, 3] uint8 and makes its folder. Raises OSError where it cannot be written."""
+def write_png(path: str | Path, picture: np.ndarray) -> bytes:
+    """Writes an RGB picture [H, W, 3] uint8, makes its folder and returns what is in the file. Raises OSError where it cannot."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+    done, encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    if not done:
         raise OSError(f"cannot write {path}")
+    content = encoded.tobytes()
+    path.write_bytes(content)
+    return content
 
 
 def data_uri(picture: np.ndarray, quality: int = 85) -> str:

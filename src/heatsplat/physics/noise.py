@@ -11,8 +11,8 @@ from torch.nn import functional
 from heatsplat.contracts import ViewSet, evenly_spread
 
 # A Laplacian of Laplacians: blind to anything that varies linearly along rows or columns (Immerkaer, CVIU 64, 1996).
-_MASK = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]], dtype=torch.float64)
-_MASK_GAIN = 6.0  # root of the sum of its squares
+# It is the second difference along rows of that along columns: [[1, -2, 1], [-2, 4, -2], [1, -2, 1]].
+_MASK_GAIN = 6.0  # root of the sum of the squares of these
 _MAD_TO_SIGMA = 1.4826
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
@@ -44,10 +44,11 @@ def noise_of(images: Tensor, step: float = 0.0, masks: Tensor | None = None) -> 
     least = max(_UNIFORM * step, MIN_NOISE)
     if min(images.shape[1:]) < 5:
         return least
-    whole = torch.ones_like(images, dtype=torch.bool) if masks is None else _whole(masks)
-    single = [
-        _of_one(image, used[1:-1, 1:-1]) for image, used in zip(images, whole, strict=True) if used[1:-1, 1:-1].any()
-    ]
+    single = []
+    for f, image in enumerate(images):  # one at a time: what is worked out takes many times the memory of an image
+        used = torch.ones_like(image, dtype=torch.bool) if masks is None else _whole(masks[f])
+        if used[1:-1, 1:-1].any():
+            single.append(_of_one(image, used[1:-1, 1:-1]))
     return max(float(torch.tensor(single).median()), least) if single else least
 
 
@@ -57,11 +58,13 @@ def noise_of_repeats(images: Tensor, masks: Tensor | None = None) -> float:
     Successive differences with their median taken away, so that a drift of the whole image does not count; pixels that do
     not count by ``masks`` [F, H, W] (bool; None: all do) are left out.
     """
-    steps = images.diff(dim=0).flatten(1).double()
-    if masks is not None:
-        steps = torch.where((masks[1:] & masks[:-1]).flatten(1), steps, torch.nan)
-    steps = steps - steps.nanmedian(dim=1, keepdim=True).values
-    spread = float(_MAD_TO_SIGMA * steps.abs().nanmedian() / math.sqrt(2.0))
+    away = torch.full((max(len(images) - 1, 1), *images.shape[1:]), torch.nan)  # float32: all are needed at once
+    for f in range(1, len(images)):
+        step = images[f].double() - images[f - 1].double()
+        if masks is not None:
+            step = torch.where(masks[f] & masks[f - 1], step, torch.nan)
+        away[f - 1] = (step - step.nanmedian()).abs()
+    spread = float(_MAD_TO_SIGMA * away.nanmedian() / math.sqrt(2.0))
     return spread if math.isfinite(spread) else 0.0
 
 
@@ -73,15 +76,15 @@ def quantum_of(image: Tensor) -> float:
     return float(gaps.min()) if len(gaps) else 0.0
 
 
-def _whole(masks: Tensor) -> Tensor:
-    """Where a pixel and its eight neighbours all count."""
-    return functional.max_pool2d((~masks)[:, None].float(), 3, stride=1, padding=1)[:, 0] == 0
+def _whole(mask: Tensor) -> Tensor:
+    """Where a pixel [H, W] and its eight neighbours all count."""
+    return functional.max_pool2d((~mask)[None].float(), 3, stride=1, padding=1)[0] == 0
 
 
 def _of_one(image: Tensor, used: Tensor) -> float:
-    image = image.double()[None, None]
-    response = functional.conv2d(image, _MASK[None, None])[0, 0].abs()
-    smooth = functional.avg_pool2d(image, 3, stride=1)
+    image = image.double()
+    response = image.diff(n=2, dim=0).diff(n=2, dim=1).abs()
+    smooth = functional.avg_pool2d(image[None, None], 3, stride=1)
     gradient = torch.hypot(
         functional.pad(smooth, (1, 1, 0, 0), mode="replicate").diff(n=1, dim=3)[..., 1:],
         functional.pad(smooth, (0, 0, 1, 1), mode="replicate").diff(n=1, dim=2)[..., 1:, :],

@@ -42,14 +42,6 @@ class Cameras(nn.Module):
         """The camera that took a training image, after ``progress`` of the run; the data's own."""
         return frame.camera
 
-    def aligned(self, frame: Frame, error: Callable[[Camera], Tensor]) -> Frame:
-        """A frame with the camera from which its image differs least, as far as ``align_steps`` go.
-
-        Args:
-            error: what the image from a camera differs by, a scalar with a gradient to the view matrix.
-        """
-        return frame
-
     def regularisers(self) -> dict[str, Tensor]:
         """Terms of the loss by name."""
         return {}
@@ -117,8 +109,8 @@ class RefinedCameras(Cameras):
                 "cameras=given"
             )
         self._rows = {frame.frame_id: row for row, frame in enumerate(frames)}
-        focals = [float(frame.camera.K[:2, :2].diagonal().mean()) for frame in frames]
-        depths = _depths(scene)
+        focals = [_focal(frame.camera) for frame in frames]
+        depths = seen_depths(scene)
         self._pixels = [(1.0 / focal, depth / focal) for focal, depth in zip(focals, depths, strict=True)]
         self.moves = nn.Parameter(torch.zeros(len(frames), 6))
         centres = torch.stack([frame.camera.center for frame in frames])
@@ -133,22 +125,6 @@ class RefinedCameras(Cameras):
             flat -= ((self.common * flat).sum(1, keepdim=True) * self.common).sum(0)
         row = self._rows[frame.frame_id]
         return _moved(frame.camera, self.moves[row].to("cpu", torch.float64), *self._pixels[row])
-
-    def aligned(self, frame: Frame, error: Callable[[Camera], Tensor]) -> Frame:
-        if self.align_steps == 0:
-            return frame
-        middle = float(torch.tensor([offset / turn for turn, offset in self._pixels]).median())
-        focal = float(frame.camera.K[:2, :2].diagonal().mean())
-        with torch.inference_mode(False), torch.enable_grad():
-            moves = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-            optimizer = torch.optim.Adam([moves])
-            for step in range(self.align_steps):
-                optimizer.param_groups[0]["lr"] = ALIGN_PX[0] * (ALIGN_PX[1] / ALIGN_PX[0]) ** (step / self.align_steps)
-                (moves.grad,) = torch.autograd.grad(
-                    error(_moved(frame.camera, moves, 1 / focal, middle / focal)), [moves]
-                )
-                optimizer.step()
-        return replace(frame, camera=_moved(frame.camera, moves.detach(), 1 / focal, middle / focal))
 
     def regularisers(self) -> dict[str, Tensor]:
         return {"cameras": self.weight * 6 * mean(self.moves.square())} if self.weight > 0 else {}
@@ -165,7 +141,28 @@ class RefinedCameras(Cameras):
         return {name: values.square().sum(1).mean().sqrt().item() for name, values in sizes.items()}
 
 
-def _depths(scene: SceneData) -> list[float]:
+def aligned(camera: Camera, error: Callable[[Camera], Tensor], steps: int, depth: float) -> Camera:
+    """The camera beside ``camera`` from which an image differs least, as far as so many steps of Adam go.
+
+    Args:
+        error: what the image from a camera differs by, a scalar with a gradient to the view matrix.
+        depth: of what it sees, in world units.
+    """
+    focal = _focal(camera)
+    with torch.inference_mode(False), torch.enable_grad():
+        camera = replace(
+            camera, viewmat=camera.viewmat.clone(), K=camera.K.clone()
+        )  # autograd keeps none of inference mode
+        moves = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([moves])
+        for step in range(steps):
+            optimizer.param_groups[0]["lr"] = ALIGN_PX[0] * (ALIGN_PX[1] / ALIGN_PX[0]) ** (step / steps)
+            (moves.grad,) = torch.autograd.grad(error(_moved(camera, moves, 1 / focal, depth / focal)), [moves])
+            optimizer.step()
+    return _moved(camera, moves.detach(), 1 / focal, depth / focal)
+
+
+def seen_depths(scene: SceneData) -> list[float]:
     """How far away what each training camera sees lies: the median depth of the scene's points in its image. Where there are
     none, that of all others, and of a scene without points its extent."""
     depths = []
@@ -177,6 +174,11 @@ def _depths(scene: SceneData) -> list[float]:
         depths.append(float(seen.median()) if len(seen) else float("nan"))
     known = torch.tensor(depths).nanmedian().item()
     return [depth if depth == depth else known if known == known else scene.extent for depth in depths]
+
+
+def _focal(camera: Camera) -> float:
+    """Focal length in pixels, the mean of both axes."""
+    return float(camera.K[:2, :2].diagonal().mean())
 
 
 def _common(centres: Tensor, pixels: Tensor) -> Tensor:

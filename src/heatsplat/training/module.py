@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import operator
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
 from heatsplat.training.averaging import Average
-from heatsplat.training.cameras import Cameras
+from heatsplat.training.cameras import Cameras, aligned, seen_depths
 from heatsplat.training.init import Initialisation
 from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
 from heatsplat.training.overlap import Overlap
@@ -580,10 +581,20 @@ class SplatTraining(pl.LightningModule):
         return self._scored(view, view.frame)
 
     def test_step(self, view: View, batch_idx: int) -> dict[str, Any]:
-        if self.cameras.align_steps == 0:
+        steps = self.cameras.align_steps
+        if steps == 0:
             return self._scored(view, view.frame)
-        self.results.data["test_cameras_aligned"] = f"each to its image, in {self.cameras.align_steps} steps"
-        return self._scored(view, self.cameras.aligned(view.frame, partial(self._error, view)))
+        self.results.data["test_cameras_aligned"] = f"each to its image, in {steps} steps"
+        return self._scored(view, replace(view.frame, camera=self.aligned(view, view.frame.camera, steps)))
+
+    def aligned(self, view: View, camera: Camera, steps: int) -> Camera:
+        """The camera beside ``camera`` from which the image of a view differs least, as far as so many steps go."""
+        return aligned(camera, partial(self.squared_error, view), steps, self._middle)
+
+    @cached_property
+    def _middle(self) -> float:
+        """How far away what the cameras see lies, in the median."""
+        return statistics.median(seen_depths(self.scene))
 
     def _scored(self, view: View, frame: Frame) -> dict[str, Any]:
         """What is scored of a view, from the camera and at the time of ``frame``."""
@@ -596,7 +607,7 @@ class SplatTraining(pl.LightningModule):
         seconds = time.perf_counter() - start
         return {"view": view, "prediction": images.pop(self.modality), "companions": images, "seconds": seconds}
 
-    def _error(self, view: View, camera: Camera) -> Tensor:
+    def squared_error(self, view: View, camera: Camera) -> Tensor:
         """Mean squared error of the image of a view as seen from a camera, over the pixels that count."""
         output = self.render(view.frame, self.sensor.needs_depth, camera=camera)
         image = self.sensor(self._images(output)[0], view.frame, output.seen_depth)

@@ -15,7 +15,12 @@ MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is
 
 def find(material: Material) -> list[Finding]:
     found = []
-    values = torch.cat([material.known(f)[::7] for f in range(len(material.images))])
+    sampled, plateaus = [], []
+    for f in range(len(material.images)):
+        known = material.known(f)
+        sampled.append(known[::7].float())  # a slice would hold the whole image
+        plateaus.append(_plateau(known))
+    values = torch.cat(sampled)
     if not len(values):
         return []
     if material.bounds_c is not None:
@@ -32,7 +37,8 @@ def find(material: Material) -> list[Finding]:
                     "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images.",
                 )
             )
-        used = float(values.quantile(0.999) - values.quantile(0.001)) if len(values) < 1 << 24 else 1.0
+        ends = values.new_tensor([0.001, 0.999])
+        used = float(values.quantile(ends).diff()) if len(values) < 1 << 24 else 1.0
         if used < NARROW:
             found.append(
                 Finding(
@@ -51,11 +57,11 @@ def find(material: Material) -> list[Finding]:
                     "Check the unit (°C, kelvin, counts) and data.raw_scale, data.raw_offset_c.",
                 )
             )
-    flat = [f for f in range(len(material.images)) if _plateau(material.known(f)) > PLATEAU]
+    flat = [f for f, share in enumerate(plateaus) if share > PLATEAU]
     if len(flat) > 0.1 * len(material.images) and not any(
         one.check == "bounds" and "cut off" in one.what for one in found
     ):
-        share = sum(_plateau(material.known(f)) for f in flat) / len(flat)
+        share = sum(plateaus[f] for f in flat) / len(flat)
         found.append(
             Finding(
                 "saturation",

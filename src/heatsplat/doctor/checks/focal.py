@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.doctor.base import Check, Finding, Material
 from heatsplat.doctor.courses import beside_courses
-from heatsplat.effects.image_motion import gradient
-from heatsplat.effects.observations import between
+from heatsplat.effects.observations import between, slopes
 
 WIDTHS = (24, 48, 96, 192)  # pixels across of the images in which it is looked for, one after the other
 STEPS, ROUNDS = 3, 5
@@ -54,22 +55,26 @@ def fitting_factor(material: Material) -> tuple[float, float]:
     tracks, (height, width) = material.tracks, material.images.shape[1:]
     away, middle = _from_the_middle(material)
     factor, error = 1.0, 0.0
-    for wide in (*(w for w in WIDTHS if w < width), min(width, WIDTHS[-1])):
-        high = max(8, round(wide * height / width))
-        images = functional.interpolate(material.images[:, None].nan_to_num(), size=(high, wide), mode="area")[:, 0]
+    widths = (*(w for w in WIDTHS if w < width), min(width, WIDTHS[-1]))
+    grids = [(max(8, round(wide * height / width)), wide) for wide in widths]
+    shrunk = [_shrunk(material.image(f), grids) for f in range(len(material.images))]
+    for (high, wide), images in zip(grids, zip(*shrunk, strict=True), strict=True):
         half = tracks.positions.new_tensor([0.5 * wide, 0.5 * high])
         for _ in range(STEPS):
             places = middle + factor * away
-            read = [
-                between(torch.cat([image[..., None], gradient(image)], 2), places[:, f])
-                for f, image in enumerate(images)
-            ]
-            values, slopes = torch.stack(read, 1).split([1, 2], dim=2)
-            pulled = (slopes * (factor * away * half)).sum(2)
+            values = torch.stack([between(one[..., None], places[:, f])[:, 0] for f, one in enumerate(images)], 1)
+            steep = torch.stack([slopes(one, places[:, f]) for f, one in enumerate(images)], 1)
+            pulled = (steep * (factor * away * half)).sum(2)
             seen = (tracks.weights > 0) & (places.abs() < 1.0).all(2)
-            share, error = _share(material, values[..., 0], pulled, seen)
+            share, error = _share(material, values, pulled, seen)
             factor = min(max(factor * (1.0 - share), 1.0 / WIDEST), WIDEST)
     return factor, error
+
+
+def _shrunk(image: Tensor, grids: Sequence[tuple[int, int]]) -> list[Tensor]:
+    """An image [H, W] on each of these grids (height, width), by means over areas; 0 where nothing is known."""
+    known = image[None, None].nan_to_num()
+    return [functional.interpolate(known, size=size, mode="area")[0, 0] for size in grids]
 
 
 def _from_the_middle(material: Material) -> tuple[Tensor, Tensor]:
@@ -101,7 +106,7 @@ def _spread(material: Material, factor: float, other: float) -> float:
     away, middle = _from_the_middle(material)
     places = middle + factor * away
     seen = (material.tracks.weights > 0) & (places.abs() < 1.0).all(2) & ((middle + other * away).abs() < 1.0).all(2)
-    images = material.images.nan_to_num()
+    images = (material.image(f).nan_to_num() for f in range(len(material.images)))
     values = torch.stack([between(image[..., None], places[:, f])[:, 0] for f, image in enumerate(images)], 1)
     left, counts = beside_courses(values, seen.double(), material)
     return 1.4826 * float(torch.where(counts > 0, left.abs(), torch.nan).nanmedian())

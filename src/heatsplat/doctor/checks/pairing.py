@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.doctor.base import Check, Finding, Material, coarse
 
-SHORTER = 64  # pixels of the shorter side at which edges are compared
 MIN_FRAMES = 5
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
@@ -23,10 +22,10 @@ def find(material: Material) -> list[Finding]:
     clocks = _clock(material)
     if clocks is not None:
         found.append(clocks)
-    if material.rgb is None or len(material.rgb) < MIN_FRAMES:
+    if material.photos is None or len(material.photos) < MIN_FRAMES:
         return found
-    heat = torch.stack([_edges(image) for image in material.images])
-    light = torch.stack([_edges(photo.double().mean(2)) for photo in material.rgb])
+    heat = torch.stack([_edges(coarse(material.image(f))) for f in range(len(material.images))])
+    light = torch.stack([_edges(photo) for photo in material.photos])
     if heat.shape != light.shape:
         return found
     # A closed shutter or a black photo says nothing.
@@ -112,16 +111,12 @@ def _late(material: Material, step: int) -> str:
 
 
 def _edges(image: Tensor) -> Tensor:
-    """Strength of edges of an image [H, W], on a coarse grid, compressed so that no single one rules."""
-    shorter = min(image.shape)
-    scale = max(1.0, shorter / SHORTER)
-    size = (round(image.shape[0] / scale), round(image.shape[1] / scale))
-    small = functional.interpolate(image[None, None].nan_to_num(), size, mode="area")
-    x = functional.pad(small.diff(dim=3), (0, 1))
-    y = functional.pad(small.diff(dim=2), (0, 0, 0, 1))
+    """Strength of edges of a coarse image [H, W], compressed so that no single one rules."""
+    x = functional.pad(image.diff(dim=1), (0, 1))
+    y = functional.pad(image.diff(dim=0), (0, 0, 0, 1))
     strength = torch.hypot(x, y)
     strength = strength / (strength + strength.mean()).clamp_min(1e-30)
-    return functional.avg_pool2d(strength, 3, stride=1, padding=1)[0, 0]
+    return functional.avg_pool2d(strength[None, None], 3, stride=1, padding=1)[0, 0]
 
 
 def _unit(rows: Tensor) -> Tensor:

@@ -93,7 +93,7 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
         return None
     at = torch.arange(-HALF, HALF + 1, dtype=torch.float64)
     patch = torch.stack(torch.meshgrid(at, at, indexing="xy"), -1).reshape(-1, 2)
-    first = _sampled(material.images[one], pixels[:, None] + patch)
+    first = _sampled(material.image(one), pixels[:, None] + patch)
     strong = first.std(1) * _corner(first)
     keep = strong.argsort(descending=True)[:POINTS]
     keep = keep[first.std(1)[keep] > STRUCTURE * material.noise]
@@ -109,7 +109,7 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
     base = second.project(world.reshape(-1, 3))[0].reshape(len(keep), -1, 2)
     steps = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     moves = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
-    seen = _sampled(material.images[other], base[:, None] + moves[:, None])
+    seen = _sampled(material.image(other), base[:, None] + moves[:, None])
     alike = (_unit(first)[:, None] * _unit(seen)).sum(2)
     best, where = alike.max(1)
     found = best > ALIKE
@@ -145,7 +145,8 @@ def _unit(patches: Tensor) -> Tensor:
 
 def _slope(material: Material) -> float:
     """How much neighbouring pixels differ (root mean square)."""
-    return float(torch.stack([image.diff(dim=1).square().nanmean() for image in material.images]).mean().sqrt())
+    squares = [material.image(f).diff(dim=1).square().nanmean() for f in range(len(material.images))]
+    return float(torch.stack(squares).mean().sqrt())
 
 
 CHECK = Check("poses", "scene points look alike where two cameras say that they are", find)

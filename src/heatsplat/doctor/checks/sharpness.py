@@ -15,15 +15,14 @@ CLEAR = 8.0  # contrast in noise from which sharpness can be told
 def find(material: Material) -> list[Finding]:
     if len(material.images) < 6 or min(material.images.shape[1:]) < 24 or material.contrast < CLEAR * material.noise:
         return []
-    counts = material.images.isfinite() if material.masks is None else material.images.isfinite() & material.masks
-    images = [_filled(image, known) for image, known in zip(material.images, counts, strict=True)]
-    sharp = torch.tensor([_sharpness(*pair, material.noise) for pair in zip(images, counts, strict=True)]).double()
+    sharp = [_sharpness(*_filled(material, f), material.noise) for f in range(len(material.images))]
+    sharp = torch.tensor(sharp).double()
     around = torch.stack([sharp[max(0, f - 4) : f + 5].nanmedian() for f in range(len(sharp))])
     worst = [f for f in range(len(sharp)) if float(sharp[f]) < BLURRED * float(around[f])]
     if not worst:
         return []
     names = [material.name(f) for f in worst]
-    along = sum(_direction(images[f], counts[f]) for f in worst) / len(worst)
+    along = sum(_direction(*_filled(material, f)) for f in worst) / len(worst)
     kind = "along one direction: motion" if along > 0.5 else "in all directions: focus, or motion along several"
     return [
         Finding(
@@ -36,9 +35,12 @@ def find(material: Material) -> list[Finding]:
     ]
 
 
-def _filled(image: Tensor, counts: Tensor) -> Tensor:
-    """The image with its median where pixels do not count."""
-    return image.where(counts, image[counts].median() if bool(counts.any()) else 0.0)
+def _filled(material: Material, frame: int) -> tuple[Tensor, Tensor]:
+    """The image of a frame with its median where pixels do not count, and which of them do."""
+    image, counts = material.image(frame), material.counts(frame)
+    if bool(counts.all()):
+        return image, counts
+    return image.where(counts, image[counts].median() if bool(counts.any()) else 0.0), counts
 
 
 def _sharpness(image: Tensor, counts: Tensor, noise: float) -> float:
@@ -52,20 +54,21 @@ def _sharpness(image: Tensor, counts: Tensor, noise: float) -> float:
 
 def _strongest(image: Tensor, counts: Tensor) -> Tensor:
     """Mean square of the strongest hundredth of the gradients between pixels that count."""
-    x, y = _steps(image, counts)
-    squares = x.square() + y.square()
+    x, y, inside = _steps(image, counts)
+    squares = (x.square() + y.square())[inside]
     return squares.topk(max(1, len(squares) // 100)).values.mean() if len(squares) else squares.new_tensor(torch.nan)
 
 
-def _steps(image: Tensor, counts: Tensor) -> Tensor:
-    """Differences to the right and down [2, n] of the pixels that count with both of these neighbours."""
+def _steps(image: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Differences to the right and down [H - 1, W - 1], and at which pixels they are between ones that count."""
     inside = counts[:-1, :-1] & counts[:-1, 1:] & counts[1:, :-1]
-    return torch.stack([image.diff(dim=1)[:-1][inside], image.diff(dim=0)[:, :-1][inside]])
+    return image.diff(dim=1)[:-1], image.diff(dim=0)[:, :-1], inside
 
 
 def _direction(image: Tensor, counts: Tensor) -> float:
     """How much more gradients there are in one direction than across it, 0 to 1."""
-    x, y = _steps(image, counts)
+    *steps, inside = _steps(image, counts)
+    x, y = (step[inside] for step in steps)
     a, b, c = (x * x).mean(), (y * y).mean(), (x * y).mean()
     return float(torch.sqrt((a - b).square() + 4 * c.square()) / (a + b).clamp_min(1e-18))
 

@@ -65,14 +65,16 @@ def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
     """For each point that lies behind others in some frames, 1 where the nearer one keeps its value, -1 where the farther
     one does, 0 where neither does clearly: by the thermal and by the visible images."""
     points = scene.points.double()[torch.tensor(evenly_spread(len(scene.points), MAX_POINTS))]
-    views = [scene.train[i] for i in evenly_spread(len(scene.train), MAX_FRAMES)]
-    views = [view for view in views if view.thermal is not None]
-    if any(view.rgb is None or view.rgb.shape[:2] != view.thermal.shape[:2] for view in views):
-        return None
-    shape, count = (len(points), len(views)), len(points)
+    chosen, count = evenly_spread(len(scene.train), MAX_FRAMES), len(points)
+    shape = (count, len(chosen))
     inside, behind = torch.zeros(shape, dtype=torch.bool), torch.full(shape, -1)
     values, colours = torch.zeros(*shape, 1), torch.zeros(*shape, 3)
-    for f, view in enumerate(views):
+    for f, i in enumerate(chosen):
+        view = scene.train[i]
+        if view.thermal is None:
+            continue
+        if view.rgb is None or view.rgb.shape[:2] != view.thermal.shape[:2]:
+            return None
         local = to_camera(points, view.camera.viewmat)
         ahead = local[:, 2] > 1e-9
         pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), view.camera.K)
@@ -89,7 +91,7 @@ def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
     found = []
     for series in (values, colours):
         level = series.mean(2) if series.shape[2] == 1 else series
-        level = level.reshape(count, len(views), -1)
+        level = level.reshape(*shape, -1)
         far, near = _variance(level, hidden), _variance(level, inside & ~hidden)
         before = torch.where(hidden, near[behind.clamp_min(0)], torch.nan).nanmedian(1).values
         ratio = far / before
