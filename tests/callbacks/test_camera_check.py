@@ -37,7 +37,7 @@ class Module:
 
     def __init__(self, beside: float, left: float, learns: bool = False, steps: int = 2000) -> None:
         self.beside, self.left = beside, left
-        self.cameras = SimpleNamespace(learns=learns, of=lambda frame, progress: frame.camera)
+        self.cameras = SimpleNamespace(learns=learns, of=lambda frame: frame.camera)
         self.schedule = SimpleNamespace(end=steps)
         self.scene = SimpleNamespace(train=[View(k) for k in range(20)], points=POINTS)
         self.results = SimpleNamespace(run={})

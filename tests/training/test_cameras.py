@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from heatsplat.callbacks.camera_check import OFF
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneError
+from heatsplat.runs.run import load
 from heatsplat.training.cameras import Cameras, RefinedCameras, _common, _moved
 
 FOCAL, SIDE = 100.0, 64
@@ -77,8 +78,7 @@ def test_a_number_is_a_pixel():
             with torch.no_grad():
                 cameras.moves.zero_()
                 cameras.moves[0, kind + along] = 1.0
-            row, (per_turn, per_offset) = cameras.moves[0].detach().double(), cameras._pixels[0]
-            after, _ = _moved(frame.camera, row, per_turn, per_offset).project(middle)
+            after, _ = cameras.of(frame).project(middle)
             assert abs(float((after - before)[0, pixel].abs()) - 1.0) < 0.1, (kind, axis)
 
 
@@ -94,16 +94,16 @@ def test_what_all_cameras_do_together_is_no_movement():
     turn, shift, scale = (1e-3 * torch.randn(3, generator=generator, dtype=torch.float64) for _ in range(3))
     about = centres.mean(0)
     moved = torch.linalg.cross(turn.expand(9, 3), centres - about) + scale[0] * (centres - about) + shift
-    pixels = torch.tensor(learned._pixels, dtype=torch.float64)
+    pixels = learned.pixels
     own = torch.zeros(9, 6)
     own[4, 2] = 1.0  # one camera alone keeps its own
     with torch.no_grad():
         learned.moves.copy_(torch.cat([turn.expand(9, 3) / pixels[:, :1], moved / pixels[:, 1:]], 1).float())
-    learned.of(scene.frames[0], 0.5)
+    learned.keep_apart()
     assert float(learned.moves.detach().abs().max()) < 1e-4
     with torch.no_grad():
         learned.moves.copy_(own)
-    learned.of(scene.frames[0], 0.5)
+    learned.keep_apart()
     assert learned.moves.detach()[4, 2] > 0.7
 
 
@@ -112,7 +112,7 @@ def test_cameras_in_one_place_have_no_scale_and_a_scene_without_points_has_its_e
     assert still.shape == (6, 24)
     cameras = RefinedCameras()
     cameras.prepare(Scene(ring(4), torch.zeros(0, 3)))
-    assert cameras._pixels[0][1] == pytest.approx(Scene.extent / FOCAL)
+    assert cameras.pixels[0].tolist() == pytest.approx([1 / FOCAL, Scene.extent / FOCAL])
 
 
 def test_cameras_that_are_given_stay_and_have_nothing_to_learn():
@@ -130,6 +130,8 @@ def test_before_its_start_nothing_is_learned():
     cameras.prepare(scene)
     assert cameras.of(scene.frames[1], 0.2) is scene.frames[1].camera
     assert cameras.of(scene.frames[1], 0.3).viewmat.requires_grad
+    other = Frame("other.png", 99, scene.frames[1].camera)
+    assert cameras.of(other, 0.3) is other.camera
 
 
 @pytest.mark.parametrize(
@@ -206,6 +208,14 @@ def test_a_run_that_was_stopped_goes_on_with_its_cameras(tmp_path):
     again, _ = run(tmp_path / "again", *settings, f"ckpt={ckpt}")
     assert torch.equal(again.cameras.moves, whole.cameras.moves)
     assert torch.equal(again.splats["means"], whole.splats["means"])
+    trained = load(tmp_path / "whole" / "checkpoints" / "last.ckpt").module
+    frame = trained.scene.train.frames[3]
+    stood = whole.cameras.of(whole.scene.train.frames[3]).viewmat.detach()
+    assert torch.equal(trained.cameras.of(frame).viewmat.detach(), stood) and not torch.equal(
+        stood, frame.camera.viewmat
+    )
+    seen = whole.render(frame, camera=whole.cameras.of(frame)).features
+    assert torch.equal(trained.render(frame).features, seen)
 
 
 def test_only_pixels_that_count_align_a_camera(tmp_path):

@@ -39,7 +39,7 @@ class CameraCheck(pl.Callback):
         for number in evenly_spread(len(module.scene.train), self.views):
             view = module.scene.train[number].to(module.device, module.dtype)
             with torch.no_grad():
-                given = module.cameras.of(view.frame, 1.0)
+                given = module.cameras.of(view.frame)
             found = module.aligned(view, given, self.steps)
             with torch.no_grad():
                 before, after = (float(module.squared_error(view, camera)) for camera in (given, found))

@@ -13,10 +13,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numb
 from heatsplat.same_bits import mean
 
 FEWEST = 3  # images: of two, the common movement of all leaves nothing to learn
-ALIGN_PX = (
-    0.1,
-    0.01,
-)  # rate in pixels of the first and of the last step in which the camera of a test image is aligned
+ALIGN_PX = (0.1, 0.01)  # rate in pixels of the first and of the last step in which a camera is aligned to an image
 
 
 class Cameras(nn.Module):
@@ -38,9 +35,13 @@ class Cameras(nn.Module):
         """Takes the cameras of the training images. Called once, before training."""
         return
 
-    def of(self, frame: Frame, progress: float) -> Camera:
-        """The camera that took a training image, after ``progress`` of the run; the data's own."""
+    def of(self, frame: Frame, progress: float = 1.0) -> Camera:
+        """The camera that took an image, as it is known after ``progress`` of the run; here the data's own."""
         return frame.camera
+
+    def keep_apart(self) -> None:
+        """Told before every step of training."""
+        return
 
     def regularisers(self) -> dict[str, Tensor]:
         """Terms of the loss by name."""
@@ -54,7 +55,7 @@ class Cameras(nn.Module):
 class RefinedCameras(Cameras):
     """Learns six numbers for each training image: by what its camera was turned, and moved, from where the data have it.
 
-    Structure from motion finds few points in thermal images, and leaves cameras off by a pixel or more: edges blur, and
+    Poses of a log, of another camera or of few features are off by a pixel or more, each by an error of its own: edges blur, and
     temperatures mix across them. The gradient of an image with respect to its camera costs little beside that of the Gaussians.
 
     **Convention:** the numbers are pixels of the training images. A turn is about the centre of the camera, by the angle of a
@@ -62,7 +63,7 @@ class RefinedCameras(Cameras):
     the axes of the world. What all cameras do together belongs to the scene, which would drift away from cameras that are
     not trained on: no common movement, rotation or scale of the cameras is learned, to first order.
 
-    Cameras of test images, and of all that is rendered after training, stay as they are given. Where those of test images are off
+    Cameras of test images, and of whatever else is rendered, stay as they are given. Where those of test images are off
     as well, scores tell what is wrong with them, not with the scene. ``align_steps`` then aligns each to its image first, with
     the scene as it is, as is usual for methods that learn cameras; such scores are not those of cameras that are known.
 
@@ -96,10 +97,16 @@ class RefinedCameras(Cameras):
         self.start, self.weight, self.lr, self.lr_end, self.align_steps = start, weight, lr, lr_end, align_steps
         self.moves = nn.Parameter(torch.zeros(0, 6))
         self.register_buffer(
+            "frame_ids", torch.zeros(0, dtype=torch.int64)
+        )  # of the training images, in the order of moves
+        self.register_buffer(
+            "pixels", torch.zeros(0, 2, dtype=torch.float64)
+        )  # radians, and world units, that are one there
+        self.register_buffer(
             "common", torch.zeros(0, 0), persistent=False
         )  # what all may do together, rows of unit length
-        self._rows: dict[int, int] = {}
-        self._pixels: list[tuple[float, float]] = []  # of each image: radians, and world units, that are one
+        self._known: dict[int, tuple[int, float, float]] = {}  # by frame: its row, and what a pixel is, on the CPU
+        self.register_load_state_dict_post_hook(lambda cameras, _: cameras._look_up())
 
     def prepare(self, scene: SceneData) -> None:
         frames = scene.train.frames
@@ -108,23 +115,33 @@ class RefinedCameras(Cameras):
                 f"scene '{scene.name}' has {len(frames)} training images, and cameras are learned from {FEWEST} on: give "
                 "cameras=given"
             )
-        self._rows = {frame.frame_id: row for row, frame in enumerate(frames)}
-        focals = [_focal(frame.camera) for frame in frames]
-        depths = seen_depths(scene)
-        self._pixels = [(1.0 / focal, depth / focal) for focal, depth in zip(focals, depths, strict=True)]
+        focals = torch.tensor([_focal(frame.camera) for frame in frames], dtype=torch.float64)
+        self.frame_ids = torch.tensor([frame.frame_id for frame in frames])
+        self.pixels = (
+            torch.stack([torch.ones_like(focals), torch.tensor(seen_depths(scene)).to(focals)], 1) / focals[:, None]
+        )
         self.moves = nn.Parameter(torch.zeros(len(frames), 6))
         centres = torch.stack([frame.camera.center for frame in frames])
-        self.common = _common(centres - centres.mean(0), torch.tensor(self._pixels, dtype=torch.float64)).float()
+        self.common = _common(centres - centres.mean(0), self.pixels).float()
+        self._look_up()
 
-    def of(self, frame: Frame, progress: float) -> Camera:
-        """The camera that took a training image; its view matrix carries a gradient to ``moves``."""
-        if progress < self.start:
+    def _look_up(self) -> None:
+        rows = zip(self.frame_ids.tolist(), self.pixels.tolist(), strict=True)
+        self._known = {frame_id: (row, *pixel) for row, (frame_id, pixel) in enumerate(rows)}
+
+    def of(self, frame: Frame, progress: float = 1.0) -> Camera:
+        """The camera that took an image. That of a training image carries a gradient to ``moves`` in its view matrix, others are
+        as they are given."""
+        if progress < self.start or frame.frame_id not in self._known:
             return frame.camera
-        with torch.no_grad():
-            flat = self.moves.view(-1)
-            flat -= ((self.common * flat).sum(1, keepdim=True) * self.common).sum(0)
-        row = self._rows[frame.frame_id]
-        return _moved(frame.camera, self.moves[row].to("cpu", torch.float64), *self._pixels[row])
+        row, per_turn, per_offset = self._known[frame.frame_id]
+        return _moved(frame.camera, self.moves[row].to("cpu", torch.float64), per_turn, per_offset)
+
+    @torch.no_grad()
+    def keep_apart(self) -> None:
+        """Takes away what all cameras have done together; before every step of training."""
+        flat = self.moves.view(-1)
+        flat -= ((self.common * flat).sum(1, keepdim=True) * self.common).sum(0)
 
     def regularisers(self) -> dict[str, Tensor]:
         return {"cameras": self.weight * 6 * mean(self.moves.square())} if self.weight > 0 else {}
@@ -133,7 +150,7 @@ class RefinedCameras(Cameras):
     def found(self) -> dict[str, Any]:
         """Root mean squares over the images: of turns and offsets in pixels, of turns in degrees, of offsets in world units."""
         turns, offsets = self.moves.cpu().double().view(-1, 2, 3).unbind(1)
-        pixels = torch.tensor(self._pixels, dtype=torch.float64)
+        pixels = self.pixels.cpu()
         sizes = {
             "turned_px": turns, "moved_px": offsets,
             "turned_deg": torch.rad2deg(turns * pixels[:, :1]), "moved": offsets * pixels[:, 1:],
@@ -150,9 +167,8 @@ def aligned(camera: Camera, error: Callable[[Camera], Tensor], steps: int, depth
     """
     focal = _focal(camera)
     with torch.inference_mode(False), torch.enable_grad():
-        camera = replace(
-            camera, viewmat=camera.viewmat.clone(), K=camera.K.clone()
-        )  # autograd keeps none of inference mode
+        # Autograd keeps no tensors that were made in inference mode.
+        camera = replace(camera, viewmat=camera.viewmat.clone(), K=camera.K.clone())
         moves = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         optimizer = torch.optim.Adam([moves])
         for step in range(steps):

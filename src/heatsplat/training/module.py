@@ -317,8 +317,9 @@ class SplatTraining(pl.LightningModule):
 
         Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
         [N, C] are what rows of the splats emit in place of what the thermal model makes of them.
-        ``generator`` draws where samples along rays lie, of fields. A ``camera`` that is given takes the image from where it
-        stands, while what the splats emit stays that towards the camera of ``frame``.
+        ``generator`` draws where samples along rays lie, of fields. The image is taken from where ``camera`` stands, by default
+        where the camera of ``frame`` is known to have stood (``Cameras.of``); what the splats emit is that towards the camera of
+        ``frame``.
         """
 
         channels = self.thermal.modality_channels[0]
@@ -338,7 +339,7 @@ class SplatTraining(pl.LightningModule):
         output = self.renderer(
             *(self._raw_shapes() if raw else self._shapes(moved)),
             emitted,
-            camera or frame.camera,
+            camera or self.cameras.of(frame),
             self.background,
             self.thermal.opacity_channels,
             absgrad=absgrad,
@@ -395,6 +396,7 @@ class SplatTraining(pl.LightningModule):
         signs = self.overlap.signs_at(here, len(self.splats) * self.thermal.per_row, self.seed)
         maps = self.density.maps_at(here)
         drawn = generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None
+        self.cameras.keep_apart()
         stood = self.cameras.of(frame, progress)
         output = self.render(
             frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn, camera=stood
@@ -511,8 +513,9 @@ class SplatTraining(pl.LightningModule):
 
     @torch.no_grad()
     def depth(self, frame: Frame) -> Tensor:
-        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none."""
-        output = self.render(frame, depth=True)
+        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none. It is that of the
+        frame's camera as it is given, by whose rays it is read."""
+        output = self.render(frame, depth=True, camera=frame.camera)
         return surface_depth(output.depth, output.alpha[0]).cpu()
 
     @contextmanager
