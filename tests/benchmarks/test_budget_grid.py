@@ -170,6 +170,20 @@ def test_planned_runs_read_the_curves_just_written_on_the_threads_asked_for(tmp_
     assert [point.steps for point in points] == ([250, 4000] if named else [250])
 
 
+def noted(monkeypatch) -> list[list[str]]:
+    """The overrides of all runs that are asked for from here on, of which none is trained."""
+    asked = []
+
+    def trained(place, train, overrides, study):
+        asked.append(overrides)
+        place.mkdir(parents=True)
+        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
+        return a_run(0, None, 0, 20.0, 5.0).results
+
+    monkeypatch.setattr(budget_grid, "trained", trained)
+    return asked
+
+
 def test_other_curves_plan_other_runs(tmp_path, monkeypatch):
     asked = []
 
@@ -190,19 +204,13 @@ def test_other_curves_plan_other_runs(tmp_path, monkeypatch):
 
 
 def test_settings_of_all_runs_choose_what_a_cap_turns_off(tmp_path, monkeypatch):
-    asked = []
-
-    def trained(place, train, overrides, study):
-        asked.append(overrides)
-        place.mkdir(parents=True)
-        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
-        return a_run(0, None, 0, 20.0, 5.0).results
-
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    asked = noted(monkeypatch)
     settings = {"train": None, "steps": 250, "caps": 8000, "decays": 1.0, "seeds": 0, "budgets": [], "curves": None}
     budget_grid.run(tmp_path, scenes="etgs/heated", overrides="density=mcmc", **settings)
     (overrides,) = asked
-    running.compose_run(tmp_path, *overrides)
+    density = running.compose_run(tmp_path, *overrides).density  # refused where a key is none of this density control's
+    assert "MCMC" in density._target_ and density.cap_max == 8000
+    assert not [text for text in overrides if text.startswith(("density.multiple", "density.reset_every"))]
 
 
 @pytest.mark.parametrize(
@@ -251,15 +259,7 @@ def test_the_study_sets_options_that_every_growing_method_has(tmp_path):
 
 
 def test_caps_go_to_density_control(tmp_path, monkeypatch):
-    asked = []
-
-    def trained(place, train, overrides, study):
-        asked.append(overrides)
-        place.mkdir(parents=True)
-        (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
-        return a_run(0, None, 0, 20.0, 5.0).results
-
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    asked = noted(monkeypatch)
     settings = {"train": "train.py", "steps": [250], "caps": [8000], "decays": [1.0], "seeds": [0], "budgets": []}
     settings |= {"overrides": [], "curves": None}
     budget_grid.run(tmp_path / "study", scenes=["ti3dgs/haze"], **settings)

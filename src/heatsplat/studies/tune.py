@@ -171,17 +171,23 @@ def run(
         check_numbers("study.seconds", seconds, error=SceneError)
     done: list[Trial] = []
     checks: list[Check] = []
+
+    def write() -> None:
+        write_csv(output_dir / "tune.csv", _records(done, checks, search_steps))
+        page = markdown(chosen, done, checks, search_steps, score, seeds, overrides)
+        write_atomically(output_dir / "tune.md", page)
+
     for method, case in chosen.items():
         runs = MethodRuns(method, output_dir, train, [*overrides, f"method={method}", *case["scene"]])
         default = Trial(method, "default", {}, runs.result("default", {}, search_steps, SEARCH_SEED))
         tried = [default, *_search(runs, case["knobs"], trials, seconds, search_steps, score)]
         done += tried
         best = _best(tried, score)
-        _write(output_dir, chosen, done, checks, search_steps, score, seeds, overrides)
+        write()
         for steps in check_steps if best is not default else ():
             checks.append(_check(runs, best, steps, seeds, score))
             log.info("%s at %d steps: %s", method, steps, checks[-1].verdict)
-            _write(output_dir, chosen, done, checks, search_steps, score, seeds, overrides)
+            write()
     log.info("%s", (output_dir / "tune.md").read_text(encoding="utf-8"))
     return checks
 
@@ -297,22 +303,6 @@ def _best(tried: Sequence[Trial], score: str) -> Trial:
 # What is written -----------------------------------------------------------------------------------------------------
 
 
-def _write(
-    folder: Path,
-    cases: Mapping[str, Mapping[str, Any]],
-    tried: Sequence[Trial],
-    checks: Sequence[Check],
-    steps: int,
-    score: str,
-    seeds: Sequence[int],
-    overrides: Sequence[str],
-) -> None:
-    runs = [trial.results for trial in tried if trial.results] + [one for each in checks for one in each.default]
-    about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
-    write_csv(folder / "tune.csv", _records(tried, checks, steps))
-    write_atomically(folder / "tune.md", markdown(cases, tried, checks, steps, score, seeds, about))
-
-
 def _records(tried: Sequence[Trial], checks: Sequence[Check], steps: int) -> Iterator[dict[str, Any]]:
     """A row for each run: what it was for, its settings, scores and costs."""
     for trial in tried:
@@ -343,9 +333,11 @@ def markdown(
     steps: int,
     score: str,
     seeds: Sequence[int],
-    about: str,
+    overrides: Sequence[str],
 ) -> str:
     """The report: what all runs have, the comparisons of all methods with their seeds, then every method's search."""
+    runs = [trial.results for trial in tried if trial.results] + [one for each in checks for one in each.default]
+    about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
     which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
     lines = ["# Tuning", "", about, "", f"## The best settings of each search beside the default, {which}", ""]
     head = [
