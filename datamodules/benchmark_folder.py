@@ -18,13 +18,13 @@ from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.weather import write_weather
+from heatsplat.geometry.transforms import camera_entry
 
 log = logging.getLogger("heatsplat")
 
 SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
 UNTOLD = {"scene_seed": 0}  # of folders of before it was told
 META, FILES = "meta.json", {"train": "transforms_train.json", "test": "transforms_test.json"}
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # from camera axes of OpenCV to those of OpenGL and back
 
 
 def write_scenes(
@@ -102,11 +102,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
             name, camera = prefix * (subset == "test") + Path(view.frame.name).stem, view.camera
             entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
             entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
-            K = camera.K
-            entry |= {"w": camera.width, "h": camera.height, "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item()}
-            entry |= {"cx": K[0, 2].item(), "cy": K[1, 2].item()}
-            entry["transform_matrix"] = (np.linalg.inv(camera.viewmat.numpy()) @ OPENGL_AXES).tolist()
-            frames.append(entry)
+            frames.append(entry | camera_entry(camera))
             if subset == "train":
                 _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
             else:

@@ -14,6 +14,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 from heatsplat.datamodules.poses import checked_pose
 from heatsplat.datamodules.side_files import finite, json_object, shortened
+from heatsplat.geometry.transforms import OPENGL_AXES
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
 _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}
@@ -88,7 +89,7 @@ def viewmat_of(transforms: Transforms, frame: dict[str, Any], opengl: bool) -> n
     """
     c2w = checked_pose(frame["transform_matrix"], f"{transforms.path}: transform_matrix of {frame['file_path']}")
     if opengl:
-        c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])
+        c2w = c2w @ OPENGL_AXES
     return np.linalg.inv(c2w)
 
 

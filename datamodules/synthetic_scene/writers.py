@@ -21,12 +21,11 @@ from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.synthetic_scene.film import Recording
 from heatsplat.datamodules.synthetic_scene.outdoor import training_frames
 from heatsplat.datamodules.weather import utc_text, write_weather
+from heatsplat.geometry.transforms import OPENGL_AXES
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 # What nerfstudio does to COLMAP's world: it swaps x and y and turns z round.
 APPLIED_TRANSFORM = ((0.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0))
-# From camera axes of OpenCV to those of OpenGL and back.
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 # A raw count of a DJI M3T camera is this many kelvin.
 KELVIN_PER_COUNT = 1.0 / 64.0
 # ThermalGaussian's files are coloured by an iron palette; this is the nearest one at hand.
