@@ -22,8 +22,9 @@ from matplotlib.figure import Figure
 
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import CURVE_FILE, RunResults, write_atomically
+from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
 from heatsplat.studies.child_runs import all_rows, trained

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.studies.options import check_count
 

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError, check_option
 from heatsplat.effects import assembly
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import all_rows, trained
 from heatsplat.studies.options import counted, filled, listed, named

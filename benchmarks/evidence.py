@@ -22,8 +22,8 @@ from benchmarks.strengths import strengths
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.studies.child_runs import refuse_others
 from heatsplat.studies.options import check_count, filled, listed

@@ -30,7 +30,8 @@ from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.alignment import PoseErrors, pose_errors
 from heatsplat.io.command_lines import setting
-from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.files import write_atomically
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.studies.child_runs import refuse_others, trained
 from heatsplat.studies.options import counted, filled, listed

@@ -19,9 +19,10 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import processor, write_atomically
 from heatsplat.io.tables import markdown_table
+from heatsplat.io.versions import processor
 
 log = logging.getLogger("heatsplat")
 

@@ -25,7 +25,7 @@ from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.datamodules.formats.lens import MODELS
 from heatsplat.geometry.alignment import Similarity, pose_errors
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
 from heatsplat.preparation.features import Features, check_positive
@@ -615,13 +615,10 @@ def _shape(path: Path) -> tuple[int, int]:
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
     """Written whole or not at all: a stopped search must not find half a copy."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise SceneError(f"{path} cannot be written")
-    fresh = path.with_suffix(".part")
-    fresh.write_bytes(data.tobytes())
-    fresh.rename(path)
+    write_atomically(path, data.tobytes())
 
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:

@@ -11,7 +11,7 @@ from heatsplat.callbacks.page import PAGE_FILE
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import read_json_object, write_atomically
 
 RECORD = ".prepared"  # file in the folder: what wrote it, and a hash of the cameras that it wrote
 PARTIAL = ".partial"  # folder of what is being written
@@ -50,7 +50,7 @@ class Target:
                 f"{lost} would be replaced: target={self.folder} writes into the folder that it is read from; give a target "
                 "outside of it"
             )
-        record = _json(self.folder / RECORD)
+        record = read_json_object(self.folder / RECORD)
         if not self._is_ours(record) and (foreign := self._first()) is not None:
             raise SceneError(
                 f"{foreign} is of something else than a scene {self.made}, and would be replaced; give an empty folder as "
@@ -79,7 +79,7 @@ class Target:
         # Earlier versions left no record; their images have one each, and their corrected scenes a title.
         if self.made == CORRECTED:
             return f", {CORRECTED} by" in self._title()
-        records = (_json(path) or {} for path in (self.folder / "images").glob("*.json"))
+        records = (read_json_object(path) or {} for path in (self.folder / "images").glob("*.json"))
         return (self.folder / PARTIAL).is_dir() or any("made_of" in record for record in records)
 
     def _has_older_cameras(self) -> bool:
@@ -103,15 +103,6 @@ class Target:
         files = [self.folder / name for name in FILES]
         inside = (path for name in FOLDERS for path in sorted((self.folder / name).rglob("*")))
         return next((path for path in (*inside, *files) if path.is_file()), None)
-
-
-def _json(path: Path) -> dict | None:
-    """The object in a JSON file, or None where there is none that can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
 
 
 def _digest(folder: Path) -> str | None:

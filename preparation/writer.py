@@ -25,7 +25,7 @@ from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.timestamps import instant
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import read_json_object, write_atomically
 from heatsplat.io.tables import write_csv
 from heatsplat.io.tiff import write_temperature
 from heatsplat.physics.defects import dead_pixels
@@ -75,7 +75,7 @@ class Writer:
     def write(self, frame: Frame) -> tuple[dict[str, Any], bool]:
         """The record of a frame, and whether its image had to be written."""
         record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
-        done = _read(record_file) or {}
+        done = read_json_object(record_file) or {}
         if done.get("made_of") == made_of and self.image_of(frame).exists():
             return done, False
         stored = frame.load()
@@ -230,12 +230,3 @@ def rows(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> list[
         row |= {"time": record["time"], **(record["position"] or {}), **(record["attitude"] or {})}
         found.append(row | {"least": quantiles[0], "median": quantiles[len(quantiles) // 2], "most": quantiles[-1]})
     return found
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """A record that was written before, or None where there is none that can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table
 from heatsplat.physics.responses import RATES
 

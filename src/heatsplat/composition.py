@@ -1,6 +1,6 @@
 """The door to Hydra: configurations as plain containers, and the objects that they describe.
 
-Only Hydra is imported here, so that --help, --cfg and typing errors answer at once.
+Nothing heavy but Hydra is imported here, so that --help, --cfg and typing errors answer at once.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
+from heatsplat.io.settings import at
 from heatsplat.training.machine import cores
 
 ROOT = CHECKOUT or Path.cwd()  # outputs/ goes there
@@ -38,10 +39,10 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
         overrides: as the command line has them.
         name: of the command: train | evaluate | render | simplify | view | export | study | prepare.
     """
-    return plain(composed(overrides, name), overrides)
+    return plain(compose_unresolved(overrides, name), overrides)
 
 
-def composed(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
+def compose_unresolved(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
     """As ``compose``, before its interpolations are resolved."""
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(name, list(overrides))
@@ -49,6 +50,11 @@ def composed(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+
+
+def options_of(group: str) -> list[str]:
+    """The options of a configuration group, such as "method"; none where there is no such group."""
+    return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
 def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
@@ -90,10 +96,7 @@ def _at(path: Path, group: str, key: str) -> Any:
     package = told[1].replace("_global_", "") if told else group.replace("/", ".")
     if package and not key.startswith(f"{package}."):
         return None
-    found = OmegaConf.to_container(OmegaConf.load(path))
-    for name in key.removeprefix(f"{package}.").split("."):
-        found = found.get(name) if isinstance(found, Mapping) else None
-    return found
+    return at(OmegaConf.to_container(OmegaConf.load(path)), key.removeprefix(f"{package}."))
 
 
 def _unmet(error: InterpolationKeyError, choices: Mapping[str, str | None]) -> str | None:
@@ -114,11 +117,6 @@ def _unmet(error: InterpolationKeyError, choices: Mapping[str, str | None]) -> s
     of_it = [name for name in having if chosen in (_at(methods[name], "method", "defaults") or ())]
     other = f"choose method={' or '.join(of_it or having)}, or " if having else ""
     return f"{option} needs {key}, which method={method} does not have: {other}add +{key}=..."
-
-
-def keys_of(overrides: Sequence[str]) -> set[str]:
-    """What overrides are given for, such as {"max_steps", "data.scene"}."""
-    return {text.lstrip("+~").partition("=")[0] for text in overrides}
 
 
 def overlap(key: str, other: str) -> bool:

@@ -12,36 +12,17 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-
-class SceneError(ValueError):
-    """Input data that cannot be used as it is. The message names the file, key or shape and the remedy."""
-
-
-def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueError] = ValueError) -> None:
-    """Raises ``error``, with the values that are known, where an option has another one."""
-    if value not in known:
-        raise error(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
-
-
-def check_numbers(name: str, value: Any, count: int | None = None, error: type[ValueError] = ValueError) -> None:
-    """Raises ``error`` where a setting is no finite number, or with ``count`` no list of so many."""
-    listed = isinstance(value, Sequence) and not isinstance(value, str)
-    numbers = value if listed else [value]
-    known = all(isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in numbers)
-    if not known or (count is None) == listed or (listed and len(numbers) != count):
-        wanted = "a number" if count is None else f"a list of {count} numbers"
-        raise error(f"{name} must be {wanted}, got {list(value) if listed else value}")
-
+# For all who need torch anyway; who does not imports heatsplat.errors.
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
 

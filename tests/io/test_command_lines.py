@@ -5,7 +5,7 @@ import shlex
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from heatsplat.io.command_lines import setting, typed
+from heatsplat.io.command_lines import as_dict, key_of, keys_of, setting, typed
 
 TEXTS = [
     "/data/flight_2",
@@ -27,3 +27,10 @@ def test_hydra_reads_what_was_meant(text):
 
 def test_plain_text_stays_plain():
     assert typed(setting("data.root", "/data/flight_2")) == "data.root=/data/flight_2"
+
+
+def test_overrides_are_told_apart_by_what_they_are_for():
+    overrides = ["data.scene=heated", "+row='a=b'", "++seed=1", "~logger"]
+    assert [key_of(text) for text in overrides] == ["data.scene", "row", "seed", "logger"]
+    assert keys_of(overrides) == {"data.scene", "row", "seed", "logger"}
+    assert as_dict(overrides) == {"data.scene": "heated", "+row": "'a=b'", "++seed": "1", "~logger": ""}

@@ -2,15 +2,12 @@
 
 import json
 import math
-import os
-import subprocess
 
 import numpy as np
 import pytest
 import torch
 
-import heatsplat
-from heatsplat.io.results import COST, TEST, RunResults, collect_versions, processor, write_atomically
+from heatsplat.io.results import COST, TEST, RunResults
 
 
 def filled():
@@ -97,27 +94,3 @@ def test_a_file_with_other_things_in_a_section_is_named(tmp_path, change):
         ValueError, match=r"metrics.json is not .*(no mappings: test|psnr is neither|gaussians is neither)"
     ):
         RunResults.read(path)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "metrics.json"
-    write_atomically(path, "old")
-    with pytest.raises(UnicodeEncodeError):
-        write_atomically(path, "new \ud800")
-    assert path.read_text() == "old"
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_versions_name_the_commit():
-    found = collect_versions()
-    assert found["heatsplat"] == heatsplat.__version__
-    assert found["torch"] == torch.__version__
-    folder = heatsplat.__path__[0]
-    head = subprocess.run(["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    assert found["git_commit"] == (head.stdout.strip() if head.returncode == 0 else None)
-    assert isinstance(found["git_dirty"], bool) == (head.returncode == 0)
-
-
-def test_the_processor_has_a_name_and_cores():
-    name, _, cores = processor().rpartition(", ")
-    assert name and cores == f"{os.cpu_count()} cores"

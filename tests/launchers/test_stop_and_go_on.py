@@ -1,48 +1,15 @@
 """What a job does when it is told to stop, and where it goes on when it is started again."""
 
 import os
-import signal
 
 import pytest
 import torch
 from hydra.core.utils import JobStatus
 from running import TINY, compose_run, run
 
-from heatsplat import cli, composition
+from heatsplat import composition
 from heatsplat.runs.resume import resumed
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
-
-
-@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN], ids=["terminal", "background job"])
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR2"])
-def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name, ctrl_c):
-    heard, number = [], signal.Signals[name]
-    before, before_ctrl_c = (
-        signal.signal(number, lambda got, _: heard.append(got)),
-        signal.signal(signal.SIGINT, ctrl_c),
-    )
-    try:
-        with pytest.raises(KeyboardInterrupt), cli.stoppable():
-            os.kill(os.getpid(), number)
-            assert heard == [], "heard before the job had stopped"
-            signal.pause()
-        assert heard == [number]
-        os.kill(os.getpid(), number)
-        assert heard == [number, number], "the listener was not put back"
-    finally:
-        signal.signal(number, before)
-        signal.signal(signal.SIGINT, before_ctrl_c)
-
-
-def test_ctrl_c_is_nobody_elses():
-    heard = []
-    before = signal.signal(signal.SIGTERM, lambda got, _: heard.append(got))
-    try:
-        with pytest.raises(KeyboardInterrupt), cli.stoppable():
-            raise KeyboardInterrupt
-        assert heard == []
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @pytest.mark.parametrize(("jobs", "expected"), [(1, 6), (2, 3), (4, 1), (9, 1), (-1, 1)])

@@ -11,7 +11,8 @@ PACKAGE = ROOT / "src" / "heatsplat"
 
 # Package -> packages of heatsplat that it may import. Packages are folders, or single files at the top of heatsplat.
 ALLOWED = {
-    "contracts": set(),
+    "errors": set(),
+    "contracts": {"errors"},
     "same_bits": set(),
     "physics": {"contracts", "kernels", "same_bits"},
     "geometry": {"contracts", "kernels"},
@@ -28,13 +29,15 @@ ALLOWED = {
     "callbacks": {"contracts", "geometry", "metrics", "physics", "io", "heatsplat", "shots", "uncertainty", "viewer"},
     "export": {"contracts", "geometry", "io", "physics", "renderers", "shots", "uncertainty"},
     "viewer": {"contracts", "export", "io"},
-    "composition": {"training", "heatsplat"},
+    "composition": {"io", "training", "heatsplat"},
+    "explanations": {"composition", "errors", "io"},
     "doctor": {"contracts", "effects", "io", "physics"},
     "runs": {
         "contracts",
         "composition",
         "doctor",
         "effects",
+        "errors",
         "geometry",
         "io",
         "renderers",
@@ -60,8 +63,9 @@ ALLOWED = {
     "shots": {"contracts", "geometry", "io"},
     "uncertainty": {"contracts", "geometry", "physics", "shots", "thermal"},
     "cli": {
-        "contracts",
         "composition",
+        "errors",
+        "explanations",
         "export",
         "runs",
         "io",
@@ -78,8 +82,8 @@ BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
 # Third-party package -> places that may import it.
 DOORS = {
-    "hydra": {"cli", "composition"},
-    "omegaconf": {"cli", "composition"},
+    "hydra": {"cli", "composition", "explanations"},
+    "omegaconf": {"cli", "composition", "explanations"},
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
     "pycolmap": {"datamodules/formats", "preparation"},
     "pvlib": {"datamodules"},

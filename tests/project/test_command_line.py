@@ -10,7 +10,7 @@ import hydra
 import numpy as np
 import pytest
 from commands import succeeds
-from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
+from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from heatsplat import cli, composition
@@ -205,34 +205,6 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
 def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
     output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output
-
-
-@pytest.mark.parametrize(
-    ("wrong", "meant"),
-    [
-        ("study.overrides=[data.size=tiny, threads=1]", "\"study.overrides=['data.size=tiny','threads=1']\""),
-        ("study.overrides=[data.size=tiny,", "\"study.overrides=['data.size=tiny',...]\""),
-        ("study.scenes=[küche,flur]", "\"study.scenes=['küche',flur]\""),
-    ],
-)
-def test_a_list_is_told_its_quotes(wrong, meant):
-    assert cli._quoted(wrong).endswith(f" {meant}")
-    with pytest.raises(OverrideParseException):
-        composition.compose([wrong], "study")
-    assert cli._quoted("a=[x,[y=1]]") == cli._quoted("a=['b=c',d=e]") == ""
-
-
-@pytest.mark.parametrize("typed", ["lr_source", "lr_sorce"])
-def test_a_key_with_dots_in_its_name_is_told_as_it_can_be_typed(typed, monkeypatch):
-    wrong = ["study=tune", f"study.cases.etgs.knobs.thermal.{typed}=[0.1,1]"]
-    monkeypatch.setattr(cli.sys, "argv", ["study.py", *wrong])
-    with pytest.raises(ConfigCompositionException) as refused:
-        composition.compose(wrong, "study")
-    told, _, argument = cli._meant(refused.value, "study").partition(": ")
-    assert told == "thermal.lr_source is one name, dots and all"
-    assert argument == '"study.cases.etgs.knobs={thermal.lr_source:[0.1,1]}"'
-    knobs = composition.compose(["study=tune", argument.strip('"')], "study")["study"]["cases"]["etgs"]["knobs"]
-    assert knobs["thermal.lr_source"] == [0.1, 1] and len(knobs) == 3
 
 
 def test_a_group_set_to_null_is_told_its_options(tmp_path):

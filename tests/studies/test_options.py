@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.options import check_count, counted, filled, listed, named
+from heatsplat.studies.options import counted, filled, listed, named
 
 
 @pytest.mark.parametrize(
@@ -39,11 +39,3 @@ def test_a_name_that_there_is_not_and_a_number_that_counts_nothing_are_told_one_
     for check in (counted, lambda key, value: named(key, value, ["hot"])):
         with pytest.raises(SceneError, match="study.only=.* has nothing in it"):
             check("study.only", [])
-
-
-@pytest.mark.parametrize("wrong", [0, -1, 1.5, "abc", None, True])
-def test_what_counts_nothing_is_named(wrong):
-    with pytest.raises(SceneError, match=r"^study\.trials must be a whole number, 1 or more, got "):
-        check_count("study.trials", wrong)
-    check_count("study.trials", 1)
-    check_count("study.seeds", 0, least=0)

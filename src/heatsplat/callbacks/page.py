@@ -12,7 +12,7 @@ from urllib.parse import unquote
 from markdown_it import MarkdownIt
 from PIL import Image
 
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 
 PAGE_FILE = "report.html"
 QUALITY = 85  # of WebP, of 100, for still pictures

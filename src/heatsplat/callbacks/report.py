@@ -26,9 +26,12 @@ from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.io.citations import citations
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, processor, write_atomically
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults
+from heatsplat.io.settings import walk
 from heatsplat.io.tables import NONE, markdown_table, read_csv
+from heatsplat.io.versions import collect_versions, processor
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
@@ -178,20 +181,11 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
 def hyperparameters(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that say what was learned and how, flat: "thermal.frequencies" -> 24."""
     flat: dict[str, Any] = {}
-
-    def add(path: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for key, item in value.items():
-                if key == "_target_":
-                    add(path, str(item).split(".")[-1])
-                else:
-                    add(f"{path}.{key}", item)
-        else:
-            flat[path] = value if isinstance(value, (int, float, str, bool)) else str(value)
-
-    for name in HYPERPARAMETERS:
-        if name in config:
-            add(name, config[name])
+    for key, value in walk({name: config[name] for name in HYPERPARAMETERS if name in config}):
+        if key.endswith("._target_"):
+            flat[key.removesuffix("._target_")] = str(value).split(".")[-1]
+        elif not isinstance(value, Mapping):
+            flat[key] = value if isinstance(value, (int, float, str, bool)) else str(value)
     return flat
 
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from heatsplat.contracts import SceneData
 from heatsplat.doctor import checks
 from heatsplat.doctor.base import Check, Finding, Material, material_of
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 
 log = logging.getLogger("heatsplat")
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 
 NONE = "–"
 

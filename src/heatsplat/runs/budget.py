@@ -20,8 +20,9 @@ from typing import Any
 import torch
 from scipy.spatial import cKDTree
 
-from heatsplat.composition import build, choices_of, compose, followed, keys_of, overlap
+from heatsplat.composition import build, choices_of, compose, followed, overlap
 from heatsplat.contracts import SceneData, SceneError
+from heatsplat.io.command_lines import keys_of
 from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
 from heatsplat.runs.device import device_of
 from heatsplat.runs.stepping import Stepper

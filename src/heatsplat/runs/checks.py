@@ -7,9 +7,10 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from heatsplat.composition import keys_of
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
+from heatsplat.io.command_lines import keys_of
+from heatsplat.io.settings import walk
 from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
@@ -88,7 +89,7 @@ def _check_ranges(config: Mapping[str, Any]) -> None:
     for key, rate in _rates(config):
         if isinstance(rate, int | float) and not rate >= 0:
             raise SceneError(f"{key} is a learning rate and must be 0 or more, got {rate}")
-    for key, weight in _weights_in({group: config[group] for group in ("thermal", "sensor", "loss")}):
+    for key, weight in _weights(config):
         if isinstance(weight, int | float) and not 0 <= weight < math.inf:
             raise SceneError(
                 f"{key} is a weight in the loss and must be 0 or more, or training makes worse what it weighs, got {weight}"
@@ -98,25 +99,17 @@ def _check_ranges(config: Mapping[str, Any]) -> None:
 def _rates(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Learning rates with their dotted keys."""
     yield from ((f"optim.{name}", config["optim"].get(name)) for name in RATES)
-    for group in ("thermal", "sensor"):
-        yield from _rates_in(config[group], group)
+    for key, value in walk({group: config[group] for group in ("thermal", "sensor")}):
+        name = key.rpartition(".")[2]
+        if not isinstance(value, Mapping) and (name == "lr" or name.startswith("lr_")):
+            yield key, value
 
 
-def _rates_in(settings: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _rates_in(value, f"{path}.{name}")
-        elif str(name) == "lr" or str(name).startswith("lr_"):
-            yield f"{path}.{name}", value
-
-
-def _weights_in(settings: Mapping[str, Any], path: str = "", weighs: bool = False) -> Iterator[tuple[str, Any]]:
+def _weights(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Weights of loss terms, penalties and priors with their dotted keys: those that are called so."""
-    for name, value in settings.items():
-        key = f"{path}.{name}".removeprefix(".")
-        if isinstance(value, Mapping):
-            yield from _weights_in(value, key, weighs=name == "weights")
-        elif weighs or str(name).endswith(WEIGHTS):
+    for key, value in walk({group: config[group] for group in ("thermal", "sensor", "loss")}):
+        *above, name = key.split(".")
+        if not isinstance(value, Mapping) and (above[-1:] == ["weights"] or name.endswith(WEIGHTS)):
             yield key, value
 
 

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import write_atomically
+from heatsplat.io.command_lines import as_dict
+from heatsplat.io.files import write_atomically
 
 CURVES_FILE = Path(__file__).with_name("budget_curves.csv")
 
@@ -158,7 +159,7 @@ def write_points(points: Iterable[Point], path: Path) -> None:
     """Writes a curves file, in one order whatever that of ``points``."""
     text = io.StringIO(newline="")
     points = sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps))
-    keys = sorted({key for point in points for key in _by_key(point.settings)})
+    keys = sorted({key for point in points for key in as_dict(point.settings)})
     writer = csv.DictWriter(text, [*COLUMNS, *keys], lineterminator="\n")
     writer.writeheader()
     for point in points:
@@ -166,13 +167,9 @@ def write_points(points: Iterable[Point], path: Path) -> None:
             {name: getattr(point, name) for name in COLUMNS}
             | {"psnr": f"{point.psnr:.3f}"}
             | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay", "cost")}
-            | _by_key(point.settings)
+            | as_dict(point.settings)
         )
     write_atomically(path, text.getvalue())
-
-
-def _by_key(settings: Iterable[str]) -> dict[str, str]:
-    return dict(text.partition("=")[::2] for text in settings)
 
 
 def curves_of(points: Iterable[Point]) -> dict[tuple[str, str], dict[Choice, Curve]]:

@@ -16,6 +16,8 @@ from typing import Any
 from heatsplat.composition import choices_of, overlap, setters_of
 from heatsplat.contracts import SceneError
 from heatsplat.effects import assembly
+from heatsplat.io.command_lines import key_of
+from heatsplat.io.settings import walk
 
 # Kinds of settings by the names that classes declare them with, in words. A class of ours, and what is called, is a part.
 KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "list": "a list"}
@@ -50,7 +52,8 @@ def check_declared(config: Mapping[str, Any]) -> None:
         if not left and not _is_of(kinds, value):
             raise SceneError(_other_kind(key, value, kinds, config))
     groups.pop("effects", None)  # its templates also hold what puts them together
-    for path, settings in _with_targets(groups):
+    parts = ((key, value) for key, value in walk(groups) if isinstance(value, Mapping) and "_target_" in value)
+    for path, settings in parts:
         names = declared(str(settings["_target_"])).names
         for name in settings:
             if names is not None and name not in names and not str(name).startswith("_"):
@@ -130,15 +133,6 @@ def _given(settings: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, A
             yield from _given(value, key)
 
 
-def _with_targets(settings: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Settings of classes and functions with their dotted keys, those within others too."""
-    if "_target_" in settings:
-        yield path, settings
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _with_targets(value, f"{path}.{name}".removeprefix("."))
-
-
 # What is said of it --------------------------------------------------------------------------------------------------
 
 
@@ -163,7 +157,7 @@ def _origin(key: str, config: Mapping[str, Any], without: str) -> tuple[str, str
     choices, overrides = choices_of(config["overrides"]), config["overrides"]
     group = key.partition(".")[0]
     option = f"{group}={choices[group]}" if choices.get(group) else group
-    named = {text: text.lstrip("+~").partition("=")[0] for text in overrides}
+    named = {text: key_of(text) for text in overrides}
     if given := [text for text, name in named.items() if "." in name and overlap(name, key)]:
         return option, "", f"leave {' and '.join(given)} out"
     setters = setters_of(key, choices)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 from heatsplat.runs.run import Trained
 from heatsplat.training.checkpoints import CheckpointFiles
 from heatsplat.training.module import CHECKPOINT_KEY

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
+from heatsplat.errors import SceneError
 
 try:
     import fcntl

@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from heatsplat.composition import compose, followed, keys_of, overlap
+from heatsplat.composition import compose, followed, overlap
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
+from heatsplat.io.command_lines import keys_of
+from heatsplat.io.settings import at
 from heatsplat.runs.trust import trusted
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
@@ -24,6 +26,7 @@ LEARNED = {  # and what in these says how it learns, or how long
 }
 # What may differ beside the length from the run whose checkpoint is given: where it is, when it ends, what is decided already.
 OPEN = ("data.root.", "renderer.backend.", "callbacks.plateau.", "effects.price.", "effects.least_db_per_ms.")
+ABSENT = object()  # of what an older heatsplat did not have
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
@@ -155,7 +158,9 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         config = followed(config, compose(overrides), shorter)
     changed = [key for key in differences(config, stored) if not f"{key}.".startswith(OPEN)]
     given = keys_of(overrides)
-    new = [key for key in changed if not (_holds(before, key) or any(overlap(key, other) for other in given))]
+    new = [
+        key for key in changed if at(before, key, ABSENT) is ABSENT and not any(overlap(key, other) for other in given)
+    ]
     if known := [key for key in changed if key not in new]:
         raise SceneError(
             f"{config['ckpt']} was trained with another {', '.join(known)}: give what it was trained with, or start anew without "
@@ -163,12 +168,3 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         )
     if new:
         log.warning("%s is of an older heatsplat without %s: they count from here on", config["ckpt"], ", ".join(new))
-
-
-def _holds(settings: Any, key: str) -> bool:
-    """Whether nested settings have a dotted key."""
-    for name in key.split("."):
-        if not isinstance(settings, Mapping) or name not in settings:
-            return False
-        settings = settings[name]
-    return True

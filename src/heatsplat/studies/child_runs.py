@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.command_lines import setting
+from heatsplat.io.command_lines import key_of, setting
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 
@@ -79,10 +79,10 @@ def all_rows(overrides: Iterable[str], **found: Iterable[Any]) -> str:
         found: key -> its values in their results; they take the place of overrides of this key, and None tells nothing.
     """
     told = {key: sorted({value for value in values if value is not None}) for key, values in found.items()}
-    kept = [text for text in overrides if not told.get(text.partition("=")[0])]
+    kept = [text for text in overrides if not told.get(key_of(text))]
     words = [*kept, *(f"{key}={','.join(map(str, values))}" for key, values in told.items() if values)]
     return f"All rows: `{' '.join(words)}`."
 
 
 def _settings(overrides: Iterable[str]) -> list[str]:
-    return [text for text in overrides if text.partition("=")[0] not in WHERE_IT_LIES]
+    return [text for text in overrides if key_of(text) not in WHERE_IT_LIES]

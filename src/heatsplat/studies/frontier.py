@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import CURVE_FILE, METRICS_FILE, write_atomically
+from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import spelled, trained
 from heatsplat.studies.frontier_report import markdown, page, picture, records

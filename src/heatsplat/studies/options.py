@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from heatsplat.contracts import SceneError, check_option
+from heatsplat.contracts import SceneError, check_count, check_option
 
 
 def listed(value: Any) -> list[Any]:
@@ -44,9 +44,3 @@ def counted(key: str, value: Any, least: int = 1) -> list[int]:
     for one in found:
         check_count(key, one, least)
     return found
-
-
-def check_count(key: str, value: Any, least: int = 1) -> None:
-    """Raises SceneError where an option is no whole number, or less than ``least``."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise SceneError(f"{key} must be a whole number, {least} or more, got {value}")

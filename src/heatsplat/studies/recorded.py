@@ -7,13 +7,15 @@ from typing import Any
 
 import yaml
 
+from heatsplat.io.command_lines import as_dict
+
 OVERRIDES = Path(".hydra") / "overrides.yaml"
 CONFIG = Path(".hydra") / "config.yaml"
 
 
 def overrides_of(place: Path) -> dict[str, str]:
     """What the command line said of the run in a folder: key -> value, as text; empty where nothing was written down."""
-    return dict(str(text).partition("=")[::2] for text in _read(place / OVERRIDES, list))
+    return as_dict(map(str, _read(place / OVERRIDES, list)))
 
 
 def config_of(place: Path) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from heatsplat.contracts import SceneError, ThermalRange, check_option
-from heatsplat.io.results import METRICS_FILE, write_atomically
+from heatsplat.io.files import write_atomically
+from heatsplat.io.results import METRICS_FILE
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS

@@ -9,8 +9,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, literal, write_png
-from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of

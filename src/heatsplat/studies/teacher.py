@@ -16,8 +16,8 @@ from tqdm import tqdm
 
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.geometry.resampling import resampled
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import Panel, colorize, compose, write_png
-from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
 from heatsplat.losses.swinir import SwinIR
 from heatsplat.metrics.psnr import psnr

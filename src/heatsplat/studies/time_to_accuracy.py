@@ -14,15 +14,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import as_dict
+from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
-from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import trained
 from heatsplat.studies.finished import settings_of
 from heatsplat.studies.frontier_runs import find_runs
 from heatsplat.studies.options import check_count, filled, listed
 from heatsplat.studies.time_to_accuracy_report import markdown, picture, records
-from heatsplat.studies.time_to_accuracy_runs import Panel, panels_of, parsed, without_length
+from heatsplat.studies.time_to_accuracy_runs import Panel, panels_of, without_length
 
 log = logging.getLogger("heatsplat")
 
@@ -74,17 +75,17 @@ def run(
     recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
     if clock not in CLOCKS:
         raise SceneError(f"study.clock={clock}: give one of {', '.join(CLOCKS)}")
-    if "max_steps" not in parsed(reference):
+    if "max_steps" not in as_dict(reference):
         raise SceneError(f"study.reference={reference}: give its length too, such as max_steps=30000")
     if runs is None:
         runs = [] if cases else outputs
     folders = [Path(text).expanduser() for text in listed(runs)]
     wanted = asked_for(cases, reference, lengths, recipes, seeds)
     known = find_runs(folders, clock)
-    common = set(settings_of(parsed(overrides)))
+    common = set(settings_of(as_dict(overrides)))
     there = {_identity(found, common) for found in known["overrides"]} if len(known) else set()
     for place, own in wanted:
-        if _identity(parsed(own), common) not in there:
+        if _identity(as_dict(own), common) not in there:
             trained(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
             folders = [*folders, output_dir / "runs" / place]
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}

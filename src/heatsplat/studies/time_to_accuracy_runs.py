@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from heatsplat.io.command_lines import as_dict, key_of
 from heatsplat.studies.finished import PLACES, settings_of
 from heatsplat.studies.frontier_runs import panel_titles, seconds_to
 from heatsplat.studies.options import listed
@@ -129,11 +130,6 @@ def _between(low: float, high: float, share: float) -> float:
     return low + share * (high - low)
 
 
-def parsed(overrides: Iterable[str]) -> dict[str, str]:
-    """Overrides as key -> value."""
-    return dict(text.partition("=")[::2] for text in overrides)
-
-
 def without_length(overrides: Iterable[str]) -> list[str]:
     """Overrides but for max_steps."""
     return [text for text in overrides if not text.startswith("max_steps=")]
@@ -143,7 +139,7 @@ def further_of(overrides: Mapping[str, str], cases: Iterable[Sequence[str]]) -> 
     """What the case of a run says beside method and scene: of the cases that say nothing but what the run has, the longest."""
     own = {f"{key}={value}" for key, value in overrides.items()}
     case = max((case for case in cases if own.issuperset(case)), key=len, default=())
-    return [text for text in case if text.partition("=")[0] not in {"method", *PLACES}]
+    return [text for text in case if key_of(text) not in {"method", *PLACES}]
 
 
 def panels_of(
@@ -167,9 +163,9 @@ def panels_of(
     """
     if runs.empty:
         return []
-    length = int(parsed(reference)["max_steps"])
-    usual = frozenset(settings_of(parsed(without_length(reference))))
-    names = {frozenset(settings_of(parsed(texts))): name for name, texts in recipes.items()}
+    length = int(as_dict(reference)["max_steps"])
+    usual = frozenset(settings_of(as_dict(without_length(reference))))
+    names = {frozenset(settings_of(as_dict(texts))): name for name, texts in recipes.items()}
     cases = [listed(case) for case in cases]
     runs = runs.assign(further=[further_of(overrides, cases) for overrides in runs["overrides"]])
     scenes = [", ".join([f"{one.method} on {one.scene}", *one.further]) for one in runs.itertuples()]

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError, check_numbers
-from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.files import write_atomically
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, trained
 from heatsplat.studies.finished import reason_of

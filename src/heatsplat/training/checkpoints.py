@@ -13,7 +13,7 @@ import torch
 from pytorch_lightning.plugins.io import CheckpointIO
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 
 
 class CheckpointFiles(CheckpointIO):

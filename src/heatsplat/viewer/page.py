@@ -12,7 +12,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.export.snapshot import snapshot
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 from heatsplat.viewer.payload import payload
 
 FILE = "viewer.html"

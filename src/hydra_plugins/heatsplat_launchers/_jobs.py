@@ -20,6 +20,9 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from heatsplat.io.command_lines import as_dict
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+
 log = logging.getLogger("heatsplat")
 
 
@@ -154,7 +157,6 @@ def _configuration(context: HydraContext, config: DictConfig, number: int, overr
 
 def _finished(job: Job) -> JobReturn | None:
     """What a job returned that has results of its settings already, else None."""
-    from heatsplat.io.results import METRICS_FILE, RunResults
     from heatsplat.studies.recorded import overrides_of
 
     file = job.folder / METRICS_FILE
@@ -165,7 +167,7 @@ def _finished(job: Job) -> JobReturn | None:
         before = overrides_of(job.folder)
     except (ValueError, OSError):  # the job says so itself, and takes no other down
         return None
-    if _learned(before) != _learned(dict(text.partition("=")[::2] for text in job.overrides)):
+    if _learned(before) != _learned(as_dict(job.overrides)):
         return None  # the job compares what was composed, and refuses the results of other settings
     log.info("#%d has results already; skipped. Delete %s to run it again.", job.number, job.folder)
     done = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
@@ -183,8 +185,6 @@ def _learned(overrides: Mapping[str, str]) -> dict[str, str]:
 
 def _died(job: Job, error: Exception) -> JobReturn:
     """The result of a job whose process did not live to return one, with the reason in its folder."""
-    from heatsplat.io.results import FAILED
-
     reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
     log.error("#%d died: %s", job.number, reason)
     if not (job.folder / FAILED).exists():

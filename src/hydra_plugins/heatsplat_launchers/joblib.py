@@ -12,6 +12,7 @@ from threading import Thread
 from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
 
+from heatsplat.training.machine import cores
 from hydra_plugins.heatsplat_launchers._jobs import (
     DiedError,
     Job,
@@ -75,7 +76,6 @@ class Joblib(JobLauncher):
             from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
         except ImportError as error:
             raise ImportError("launcher=joblib needs joblib: pip install -e '.[sweep]'") from error
-        from heatsplat.training.machine import cores
 
         at_a_time = min(cores() if self.n_jobs == -1 else self.n_jobs, len(jobs))
         # Libraries read these when they are loaded; what the job itself sets (torch, kernels) comes too late for some.

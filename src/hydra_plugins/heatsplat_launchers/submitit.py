@@ -11,6 +11,7 @@ from typing import Any
 
 from hydra.core.utils import JobReturn
 
+from heatsplat.errors import SceneError
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, JobLauncher, attempt, execute, python_path
 
 try:
@@ -91,8 +92,6 @@ class Slurm(SubmititLauncher):
 
     def outcomes(self, jobs: Sequence[Job]) -> Iterator[JobReturn | Exception]:
         """As of any launcher. Raises SceneError on a machine that is not of a cluster."""
-        from heatsplat.contracts import SceneError
-
         if shutil.which("srun") is None:
             raise SceneError(
                 "launcher=slurm: SLURM is not on this machine (no srun). Start the sweep on one that can submit jobs; "
@@ -103,8 +102,6 @@ class Slurm(SubmititLauncher):
     def submitted(self, executor: Any, arguments: Iterable[tuple[Any, ...]]) -> list[Any]:
         """As above. Raises SceneError, with what sbatch says, where it takes no job."""
         from submitit.core.utils import FailedJobError, FailedSubmissionError
-
-        from heatsplat.contracts import SceneError
 
         if (cores := executor.parameters.get("cpus_per_task")) is not None:
             # Not every srun takes them over from sbatch (not that of 22.05 and 23.02), and a job would have one core.

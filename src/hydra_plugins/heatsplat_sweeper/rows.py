@@ -18,6 +18,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
+from heatsplat.errors import SceneError
+from heatsplat.io.command_lines import as_dict, keys_of
 from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
 
 if TYPE_CHECKING:
@@ -43,11 +45,6 @@ def folder_name(overrides: str) -> str:
         half = (LONGEST - len(mark) - len("..")) // 2
         name = f"{name[:half]}..{name[-half:]}"
     return name + mark
-
-
-def keys_of(arguments: Sequence[str]) -> set[str]:
-    """Keys that a command line sets."""
-    return {text.lstrip("+~").partition("=")[0] for text in arguments}
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
@@ -132,13 +129,12 @@ class RowSweeper(BasicSweeper):
 
     def _check_methods(self, jobs: Sequence[Sequence[str]]) -> None:
         """Raises SceneError where the rows would not be what they are called, for they are parts of another method."""
-        from heatsplat.contracts import SceneError
         from heatsplat.studies.options import listed
 
         if not (own := listed(self.of)):
             return
         chosen = self.config.hydra.runtime.choices.method
-        asked = {dict(text.partition("=")[::2] for text in job).get("method", chosen).strip("'\"") for job in jobs}
+        asked = {as_dict(job).get("method", chosen).strip("'\"") for job in jobs}
         if others := sorted(asked - {*own}):
             raise SceneError(
                 f"the rows of this ablation are parts of method={' or '.join(own)}, not of method={', '.join(others)}: leave "
@@ -216,7 +212,6 @@ class RowSweeper(BasicSweeper):
 
         Exit code 1 where the table asks for what there is not, or none of its scenes is on disk.
         """
-        from heatsplat.contracts import SceneError
         from heatsplat.studies.published import reproduction_of
 
         table = OmegaConf.to_container(self.config.table)
@@ -241,7 +236,6 @@ class RowSweeper(BasicSweeper):
 
     def _plan_board(self, arguments: list[str]) -> None:
         """Plans the runs of the leaderboard and tells how many; exit code 1 where it asks for what there is not."""
-        from heatsplat.contracts import SceneError
         from heatsplat.studies.leaderboard.plan import board_of
 
         asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from heatsplat.io.results import write_atomically
+from heatsplat.io.files import write_atomically
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page

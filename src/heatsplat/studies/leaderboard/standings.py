@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import METRICS_FILE, write_atomically
+from heatsplat.io.files import write_atomically
+from heatsplat.io.results import METRICS_FILE
 from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import (
     add_earlier,

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from heatsplat.io.results import RunResults, write_atomically
+from heatsplat.io.files import write_atomically
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.studies.finished import Runs
 from heatsplat.studies.published.figures import METRICS, Figure

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import key_of
 from heatsplat.metrics.lpips import LpipsUnavailable, find_backbone
 from heatsplat.studies.options import listed
 from heatsplat.studies.published.figures import METRICS, TITLES, Figure, doubts, figures
@@ -57,7 +58,7 @@ class OnOthers(Run):
 
     def job(self, given: Sequence[str]) -> list[str]:
         """As of any run; what the command line says of the data set goes to its scenes (``data.each``)."""
-        keys = [text.lstrip("+~").partition("=")[0] for text in given]
+        keys = [key_of(text) for text in given]
         own = [key.startswith("data.") and not key.startswith("data.each.") and key not in OF_ALL for key in keys]
         moved = [text.replace("data.", "data.each.", 1) if to else text for text, to in zip(given, own, strict=True)]
         return super().job(moved)
@@ -285,7 +286,7 @@ def _recipe(
     """Overrides of a row, without those that the command line decides."""
     method, setting = row
     recipe = [*config["recipes"].get(method, [f"method={method}"]), *_protocol(config, setting, ablation)]
-    return [text for text in recipe if text.partition("=")[0] not in given]
+    return [text for text in recipe if key_of(text) not in given]
 
 
 def _wanted(config: Mapping[str, Any], data: Source, printed: Sequence[Figure]) -> list[str]:

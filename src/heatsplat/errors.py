@@ -1,0 +1,47 @@
+"""What is wrong with a setting or with input data, and checks that say so. Imports nothing heavy: every command begins here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from numbers import Real
+from typing import Any
+
+
+class SceneError(ValueError):
+    """Input data that cannot be used as it is. The message names the file, key or shape and the remedy."""
+
+
+def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueError] = ValueError) -> None:
+    """Raises ``error``, with the values that are known, where an option has another one."""
+    if value not in known:
+        raise error(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+
+
+def check_numbers(
+    name: str,
+    value: Any,
+    count: int | None = None,
+    error: type[ValueError] = ValueError,
+    above: float = -math.inf,
+) -> None:
+    """Raises ``error`` where a setting is no finite number ``above`` another, or with ``count`` no list of so many."""
+    listed = isinstance(value, Sequence) and not isinstance(value, str)
+    numbers = value if listed else [value]
+    shown = list(value) if listed else value
+    if not all(is_number(x) for x in numbers) or (count is None) == listed or (listed and len(numbers) != count):
+        wanted = "a number" if count is None else f"a list of {count} numbers"
+        raise error(f"{name} must be {wanted}, got {shown}")
+    if not all(x > above for x in numbers):
+        raise error(f"{name} must be above {above:g}, got {shown}")
+
+
+def check_count(name: str, value: Any, least: int = 1) -> None:
+    """Raises SceneError where an option is no whole number, or less than ``least``."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise SceneError(f"{name} must be a whole number, {least} or more, got {value}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a setting is a finite number: neither text nor true or false."""
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,160 @@
+"""What a user is told of an error that is theirs to mend, in a sentence in place of a traceback."""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import re
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.errors import CompactHydraException, InstantiationException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from heatsplat.composition import CONF, compose_unresolved, options_of
+from heatsplat.errors import SceneError
+from heatsplat.io.command_lines import as_dict, setting, typed
+from heatsplat.io.settings import walk
+
+# What a disk says that is full, may not be written to, or has a file where a folder is to be: no traceback helps.
+NO_PLACE = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room, or give a folder on another disk")
+NO_PLACE |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "nothing may be written there: give another folder")
+NO_PLACE |= dict.fromkeys(
+    (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
+)
+
+
+def explain(error: Exception, command: str, arguments: Sequence[str]) -> str | None:
+    """What is printed of an error that ended a command, or None where it is a mistake of ours, which needs its traceback.
+
+    Args:
+        error: of Hydra, which composes and builds, or of a job.
+        command: its name, such as "train".
+        arguments: what it was given.
+    """
+    if isinstance(error, CompactHydraException | OmegaConfBaseException):
+        return _of_composing(error, command, arguments)
+    if "group override must be a string" in str(error) and (nulled := _nulled(arguments)):
+        return f"{nulled}=null: a group takes the name of one of its options: {', '.join(options_of(nulled))}"
+    cause = expected(error)
+    return None if cause is None else sentence(cause)
+
+
+def expected(error: BaseException) -> BaseException | None:
+    """The error behind ``error`` that is the user's to mend and needs no traceback, or None."""
+    while error is not None:
+        if isinstance(error, SceneError | FileNotFoundError | ImportError | FloatingPointError):
+            return error
+        if isinstance(error, OSError) and error.errno in NO_PLACE:
+            return error
+        if isinstance(error, ValueError) and _raised_here(error):  # of a setting, once the scene is known
+            return error
+        error = error.__cause__
+    return None
+
+
+def sentence(error: BaseException) -> str:
+    """What is printed of an error that is the user's to mend."""
+    remedy = NO_PLACE.get(error.errno) if isinstance(error, OSError) else None
+    if remedy is None:
+        return f"{type(error).__name__}: {error}"
+    return f"{error.filename}: {error.strerror}; {remedy}" if error.filename else f"{error.strerror}; {remedy}"
+
+
+def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> str | None:
+    """What is printed of an error of Hydra, and of what it built; None for a mistake of ours."""
+    place = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+    cause = error.__cause__
+    if place and isinstance(cause, ValueError):
+        return f"{place[1]}: {cause}"
+    if place and isinstance(cause, TypeError) and _of_settings(cause):
+        return f"{place[1]}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
+    if place and cause is not None and _raised_here(cause) and expected(cause) is None:
+        return None
+    return "\n".join(filter(None, [str(error), str(cause or ""), _meant(error, command, arguments)]))
+
+
+def _raised_here(error: BaseException) -> bool:
+    """Whether code of this package raised an error, and not a library that it called."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return bool(frames) and frames[-1].f_globals.get("__name__", "").startswith("heatsplat.")
+
+
+def _of_settings(error: TypeError) -> bool:
+    """Whether a class or function did not take settings, or a constructor of ours itself stumbled over one."""
+    *_, last = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    called = last.f_globals.get("__name__", "").startswith("hydra.")  # and never entered
+    return called or (_raised_here(error) and last.f_code.co_name == "__init__")
+
+
+def _meant(error: Exception, command: str, arguments: Sequence[str]) -> str:
+    """ "Did you mean ...?" for a group's option or a key that there is not, or how a value is written that Hydra cannot read;
+    empty where nothing is like it."""
+    if isinstance(error, OverrideParseException):
+        return _quoted(error.override)
+    if ambiguous := re.match(r"Ambiguous value for argument '(.+)'\n", str(error)):
+        return _quoted(ambiguous[1])
+    if (missing := getattr(error, "missing_cfg_file", None)) and error.options:
+        group, _, option = missing.rpartition("/")
+        return _did_you_mean([f"{group}={near}" for near in difflib.get_close_matches(option, error.options, 3, 0.5)])
+    if unknown := re.search(r"Could not override '([^']+)'", str(error)):
+        return _of_unknown_key(unknown[1], command, arguments)
+    return ""
+
+
+def _did_you_mean(near: Sequence[str]) -> str:
+    return f"Did you mean {' or '.join(near)}?" if near else ""
+
+
+def _of_unknown_key(wrong: str, command: str, arguments: Sequence[str]) -> str:
+    """Keys like one that there is not, or what stands beside it; empty where nothing is like it."""
+    others = [text for text in arguments if not text.startswith(("-", wrong))]
+    try:
+        settings = OmegaConf.to_container(compose_unresolved(others, command))
+    except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
+        return ""
+    if inner := _of_dotted_name(settings, wrong, arguments):
+        return inner
+    keys = [*(key for key, _ in walk(settings)), *(path.name for path in Path(CONF).iterdir() if path.is_dir())]
+    parent, _, leaf = wrong.rpartition(".")
+    beside = {
+        name: key for key in keys for above, _, name in [key.rpartition(".")] if above == parent and name[0] != "_"
+    }
+    near = [beside[name] for name in difflib.get_close_matches(leaf, beside, 3)]
+    if not near and parent in keys:
+        return f"{parent} has {', '.join(sorted(beside)) or 'nothing to set'}"
+    return _did_you_mean(near or difflib.get_close_matches(wrong, keys, 3))
+
+
+def _of_dotted_name(settings: dict[str, Any], wrong: str, arguments: Sequence[str]) -> str:
+    """How a key is set whose name has dots in it, which a path cannot reach; empty where ``wrong`` looks like none."""
+    above, inside, rest = "", settings, wrong
+    while isinstance(inside.get(rest.partition(".")[0]), dict):
+        first, _, rest = rest.partition(".")
+        above, inside = f"{above}.{first}".lstrip("."), inside[first]
+    near = difflib.get_close_matches(rest, [name for name in inside if "." in name], 1)
+    value = as_dict(arguments).get(wrong, "...")
+    return f"{near[0]} is one name, dots and all: {typed(f'{above}={{{near[0]}:{value}}}')}" if near else ""
+
+
+def _quoted(override: str) -> str:
+    """How a setting is written whose value Hydra's grammar does not take as it stands, such as a path with a space."""
+    key, _, value = override.partition("=")
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+    if re.fullmatch(r"\[[^][{}'\"]*\]?", value):  # without its end where a shell took it apart at a space
+        words = [setting("", word.strip())[1:] for word in value.strip("[]").split(",") if word.strip()]
+        whole = ",".join([*words, *([] if value.endswith("]") else ["..."])])
+        return f"A list is one argument, and text with = or umlauts in it takes quotes: {typed(f'{key}=[{whole}]')}"
+    if not value or value[0] in "[{'\"":
+        return ""
+    return f"Text with spaces, commas, umlauts or brackets takes two pairs of quotes: {typed(setting(key, value))}"
+
+
+def _nulled(arguments: Sequence[str]) -> str | None:
+    """The configuration group that a command line sets to null, if there is one."""
+    given = (text.removesuffix("=null") for text in arguments if text.endswith("=null"))
+    return next((group for group in given if options_of(group)), None)

@@ -1,0 +1,43 @@
+"""Settings that are of no use are named, with what they must be."""
+
+import math
+
+import pytest
+
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option
+
+
+def test_an_option_that_there_is_not_is_told_those_that_there_are():
+    check_option("codec", "h264", ("auto", "h264"))
+    with pytest.raises(SceneError, match="^codec must be one of auto, h264, got 'h265'$"):
+        check_option("codec", "h265", ("auto", "h264"), SceneError)
+
+
+@pytest.mark.parametrize("wrong", ["x", "12", True, None, [1.0], math.nan, math.inf])
+def test_a_setting_that_is_no_number_is_named(wrong):
+    check_numbers("clip", 3)
+    with pytest.raises(ValueError, match="clip must be a number, got"):
+        check_numbers("clip", wrong)
+
+
+@pytest.mark.parametrize("wrong", [2.0, [1.0], [1, 2, 3], [1, "b"], "ab", [1, math.nan]])
+def test_a_setting_that_is_no_list_of_numbers_is_named(wrong):
+    check_numbers("bounds", (1, 2.5), 2)
+    with pytest.raises(ValueError, match="bounds must be a list of 2 numbers, got"):
+        check_numbers("bounds", wrong, 2)
+
+
+@pytest.mark.parametrize("wrong", [0, -1.5, [1, 0]])
+def test_a_setting_that_is_not_above_its_bound_is_named(wrong):
+    count = len(wrong) if isinstance(wrong, list) else None
+    check_numbers("fps", 1e-9, above=0)
+    with pytest.raises(ValueError, match="^fps must be above 0, got "):
+        check_numbers("fps", wrong, count, above=0)
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 1.5, "abc", None, True])
+def test_what_counts_nothing_is_named(wrong):
+    with pytest.raises(SceneError, match=r"^study\.trials must be a whole number, 1 or more, got "):
+        check_count("study.trials", wrong)
+    check_count("study.trials", 1)
+    check_count("study.seeds", 0, least=0)

@@ -1,0 +1,44 @@
+"""What a user is told of an error: a sentence in place of a traceback, where it is theirs to mend."""
+
+import errno
+import os
+
+import pytest
+from hydra.errors import ConfigCompositionException, OverrideParseException
+
+from heatsplat import composition
+from heatsplat.explanations import _quoted, expected, explain, sentence
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        ("study.overrides=[data.size=tiny, threads=1]", "\"study.overrides=['data.size=tiny','threads=1']\""),
+        ("study.overrides=[data.size=tiny,", "\"study.overrides=['data.size=tiny',...]\""),
+        ("study.scenes=[küche,flur]", "\"study.scenes=['küche',flur]\""),
+    ],
+)
+def test_a_list_is_told_its_quotes(wrong, meant):
+    assert _quoted(wrong).endswith(f" {meant}")
+    with pytest.raises(OverrideParseException):
+        composition.compose([wrong], "study")
+    assert _quoted("a=[x,[y=1]]") == _quoted("a=['b=c',d=e]") == ""
+
+
+@pytest.mark.parametrize("typed", ["lr_source", "lr_sorce"])
+def test_a_key_with_dots_in_its_name_is_told_as_it_can_be_typed(typed):
+    wrong = ["study=tune", f"study.cases.etgs.knobs.thermal.{typed}=[0.1,1]"]
+    with pytest.raises(ConfigCompositionException) as refused:
+        composition.compose(wrong, "study")
+    told, _, argument = explain(refused.value, "study", wrong).rpartition("\n")[2].partition(": ")
+    assert told == "thermal.lr_source is one name, dots and all"
+    assert argument == '"study.cases.etgs.knobs={thermal.lr_source:[0.1,1]}"'
+    knobs = composition.compose(["study=tune", argument.strip('"')], "study")["study"]["cases"]["etgs"]["knobs"]
+    assert knobs["thermal.lr_source"] == [0.1, 1] and len(knobs) == 3
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG, errno.EROFS, errno.EACCES])
+def test_a_disk_that_takes_no_file_needs_no_traceback(code):
+    error = OSError(code, os.strerror(code), "/read/only/run.log")
+    assert expected(error) is error and sentence(error).startswith("/read/only/run.log: ")
+    assert expected(OSError(errno.EIO, "broken")) is None
