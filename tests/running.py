@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from heatsplat.composition import compose, composed
+from heatsplat.composition import compose, compose_unresolved
 
 NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks.report.html=false")
 TINY = (
@@ -16,7 +16,7 @@ TINY = (
 
 def compose_run(output_dir: Path, *overrides: str, config_name: str = "train") -> DictConfig:
     """The configuration of ``python src/train.py OVERRIDES``, its interpolations not resolved; the same for any folder."""
-    return composed(overrides, config_name)
+    return compose_unresolved(overrides, config_name)
 
 
 def run(output_dir: Path, *overrides: str):

@@ -165,7 +165,7 @@ def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> N
 @_job
 def train(config: dict[str, Any], output_dir: Path) -> float | None:
     """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
-    from heatsplat.runs.run import complete
+    from heatsplat.runs.run import train_in
 
     if (chosen := HydraConfig.get().runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
@@ -174,7 +174,7 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)
-    return complete(config, output_dir).test.get("psnr")
+    return train_in(config, output_dir).test.get("psnr")
 
 
 def check_first(ckpt: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from heatsplat.composition import composed
+from heatsplat.composition import compose_unresolved
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -83,4 +83,4 @@ def test_its_keys_and_options_are_those_of_the_configuration(script, words):
         pytest.skip("the page that shows it adds the file first; tests/project/test_extending.py runs it")
     if "-m" in words or any(re.search(r"=[^\[{'\"]*,", word) for word in words):
         words = [re.sub(r"(=[^\[{,]*),.*", r"\1", word) for word in words if not word.startswith("hydra.")]
-    assert composed([word for word in words if not word.startswith("launcher=")], script) is not None
+    assert compose_unresolved([word for word in words if not word.startswith("launcher=")], script) is not None

@@ -26,7 +26,7 @@ from heatsplat.io.command_lines import keys_of
 from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_points
 from heatsplat.runs.device import device_of
 from heatsplat.runs.stepping import Stepper
-from heatsplat.runs.verdicts import filled
+from heatsplat.runs.verdicts import with_verdicts
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")
@@ -200,7 +200,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Prices:
+class RunCosts:
     """What runs cost here, and the best that seconds buy.
 
     Args:
@@ -268,16 +268,16 @@ def plan(
     """
     own, reasons = _of_method(points, method, cap_max is not None, free_decay)
     outlook = Outlook(own)
-    prices, train_s = Prices(outlook, pace, cap_max), asked_s - pace.spent_s
-    least = min(prices.cost(choice, MIN_STEPS) for choice in outlook.choices)
+    costs, train_s = RunCosts(outlook, pace, cap_max), asked_s - pace.spent_s
+    least = min(costs.cost(choice, MIN_STEPS) for choice in outlook.choices)
     if train_s < least:
         raise SceneError(
             f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
             f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
             "smaller (data.downscale=2, init.count=10000)."
         )
-    score, chosen, steps = prices.best(train_s)
-    better, more, longer = prices.best(train_s + asked_s)
+    score, chosen, steps = costs.best(train_s)
+    better, more, longer = costs.best(train_s + asked_s)
     if without := outlook.missing(chosen):
         reasons.append(f"this choice was not measured on {', '.join(without)}; what it gains elsewhere stands in there")
     measured = outlook.last(more)
@@ -290,19 +290,19 @@ def plan(
         calibration_s=round(pace.spent_s, 3),
         train_s=round(train_s, 3),
         steps=max(steps, MIN_STEPS),
-        cap=prices.cap(chosen.growth),
-        growth=prices.growth(chosen),
+        cap=costs.cap(chosen.growth),
+        growth=costs.growth(chosen),
         decay=chosen.decay if free_decay else None,
         expected_psnr=round(score, 2) if any(point.method == method for point in points) else None,
         twice_steps=longer,
-        twice_growth=prices.growth(more),
+        twice_growth=costs.growth(more),
         twice_gain_db=round(max(better - score, 0.0), 2),
         step_ms=round(1e3 * pace.step_s(pace.points), 3),
         reasons=tuple(reasons),
         settings=chosen.settings,
         points=pace.points,
         gaussian_us=round(1e6 * pace.per_gaussian_s, 6),
-        gaussians=round(prices.gaussians(chosen, steps), 1),
+        gaussians=round(costs.gaussians(chosen, steps), 1),
     )
 
 
@@ -386,7 +386,7 @@ def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
     overrides = config["overrides"]
     points = open_points(read_points(Path(config["budget_curves"] or CURVES_FILE)), config["name"], overrides)
     log.info("measuring what a step costs here")
-    module, seconds = filled(config)["module"], config["budget"]
+    module, seconds = with_verdicts(config)["module"], config["budget"]
     device = device_of(config["trainer"]["accelerator"], config["renderer"])
     pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
     cap_max = config["density"].get("cap_max")

@@ -30,7 +30,7 @@ from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import locked
 from heatsplat.runs.resume import completed, on_scene, resumed, stored_config
 from heatsplat.runs.trust import trusted
-from heatsplat.runs.verdicts import decided, filled
+from heatsplat.runs.verdicts import decided, with_verdicts
 from heatsplat.shots import UNSEEN, at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
 from heatsplat.training.loop import lean
@@ -77,10 +77,10 @@ def train(config: dict[str, Any], output_dir: Path | str | None = None) -> RunRe
         scene = scene_name("data", data.get("root"), data.get("scene"))
         output_dir = Path("outputs") / f"{config['name']}_{scene}" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     with locked(Path(output_dir)):
-        return complete(config, Path(output_dir))
+        return train_in(config, Path(output_dir))
 
 
-def complete(config: dict[str, Any], output_dir: Path) -> RunResults:
+def train_in(config: dict[str, Any], output_dir: Path) -> RunResults:
     """As ``train``, in a folder that is kept from other processes."""
     results = results_in(output_dir, config)
     if results is not None:
@@ -102,7 +102,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
     config = decided(config, data.scene)
     config = budgeted(config, data.scene)
     check_last_stage(config)
-    config = filled(config)
+    config = with_verdicts(config)
     config = completed(config, composed)
     module = build_module(config, output_dir)
     device = device_of(config["trainer"]["accelerator"], config["renderer"])

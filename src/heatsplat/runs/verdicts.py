@@ -31,7 +31,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     if config["effects"]["price"]:
 
         def maker(chosen: Mapping[str, Verdict]) -> Callable[[], Any]:
-            return lambda: build(filled(config | {"verdicts": assembly.verdicts_as_dicts(chosen, {})})["module"])
+            return lambda: build(with_verdicts(config | {"verdicts": assembly.verdicts_as_dicts(chosen, {})})["module"])
 
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
@@ -61,7 +61,7 @@ def decide_effects(effects: Mapping[str, Any], scene: SceneData) -> dict[str, Ve
     return assembly.reconcile(assembly.drop_impossible(seen, scene), assembly.explicit_choices(effects))
 
 
-def filled(config: dict[str, Any]) -> dict[str, Any]:
+def with_verdicts(config: dict[str, Any]) -> dict[str, Any]:
     """The configuration with thermal model, sensor and loss as its verdicts choose them; the same without verdicts."""
     if "verdicts" not in config:
         return config
