@@ -12,7 +12,7 @@ from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import SceneError, View, ViewSet
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import checked_unseen, shot_frames, sightings, warn_beyond_record, write_shot
+from heatsplat.shots import ShotFiles, checked_unseen, shot_frames, sightings, warn_beyond_record, write_shot
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
@@ -22,7 +22,9 @@ def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
     seen = torch.ones(height, width, dtype=torch.bool)
     seen[0] = False
     with caplog.at_level(logging.WARNING, "heatsplat"):
-        write_shot([({"recorded": torch.full((height, width, 1), 0.5)}, seen)], frames, scene, tmp_path, video=False)
+        write_shot(
+            [({"recorded": torch.full((height, width, 1), 0.5)}, seen)], frames, scene, ShotFiles(tmp_path, video=False)
+        )
     values = read_temperature(next(tmp_path.glob("tiff/*.tiff")))
     assert np.isnan(values[0]).all()
     assert np.allclose(values[1:], scene.thermal_range.to_celsius(0.5))
@@ -37,7 +39,7 @@ def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
     camera = frames[0].camera
     with caplog.at_level(logging.WARNING, "heatsplat"):
         images = {"recorded": torch.full((camera.height, camera.width, 1), 0.5)}
-        write_shot([(images, None)], frames, scene, tmp_path, video=False)
+        write_shot([(images, None)], frames, scene, ShotFiles(tmp_path, video=False))
     assert np.isfinite(read_temperature(next(tmp_path.glob("tiff/*.tiff")))).all()
     assert "no training view" not in caplog.text
 
@@ -56,7 +58,7 @@ def test_every_image_of_a_frame_has_files_of_its_own_and_one_range(tmp_path):
         for i in range(2)
     ]
     images = zip(shown, (None, None), strict=True)
-    written = write_shot(images, frames, scene, tmp_path, codec="mpeg4", figures="svg")
+    written = write_shot(images, frames, scene, ShotFiles(tmp_path, codec="mpeg4", figures="svg"))
     names = sorted({path.relative_to(tmp_path).parts[0] for path in written})
     films = ["video.mp4", "video_clean.mp4", "video_rgb.mp4"]
     assert names == ["figures", "frames.csv", "png", "png_clean", "png_rgb", "tiff", "tiff_clean", *films]
@@ -172,7 +174,7 @@ def test_images_of_one_name_have_files_of_their_own(tmp_path):
     frames = scene.train.frames
     camera = frames[0].camera
     images = [({"recorded": torch.full((camera.height, camera.width, 1), 0.1 * i)}, None) for i in range(3)]
-    write_shot(images, frames, scene, tmp_path, video=False)
+    write_shot(images, frames, scene, ShotFiles(tmp_path, video=False))
     assert sorted(path.stem for path in (tmp_path / "tiff").iterdir()) == ["left_1", "right_1", "right_2"]
     assert np.allclose(
         read_temperature(tmp_path / "tiff" / "right_1.tiff"), scene.thermal_range.to_celsius(0.1), atol=1e-4

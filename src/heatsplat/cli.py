@@ -217,7 +217,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.export.formats.base import checked_range
     from heatsplat.io.video import CODECS, encoder
-    from heatsplat.shots import check_shot, checked_unseen, shot_frames, warn_beyond_record, write_shot
+    from heatsplat.shots import ShotFiles, check_shot, checked_unseen, shot_frames, warn_beyond_record, write_shot
     from heatsplat.uncertainty import Uncertainty
 
     shot = {key: config[key] for key in ("trajectory", "time", "view")} | {"count": config["frames"]}
@@ -241,11 +241,13 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     images = (
         (trained.images(frame, names), None if keep else trained.seen(frame)) for frame in track(frames, "rendering")
     )
-    options = {key: config[key] for key in ("tiff", "png", "video", "fps", "range_c", "codec", "figures")}
+    kinds = {key: config[key] for key in ("tiff", "png", "video", "fps", "codec", "figures")}
+    uncertain = {}
     if config["uncertainty"]:
-        told = Uncertainty(trained.module)
-        options |= {"deviation": told.deviation, "widest": told.widest}
-    written = write_shot(images, frames, trained.scene, output_dir, **options)
+        uncertainty = Uncertainty(trained.module)
+        uncertain = {"deviation": uncertainty.deviation, "widest": uncertainty.widest}
+    files = ShotFiles(output_dir, **kinds)
+    written = write_shot(images, frames, trained.scene, files, config["range_c"], **uncertain)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 
 

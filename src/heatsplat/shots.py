@@ -6,17 +6,17 @@ import csv
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers, check_option
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
-from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible, write_figure, write_png
+from heatsplat.io.pictures import Bar, Panel, compose, image_panel, write_figure, write_png
 from heatsplat.io.quantities import moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
@@ -75,8 +75,7 @@ def check_shot(trajectory: str, time: float | Sequence[float] | None, view: int 
         raise SceneError(f"time must be a number of seconds or [start, end], got {list(time)}")
     if not isinstance(view, int | str):
         raise SceneError(f"view must be the whole number or the file name of a training frame, got {view}")
-    if not isinstance(count, int) or count < 1:
-        raise SceneError(f"frames must be a whole number, 1 or more, got {count}")
+    check_count("frames", count)
 
 
 def checked_times(time: float | Sequence[float]) -> list[float]:
@@ -177,18 +176,67 @@ def warn_beyond_record(scene: SceneData, frames: Sequence[Frame], assumption: st
     return bool(beyond)
 
 
+@dataclass
+class ShotFiles:
+    """The files of a shot: those of the kinds that are wanted are written, and their paths kept.
+
+    What belongs to an image has a ``suffix``: "" for the first of a frame, "_clean" for one of that name.
+
+    Args:
+        folder: where they lie.
+        tiff, png, video: which of them to write.
+        fps: images per second of a video.
+        codec: of videos (``io.video.video``).
+        figures: "pdf" or "svg" writes a figure for print of each frame, all its images in a row; None none.
+    """
+
+    folder: Path
+    tiff: bool = True
+    png: bool = True
+    video: bool = True
+    fps: float = 15.0
+    codec: str = "auto"
+    figures: str | None = None
+    written: list[Path] = field(default_factory=list, init=False)
+    videos: ExitStack = field(default_factory=ExitStack, init=False, repr=False)  # closes those that are open
+    _films: dict[str, Callable[[np.ndarray], None]] = field(default_factory=dict, init=False, repr=False)
+
+    def add(self, name: str) -> Path:
+        """The path of a file that is written now."""
+        self.written.append(self.folder / name)
+        return self.written[-1]
+
+    def add_values(self, suffix: str, stem: str, values: Tensor) -> None:
+        """Writes values [H, W] of a frame."""
+        if self.tiff:
+            write_temperature(self.add(f"tiff{suffix}/{stem}.tiff"), values)
+
+    def add_picture(self, suffix: str, stem: str, panel: Panel, moving: bool = True) -> None:
+        """Writes a picture of a frame, and adds it to its video where it is ``moving``."""
+        filmed = self.video and moving
+        if not (self.png or filmed):
+            return
+        picture = compose([panel])
+        if self.png:
+            write_png(self.add(f"png{suffix}/{stem}.png"), picture)
+        if filmed:
+            if suffix not in self._films:
+                path = self.add(f"video{suffix}.mp4")
+                self._films[suffix] = self.videos.enter_context(film(path, self.fps, self.codec))
+            self._films[suffix](picture)
+
+    def add_figure(self, stem: str, panels: Sequence[Panel], title: str) -> None:
+        """Writes a figure of a frame."""
+        if self.figures is not None:
+            write_figure(self.add(f"figures/{stem}.{self.figures}"), panels, title)
+
+
 def write_shot(
     images: Iterable[tuple[Mapping[str, Tensor], Tensor | None]],
     frames: Sequence[Frame],
     scene: SceneData,
-    output_dir: Path,
-    tiff: bool = True,
-    png: bool = True,
-    video: bool = True,
-    fps: float = 15.0,
+    files: ShotFiles,
     range_c: Sequence[float] | None = None,
-    codec: str = "auto",
-    figures: str | None = None,
     deviation: Callable[[Frame], Tensor] | None = None,
     widest: float = 1.0,
 ) -> list[Path]:
@@ -209,12 +257,8 @@ def write_shot(
             [H, W] bool (None: all).
         frames: of the shot.
         scene: that is shown.
-        output_dir: folder of the files.
-        tiff, png, video: which of them to write.
-        fps: images per second of the video.
+        files: which of them are wanted, and where.
         range_c: °C at the ends of the colours; None takes the scene's range.
-        codec: of videos (``io.video.video``).
-        figures: "pdf" or "svg" writes a figure for print of each frame, all its images in a row, into figures; None none.
         deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
             and png_uncertainty, also of what was not seen; None writes none.
         widest: of these, at the end of the colours.
@@ -225,10 +269,8 @@ def write_shot(
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     bar = Bar(low, high, "°C" if bounds else "")
     stems = _stems([frame.name for frame in frames])
-    written: list[Path] = []
     rows: list[tuple[str, float | None, float, float]] = []
-    with ExitStack() as open_videos:
-        films: dict[str, Callable[[np.ndarray], None]] = {}
+    with files.videos:
         for frame, (shown, seen) in zip(frames, images, strict=True):
             stem, share = stems[frame.name], 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
@@ -240,42 +282,20 @@ def write_shot(
             for number, (name, image) in enumerate(shown.items()):
                 suffix = f"_{name}" if number else ""
                 values = image if seen is None else image.where(seen[..., None], torch.nan)
-                if image.shape[-1] == 3:
-                    panel = Panel(visible(values), name)
-                else:
-                    values = (bounds.to_celsius(values) if bounds else values)[..., 0]
-                    panel = Panel(colorize(values, low, high), name, bar)
-                    if tiff:
-                        written.append(output_dir / f"tiff{suffix}" / f"{stem}.tiff")
-                        write_temperature(written[-1], values)
-                panels.append(panel)
-                if not (png or video):
-                    continue
-                picture = compose([replace(panel, title=f"{title}   {name}" if number else title)])
-                if png:
-                    written.append(output_dir / f"png{suffix}" / f"{stem}.png")
-                    write_png(written[-1], picture)
-                if video:
-                    if name not in films:
-                        written.append(output_dir / f"video{suffix}.mp4")
-                        films[name] = open_videos.enter_context(film(written[-1], fps, codec))
-                    films[name](picture)
+                panels.append(image_panel(values, name, bar, bounds))
+                if image.shape[-1] == 1:
+                    files.add_values(suffix, stem, (bounds.to_celsius(values) if bounds else values)[..., 0])
+                titled = replace(panels[-1], title=f"{title}   {name}" if number else title)
+                files.add_picture(suffix, stem, titled)
             if deviation is not None:
                 spread = deviation(frame)
-                ends = Bar(0.0, widest, bar.unit, DEVIATION)
-                panels.append(Panel(colorize(spread, 0.0, widest, DEVIATION), "uncertainty", ends))
-                if tiff:
-                    written.append(output_dir / "tiff_uncertainty" / f"{stem}.tiff")
-                    write_temperature(written[-1], spread)
-                if png:
-                    written.append(output_dir / "png_uncertainty" / f"{stem}.png")
-                    write_png(written[-1], compose([replace(panels[-1], title=f"{title}   uncertainty")]))
-            if figures is not None:
-                written.append(output_dir / "figures" / f"{stem}.{figures}")
-                write_figure(written[-1], panels, title)
-    written.append(output_dir / "frames.csv")
-    _write_table(written[-1], rows)
-    return written
+                panels.append(image_panel(spread[..., None], "uncertainty", Bar(0.0, widest, bar.unit, DEVIATION)))
+                files.add_values("_uncertainty", stem, spread)
+                titled = replace(panels[-1], title=f"{title}   uncertainty")
+                files.add_picture("_uncertainty", stem, titled, moving=False)
+            files.add_figure(stem, panels, title)
+    _write_table(files.add("frames.csv"), rows)
+    return files.written
 
 
 def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, float]]) -> None:

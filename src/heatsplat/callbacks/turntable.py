@@ -8,7 +8,7 @@ import pytorch_lightning as pl
 from PIL import Image
 
 from heatsplat.callbacks.images import scene_bounds
-from heatsplat.io.pictures import Bar, Panel, colorize, compose, visible
+from heatsplat.io.pictures import Bar, compose, image_panel
 from heatsplat.io.quantities import moment
 from heatsplat.shots import shot_frames
 
@@ -36,17 +36,12 @@ class Turntable(pl.Callback):
             frames = shot_frames(scene, "orbit", count=self.frames)
         except ValueError:  # all cameras on one line of sight
             frames = shot_frames(scene, "path", count=self.frames)
-        low, high = scene_bounds(scene, module.modality)
+        bar = Bar(*scene_bounds(scene, module.modality), "" if known is None else "°C")
         shown = []
         for frame in frames:
             image = module.predict(replace(frame, camera=frame.camera.within(self.size))).cpu()
             title = "" if frame.time_s is None else moment(frame.time_s)
-            if image.shape[-1] == 3:
-                panel = Panel(visible(image), title)
-            else:
-                values = (image if known is None else known.to_celsius(image))[..., 0]
-                panel = Panel(colorize(values, low, high), title, Bar(low, high, "" if known is None else "°C"))
-            shown.append(Image.fromarray(compose([panel])))
+            shown.append(Image.fromarray(compose([image_panel(image, title, bar, known)])))
         path = module.output_dir / TURNTABLE_FILE
         path.parent.mkdir(parents=True, exist_ok=True)
         options = {"quality": QUALITY, "method": 2, "duration": self.milliseconds, "loop": 0}

@@ -42,7 +42,7 @@ FIGURE_PANEL = 1.8  # inches of height of an image in print
 
 
 @cache
-def _lut(name: str) -> np.ndarray:
+def lut(name: str) -> np.ndarray:
     """The 256 colours of a matplotlib map, uint8 [256, 3]."""
     return matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
 
@@ -83,7 +83,7 @@ def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> n
     values = np.asarray(values, dtype=np.float64)
     known = np.isfinite(values)
     unit = (np.where(known, values, low) - low) / (high - low) if high > low else np.full(values.shape, 0.5)
-    colors = _lut(colormap)[(unit.clip(0, 1) * 255).round().astype(np.uint8)]
+    colors = lut(colormap)[(unit.clip(0, 1) * 255).round().astype(np.uint8)]
     colors[~known] = _hatching(values.shape)[~known]
     return colors
 
@@ -92,6 +92,21 @@ def _hatching(shape: tuple[int, ...]) -> np.ndarray:
     """Diagonal stripes, uint8 RGB [H, W, 3] (or [N, 1, 3] and the like), for pixels of which nothing is known."""
     stripes = sum(np.indices(shape)) // HATCH % 2
     return np.array(UNKNOWN, dtype=np.uint8)[stripes]
+
+
+def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | None = None) -> Panel:
+    """An image [H, W, C] under a title: with C = 3 in its own colours, with C = 1 in those of a bar, which stands beside it.
+
+    Args:
+        image: in [0, 1], or with C = 1 and no range in the unit of the bar; what is NaN is hatched.
+        title: of the panel.
+        bar: the values at the ends of the colours, in °C with a range.
+        thermal_range: temperatures of 0 and 1.
+    """
+    if image.shape[-1] == 3:
+        return Panel(visible(image), title)
+    values = (image if thermal_range is None else thermal_range.to_celsius(image))[..., 0]
+    return Panel(colorize(values, bar.low, bar.high, bar.colormap), title, bar)
 
 
 def comparison_panels(
@@ -218,7 +233,7 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
         if panel.bar:
             left = x + width + 6
             ramp = np.broadcast_to(
-                _lut(panel.bar.colormap)[np.linspace(255, 0, height).round().astype(int), None], (height, BAR, 3)
+                lut(panel.bar.colormap)[np.linspace(255, 0, height).round().astype(int), None], (height, BAR, 3)
             )
             page.paste(Image.fromarray(np.ascontiguousarray(ramp)), (left, y))
             draw.rectangle((left - 1, y - 1, left + BAR, y + height), outline=(170, 170, 170))

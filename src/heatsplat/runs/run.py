@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.composition import build, scene_name
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_option
 from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
@@ -135,7 +135,7 @@ def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]
     return [without_idle_hooks(callback) for callback in build(on).values()]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trained:
     """A trained scene, to look at from anywhere and at any time.
 
@@ -150,7 +150,7 @@ class Trained:
     module: SplatTraining
     data: Any
     checkpoint: dict[str, Any]
-    _warned: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
+    _warned: bool = field(default=False, init=False, repr=False, compare=False)  # of moments beyond the record
 
     @property
     def scene(self) -> SceneData:
@@ -171,12 +171,10 @@ class Trained:
             SceneError: the scene's weather is not known at that time.
             ValueError: ``unseen`` is neither.
         """
-        if unseen not in UNSEEN:
-            raise ValueError(f"unseen must be one of {', '.join(UNSEEN)}, got '{unseen}'")
+        check_option("unseen", unseen, UNSEEN)
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
-        if not self._warned and warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record):
-            self._warned.add("beyond the record")
+        self._warned = self._warned or warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record)
         image = self.module.predict(frame)[..., 0].cpu()
         image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
         return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from torch import Tensor
 from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.export.basis import steps_of
 from heatsplat.export.snapshot import TOLERANCE_C, TOLERANCE_UNIT, Layer, Snapshot
+from heatsplat.io.pictures import lut
 from heatsplat.io.quantities import words_and_unit
 
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
@@ -101,7 +101,7 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
         "cameras": _cameras(module, seen, cameras, block),
         "probes": [] if scene.probes is None else scene.probes.tolist(),
         "effects": sorted(module.thermal.effects() | module.sensor.effects()),
-        "maps": {name: block.add(_colours(name), "u1") for name in COLORMAPS},
+        "maps": {name: block.add(lut(name), "u1") for name in COLORMAPS},
     }
     return header, block.content
 
@@ -113,10 +113,6 @@ def _moments(scene: SceneData) -> list[tuple[str, float]]:
     known = {frame.name: frame.time_s for part in views for frame in part.frames if frame.time_s is not None}
     ordered = sorted(known.items(), key=lambda moment: (moment[1], moment[0]))
     return [ordered[i] for i in evenly_spread(len(ordered), MOMENTS)]
-
-
-def _colours(name: str) -> np.ndarray:
-    return matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
 
 
 def _layer(layer: Layer, block: Block) -> dict[str, Any]:
@@ -180,8 +176,8 @@ def _cameras(module: Any, seen: Snapshot, count: int, block: Block) -> list[dict
         view = scene.train[i]
         camera, frame = view.camera, view.frame
         low, high = seen.limits
-        shrink = max(1.0, max(camera.width, camera.height) / THUMBNAIL)
-        size = max(1, round(camera.height / shrink)), max(1, round(camera.width / shrink))
+        small = camera.within(THUMBNAIL)
+        size = small.height, small.width
         entry: dict[str, Any] = {
             "name": frame.name,
             "time": frame.time_s,
