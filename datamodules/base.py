@@ -16,7 +16,7 @@ import numpy as np
 import pytorch_lightning as pl
 from torch.utils.data import DataLoader
 
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
@@ -74,8 +74,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         upsample: str | None = None,
     ) -> None:
         super().__init__()
-        if mask_keep not in ("white", "black"):
-            raise SceneError(f"data.mask_keep must be white or black, got {mask_keep!r}")
+        check_option("data.mask_keep", mask_keep, ("white", "black"), SceneError)
         self.root = root
         self.degrade, self.upsample = degrade, upsample
         self.scene_name = scene

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option
 from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.file_names import same_files
@@ -88,8 +88,7 @@ class Colmap(SceneDataModule):
         **shared: Any,
     ) -> None:
         super().__init__(**shared)
-        if radiometric not in ("auto", "never"):
-            raise SceneError(f"data.radiometric must be auto or never, got {radiometric!r}")
+        check_option("data.radiometric", radiometric, ("auto", "never"), SceneError)
         if images is None and (rgb is None or raw is not None):
             raise SceneError("data.images=null is for photos alone: give their folder as data.rgb, and no data.raw")
         if bounds_c is not None and len(bounds_c) != 2:

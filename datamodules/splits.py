@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.datamodules.side_files import json_object, read_text, shortened
 
 Positions = tuple[list[int], list[int]]
@@ -144,8 +144,7 @@ class SplitRule:
     RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list")
 
     def __post_init__(self) -> None:
-        if self.rule not in self.RULES:
-            raise SceneError(f"data.split={self.rule} is no split; choose one of {', '.join(self.RULES)}")
+        check_option("data.split", self.rule, self.RULES, SceneError)
         if self.rule == "block" and not (0 < self.fraction < 1 and 0 <= self.position <= 1):
             raise SceneError(
                 "data.split=block needs data.split_fraction in (0, 1) and data.split_position in [0, 1], "

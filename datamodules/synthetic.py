@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneData, SceneError, View, ViewSet
+from heatsplat.contracts import SceneData, SceneError, View, ViewSet, check_option
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.drawn import DRAWN, Drawn, drawn
@@ -107,8 +107,7 @@ class Synthetic(SceneDataModule):
             raise SceneError(f"data.weather={weather}: scene '{scene}' {why}; leave it null")
         if weather is not None and weather not in SKIES:
             raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
-        if size not in SIZES:
-            raise SceneError(f"data.size={size}: choose one of {', '.join(SIZES)}")
+        check_option("data.size", size, SIZES, SceneError)
         if frames is not None and frames < 2:
             raise SceneError(f"data.frames={frames}: a scene needs at least 2 frames, one to train and one to test")
         usual = self.drawn or Drawn(None, SIZES[size].frames, noise_k=0.05, bits=16, pose_error_px=0.0)

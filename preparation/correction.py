@@ -189,9 +189,7 @@ def correct_scene(
             "the scale of the scene is not known, and the air between camera and surface counts in metres: give "
             "correct.metres_per_unit (poses with GPS have 1)"
         )
-    check_numbers("correct.metres_per_unit", metres_per_unit, error=SceneError)
-    if not metres_per_unit > 0:
-        raise SceneError(f"correct.metres_per_unit must be above 0, got {metres_per_unit}")
+    check_numbers("correct.metres_per_unit", metres_per_unit, error=SceneError, above=0)
     if index is not None:
         check_numbers("correct.refractive_index", index, error=SceneError)
     if index is not None and not index > 1:

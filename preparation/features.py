@@ -50,7 +50,7 @@ class Sift(Features):
 
     def __post_init__(self) -> None:
         for name in ("most", "peak", "ratio"):
-            check_positive(f"poses.features.{name}", getattr(self, name))
+            check_numbers(f"poses.features.{name}", getattr(self, name), error=SceneError, above=0)
 
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
         options = pycolmap.FeatureExtractionOptions(num_threads=1)
@@ -84,7 +84,7 @@ class Aliked(Features):
 
     def __post_init__(self) -> None:
         """Says before any work is done what is missing: SceneError for weights, ImportError for an old kornia."""
-        check_positive("poses.features.most", self.most)
+        check_numbers("poses.features.most", self.most, error=SceneError, above=0)
         try:
             from kornia.feature import ALIKED, LightGlue  # noqa: F401
         except ImportError as error:
@@ -149,13 +149,6 @@ class Aliked(Features):
         one, other = (_weights_folder() / name for name in WEIGHTS)
         detector = ALIKED("aliked-n16", max_num_keypoints=self.most)
         return _filled(detector, one), _filled(LightGlue(None, input_dim=DESCRIPTOR, weights=None), other)
-
-
-def check_positive(name: str, value: Any) -> None:
-    """Raises SceneError where a setting is no number above 0."""
-    check_numbers(name, value, error=SceneError)
-    if not value > 0:
-        raise SceneError(f"{name} must be above 0, got {value}")
 
 
 def _weights_folder() -> Path:

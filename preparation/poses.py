@@ -28,7 +28,7 @@ from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.io.files import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
-from heatsplat.preparation.features import Features, check_positive
+from heatsplat.preparation.features import Features
 from heatsplat.preparation.frame import Frame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
@@ -94,13 +94,11 @@ class FindPoses:
         check_option("poses.camera_model", self.camera_model, MODELS, SceneError)
         for name in ("focal_px", "pixel_um", "overlap", "clip"):
             if name != "focal_px" or self.focal_px is not None:
-                check_positive(f"poses.{name}", getattr(self, name))
+                check_numbers(f"poses.{name}", getattr(self, name), error=SceneError, above=0)
         check_numbers("poses.all_pairs", self.all_pairs, error=SceneError)
         if self.all_pairs < 0:
             raise SceneError(f"poses.all_pairs must be 0 or above, got {self.all_pairs}")
-        check_numbers("poses.gps_sd_m", self.gps_sd_m, 2, SceneError)
-        for value in self.gps_sd_m:
-            check_positive("poses.gps_sd_m", value)
+        check_numbers("poses.gps_sd_m", self.gps_sd_m, 2, SceneError, above=0)
 
     def __call__(self, frames: list[Frame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns what was found, what was not, and why.

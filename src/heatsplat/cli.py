@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.composition import CONF, build, options_of, plain, run_of
-from heatsplat.errors import SceneError, check_numbers, check_option
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option
 from heatsplat.explanations import expected, explain, sentence
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
@@ -278,11 +278,11 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
 @_job
 def view(config: dict[str, Any], output_dir: Path) -> None:
     """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
-    from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
+    from heatsplat.viewer.page import FILE, write_viewer
 
-    cameras = checked_cameras(config["cameras"])
+    check_count("cameras", config["cameras"])
     trained = _load(config, output_dir)
-    path = write_viewer(trained.module, output_dir / FILE, cameras)
+    path = write_viewer(trained.module, output_dir / FILE, config["cameras"])
     log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
 
 

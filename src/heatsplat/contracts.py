@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 # For all who need torch anyway; who does not imports heatsplat.errors.
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option  # noqa: F401
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option, is_number  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
 

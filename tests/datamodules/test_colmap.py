@@ -328,9 +328,9 @@ def test_bounds_that_are_no_json_are_refused(tmp_path):
 def test_bad_options_are_refused():
     with pytest.raises(SceneError, match=r"data.bounds_c needs two values \[min, max\] in °C, got \[1.0\]"):
         Colmap(bounds_c=[1.0])
-    with pytest.raises(SceneError, match="data.radiometric must be auto or never"):
+    with pytest.raises(SceneError, match="data.radiometric must be one of auto, never"):
         Colmap(radiometric="yes")
-    with pytest.raises(SceneError, match="data.mask_keep must be white or black"):
+    with pytest.raises(SceneError, match="data.mask_keep must be one of white, black"):
         Colmap(mask_keep="grey")
     with pytest.raises(SceneError, match="data.raw_scale must be positive"):
         Colmap(raw_scale=0.0)

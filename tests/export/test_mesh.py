@@ -52,7 +52,7 @@ def test_a_mesh_is_in_the_coordinates_of_the_data_set(cooling, tmp_path):
 
 @pytest.mark.parametrize("views", [0, 1.5, "abc"])
 def test_what_is_no_number_of_views_is_refused(views):
-    with pytest.raises(SceneError, match=f"what.views must be a whole number, 1 or more, or null for all, got {views}"):
+    with pytest.raises(SceneError, match=f"what.views must be a whole number, 1 or more, got {views}"):
         Mesh("given.obj", views=views)
 
 

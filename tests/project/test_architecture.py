@@ -25,7 +25,7 @@ ALLOWED = {
     "thermal": {"contracts", "geometry", "physics", "same_bits", "splats", "kernels"},
     "density": {"contracts", "geometry", "physics", "same_bits", "splats"},
     "effects": {"contracts", "geometry", "physics", "kernels", "training"},
-    "io": {"contracts", "metrics", "physics", "geometry", "heatsplat"},
+    "io": {"contracts", "errors", "metrics", "physics", "geometry", "heatsplat"},
     "callbacks": {"contracts", "geometry", "metrics", "physics", "io", "heatsplat", "shots", "uncertainty", "viewer"},
     "export": {"contracts", "geometry", "io", "physics", "renderers", "shots", "uncertainty"},
     "viewer": {"contracts", "export", "io"},

@@ -356,7 +356,7 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
         "hydra.sweeper.paper={of:etgs,table:'4',scenes:[average]}",
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
-    assert "data.size=huge: choose one of" in succeeds(command, code=1, HYDRA_FULL_ERROR="0")
+    assert "data.size must be one of" in succeeds(command, code=1, HYDRA_FULL_ERROR="0")
     table = (tmp_path / "sweep" / "table.md").read_text()
     assert "| a | 1 |" in table and "| b | 1 |" in table and "40.59" in table
     assert "- c on cooling:" in table and "data.size=huge" in table

@@ -189,7 +189,7 @@ def test_better_is_what_all_seeds_say_by_more_than_they_differ(default, best, ve
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"score": "speed"}, "study.score=speed"),
+        ({"score": "speed"}, "study.score must be one of .*, got 'speed'"),
         ({"trials": 0}, "study.trials must be a whole number, 1 or more, got 0"),
         ({"trials": "abc"}, "study.trials must be a whole number, 1 or more, got abc"),
         ({"search_steps": 0}, "study.search_steps must be a whole number"),

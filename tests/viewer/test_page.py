@@ -19,7 +19,7 @@ from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
 from heatsplat.runs.run import load
 from heatsplat.viewer import page as pages
-from heatsplat.viewer.page import FILE, checked_cameras, write_viewer
+from heatsplat.viewer.page import FILE, write_viewer
 
 ActionChains = pytest.importorskip(
     "selenium.webdriver", reason="selenium is not installed (pip install -e '.[dev]')"
@@ -486,4 +486,4 @@ def test_narrow_screens_have_everything_too(folder):
 @pytest.mark.parametrize("cameras", ["abc", 2.5, -1])
 def test_what_is_no_number_of_cameras_is_refused(cameras):
     with pytest.raises(SceneError, match=f"cameras must be a whole number, 1 or more.*got {cameras}"):
-        checked_cameras(cameras)
+        ViewerPage(cameras)

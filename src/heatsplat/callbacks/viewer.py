@@ -6,7 +6,8 @@ import logging
 
 import pytorch_lightning as pl
 
-from heatsplat.viewer.page import CAMERAS, FILE, checked_cameras, write_viewer
+from heatsplat.contracts import check_count
+from heatsplat.viewer.page import CAMERAS, FILE, write_viewer
 
 log = logging.getLogger("heatsplat")
 
@@ -24,7 +25,8 @@ class ViewerPage(pl.Callback):
     """
 
     def __init__(self, cameras: int = CAMERAS) -> None:
-        self.cameras = checked_cameras(cameras)
+        check_count("cameras", cameras)
+        self.cameras = cameras
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if module.thermal.stays_here:

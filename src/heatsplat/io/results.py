@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from heatsplat.errors import is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.metrics.definitions import DEFINITIONS
 
@@ -108,15 +109,11 @@ class RunResults:
                 raise ValueError(f"sections are missing or no mappings: {', '.join(lacking)}")
             for section in ("test", "cost"):
                 for name, value in content[section].items():
-                    if value is not None and not (_is_number(value) and math.isfinite(value)):
+                    if value is not None and not is_number(value):
                         raise ValueError(f"{section}.{name} is neither a number nor null: {value!r}")
         except (ValueError, TypeError) as error:  # of JSON and UTF-8, too
             raise ValueError(f"{path} is not a metrics.json of heatsplat: {error}") from error
         return cls(**{name: content[name] for name in sections})
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _plain(value: Any, path: str, reasons: dict[str, str]) -> Any:

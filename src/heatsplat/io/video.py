@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from heatsplat.errors import check_option
+
 log = logging.getLogger("heatsplat")
 
 CODECS = ("auto", "h264", "mpeg4")
@@ -74,8 +76,7 @@ def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callab
     Raises:
         ImportError, ValueError: as ``video``.
     """
-    if codec not in CODECS:
-        raise ValueError(f"codec must be one of {', '.join(CODECS)}, got '{codec}'")
+    check_option("codec", codec, CODECS)
     if codec == "mpeg4":
         return _opencv
     try:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_count
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
 from heatsplat.io.settings import walk
@@ -84,8 +84,7 @@ def check_last_stage(config: Mapping[str, Any]) -> None:
 def _check_ranges(config: Mapping[str, Any]) -> None:
     check_threads(config["threads"])
     for key, least in (("max_steps", 1), ("seed", 0)):
-        if not isinstance(config[key], int) or config[key] < least:
-            raise SceneError(f"{key} must be a whole number, {least} or more, got {config[key]}")
+        check_count(key, config[key], least)
     for key, rate in _rates(config):
         if isinstance(rate, int | float) and not rate >= 0:
             raise SceneError(f"{key} is a learning rate and must be 0 or more, got {rate}")

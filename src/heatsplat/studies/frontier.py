@@ -11,12 +11,11 @@ from __future__ import annotations
 import io
 import itertools
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
@@ -135,7 +134,6 @@ def checked_levels(name: str, levels: Any) -> list[float]:
     """
     numbers = list(levels) if isinstance(levels, (list, tuple)) else [None]
     for value in numbers:
-        good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-        if not good:
+        if not is_number(value) or value <= 0:
             raise SceneError(f"study.{name}={levels}: give positive numbers in brackets, such as [1, 2]; [] for none")
     return sorted({float(value) for value in numbers})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneError, ThermalRange, check_option
+from heatsplat.contracts import SceneError, ThermalRange, check_option, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.io.tables import markdown_table, number, write_csv
@@ -149,8 +148,7 @@ def read_submission(folder: Path) -> dict[str, Any]:
             raise SceneError(f'{path}: scenes.{scene} is {cost!r}; what it cost, {{"seconds": ...}}, or null')
         for key, value in (cost or {}).items():
             check_option(f"{path}: each key of scenes.{scene}", key, COSTS, SceneError)
-            counts = isinstance(value, int | float) and not isinstance(value, bool)
-            if value is not None and not (counts and math.isfinite(value) and value >= 0):
+            if value is not None and not (is_number(value) and value >= 0):
                 raise SceneError(f"{path}: scenes.{scene}.{key} is {value!r}; a number of 0 or more, or null")
     return told
 

@@ -66,9 +66,7 @@ def run(
     scenes, held_out = filled("study.scenes", scenes), filled("study.held_out", held_out)
     for key, value in {"factor": factor, "steps": steps, "batch": batch, "patch": patch}.items():
         check_count(f"study.{key}", value)
-    check_numbers("study.rate", rate, error=SceneError)
-    if rate <= 0:
-        raise SceneError(f"study.rate must be above 0, or nothing is learned, got {rate}")
+    check_numbers("study.rate", rate, error=SceneError, above=0)
     check_network(network)
     if both := sorted(set(scenes) & set(held_out)):
         raise SceneError(f"study.held_out names scenes that the network learns from: {', '.join(both)}")

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
@@ -73,8 +73,7 @@ def run(
     """
     output_dir, reference, overrides = Path(output_dir), listed(reference), listed(overrides)
     recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
-    if clock not in CLOCKS:
-        raise SceneError(f"study.clock={clock}: give one of {', '.join(CLOCKS)}")
+    check_option("study.clock", clock, CLOCKS, SceneError)
     if "max_steps" not in as_dict(reference):
         raise SceneError(f"study.reference={reference}: give its length too, such as max_steps=30000")
     if runs is None:

@@ -8,14 +8,13 @@ finished, and goes on.
 from __future__ import annotations
 
 import logging
-import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.contracts import SceneError, check_numbers, check_option, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number, write_csv
@@ -208,8 +207,7 @@ def _checked(
     cases: Mapping[str, Mapping[str, Any]], methods: Sequence[str], trials: int, seeds: Sequence[int], score: str
 ) -> dict[str, Mapping[str, Any]]:
     """The cases asked for."""
-    if score not in SCORES:
-        raise SceneError(f"study.score={score}: give one of {', '.join(SCORES)}")
+    check_option("study.score", score, SCORES, SceneError)
     check_count("study.trials", trials)
     counted("study.seeds", seeds, least=0)
     if SEARCH_SEED in seeds or len({*seeds}) < len(seeds):
@@ -236,7 +234,7 @@ def _distribution(method: str, key: str, values: Any) -> Any:
     distributions = _optuna().distributions
     if isinstance(values, Mapping) and list(values) == ["among"] and listed(values["among"]):
         return distributions.CategoricalDistribution(listed(values["among"]))
-    if isinstance(values, list | tuple) and len(values) == 2 and all(_is_number(value) for value in values):
+    if isinstance(values, list | tuple) and len(values) == 2 and all(is_number(value) for value in values):
         low, high = values
         if low < high:
             whole = isinstance(low, int) and isinstance(high, int)
@@ -245,10 +243,6 @@ def _distribution(method: str, key: str, values: Any) -> Any:
     raise SceneError(
         f"study.cases.{method}.knobs.{key}={values}: give [lowest, highest], or {{among: [values]}}, such as [1e-4, 1e-2]"
     )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _optuna() -> Any:

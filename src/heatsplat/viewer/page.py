@@ -10,7 +10,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import check_count
 from heatsplat.export.snapshot import snapshot
 from heatsplat.io.files import write_atomically
 from heatsplat.viewer.payload import payload
@@ -19,17 +19,6 @@ FILE = "viewer.html"
 CAMERAS = 36  # in a page: their images take 1 to 2 MB
 SOURCES = Path(__file__).resolve().parent / "page"
 SCRIPTS = ("payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "viewer.js")
-
-
-def checked_cameras(count: int) -> int:
-    """The number of training cameras of a page.
-
-    Raises:
-        SceneError: it is no whole number, or less than one; the page stands at the first when it opens.
-    """
-    if not isinstance(count, int) or count < 1:
-        raise SceneError(f"cameras must be a whole number, 1 or more: the page opens at a training camera; got {count}")
-    return count
 
 
 def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
@@ -43,7 +32,8 @@ def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
     Raises:
         SceneError: fewer than one camera, or Gaussians that cannot be told apart from the model (``snapshot``).
     """
-    header, block = payload(module, snapshot(module), checked_cameras(cameras))
+    check_count("cameras", cameras)  # the page opens at the first
+    header, block = payload(module, snapshot(module), cameras)
     write_atomically(path, page(header, block))
     return path
 

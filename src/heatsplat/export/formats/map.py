@@ -61,11 +61,11 @@ class Map(Format):
         uncertainty: bool = False,
         against: str | None = None,
     ) -> None:
-        for name, value, count in (("resolution", resolution, None), ("bounds", bounds, 4), ("above", above, 3)):
+        if resolution is not None:
+            check_numbers("what.resolution", resolution, error=SceneError, above=0)
+        for name, value, count in (("bounds", bounds, 4), ("above", above, 3)):
             if value is not None:
                 check_numbers(f"what.{name}", value, count, SceneError)
-        if resolution is not None and not resolution > 0:
-            raise SceneError(f"what.resolution must be above 0, got {resolution}")
         if bounds is not None and not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
             raise SceneError(f"what.bounds must be [west, south, east, north], got {list(bounds)}")
         if above is not None and (not any(above) or gps not in (None, AUTO)):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
-from heatsplat.contracts import Frame, SceneError, evenly_spread
+from heatsplat.contracts import Frame, SceneError, check_count, evenly_spread
 from heatsplat.export.formats.base import Format, checked_range, optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.coverage import OPEN, surface_depth
@@ -47,8 +47,8 @@ class Mesh(Format):
     ) -> None:
         if mesh is None:
             raise SceneError("which mesh? Give what.mesh=FILE, in the coordinates of the scene")
-        if views is not None and not (isinstance(views, int) and views >= 1):
-            raise SceneError(f"what.views must be a whole number, 1 or more, or null for all, got {views}")
+        if views is not None:
+            check_count("what.views", views)
         self.mesh, self.views, self.two_sided = Path(mesh).expanduser(), views, two_sided
         self.colormap, self.range_c = colormap, checked_range(range_c)
 
