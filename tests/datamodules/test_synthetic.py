@@ -326,7 +326,7 @@ def test_config_makes_the_module():
     ("options", "message"),
     [
         ({"scene": "boiling"}, "data.scene=boiling: .* choose one of static, cooling, heated"),
-        ({"size": "huge"}, "data.size=huge: choose one of tiny, demo, benchmark, large"),
+        ({"size": "huge"}, "data.size must be one of tiny, demo, benchmark, large"),
         ({"frames": 1}, "data.frames=1: a scene needs at least 2 frames"),
         ({"noise_k": -0.1}, "data.noise_k=-0.1"),
         ({"noise_k": float("nan")}, "data.noise_k=nan"),
