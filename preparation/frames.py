@@ -18,7 +18,14 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.exif import exif_in
-from heatsplat.datamodules.formats.images import SUFFIXES, colour_levels, pages_of, read_image, to_grey
+from heatsplat.datamodules.formats.images import (
+    PSEUDO_COLOUR_LEVELS,
+    SUFFIXES,
+    colour_levels,
+    pages_of,
+    read_image,
+    to_grey,
+)
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
@@ -26,8 +33,6 @@ from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
 from heatsplat.preparation.meaning import Meaning
-
-__all__ = ["Attitude", "CameraInfo", "Frame", "Position", "Reading", "Recording", "read_frames", "read_recording"]
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +42,6 @@ RECORDS = (".fff", *SEQUENCES)
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
 DJI_CLOCK = re.compile(r"DJI_(\d{14})_(?=\d+)")
 SAME_EXPOSURE_S = 5.0  # by which the clocks in the names of one exposure's files may differ
-GREY_LEVELS = 4.0  # colour images below are greys that were stored as colours
 # Columns of a table that make up a position and an attitude.
 NUMBERS = {
     Position: ("latitude_deg", "longitude_deg", "altitude_m", "above_takeoff_m"),
@@ -74,11 +78,6 @@ class Recording:
 
     frames: list[Frame]
     notes: list[str]
-
-
-def read_frames(folder: Path, reading: Reading | None = None) -> list[Frame]:
-    """The thermal frames of all files in a folder (``read_recording``, without its notes)."""
-    return read_recording(folder, reading).frames
 
 
 def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
@@ -175,7 +174,7 @@ def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
 def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
     """Greys that were stored as colours count as greys. Raises SceneError where the pictures are pseudo-colours or photos."""
     colour = kinds.get("colour", [])
-    if colour and all(colour_levels(read_image(path, 0)[..., :3]) < GREY_LEVELS for path in colour[:3]):
+    if colour and all(colour_levels(read_image(path, 0)[..., :3]) < PSEUDO_COLOUR_LEVELS for path in colour[:3]):
         return {"grey": colour}
     if colour:
         raise SceneError(

@@ -75,7 +75,6 @@ BODIES = {
     "limestone": _stone(LIMESTONE),
     "granite": _stone(GRANITE),
 }
-DEFECTS = ("thin insulation", "no insulation", "slab edge")
 
 
 def u_value(body: Body) -> float:

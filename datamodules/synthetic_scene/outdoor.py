@@ -33,8 +33,7 @@ from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.training.rng import generator_for
 
 SITE = Site(latitude=47.0, longitude=9.0, altitude_m=500.0)
-START_UTC = "2024-07-11T00:00:00+00:00"
-START_UTC_S = 1720656000.0
+START_UTC_S = 1720656000.0  # 2024-07-11, 0:00 UTC
 DURATION_S = 2.0 * DAY_S
 SAMPLE_S = 600.0
 NIGHT_S = (19.7 * 3600.0, 27.4 * 3600.0)  # from sunset to sunrise

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import write_images
+from recordings import read_frames, write_images
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
@@ -19,7 +19,7 @@ from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.doctor import check
 from heatsplat.preparation.features import Sift
 from heatsplat.preparation.frame import CameraInfo, Frame
-from heatsplat.preparation.frames import read_frames, read_recording
+from heatsplat.preparation.frames import read_recording
 from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 

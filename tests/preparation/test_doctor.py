@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from camera_files import with_segment
 from PIL import Image
+from recordings import read_frames
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
@@ -17,7 +18,7 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
 from heatsplat.preparation.doctor import _photo_times, check, section
 from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import Reading, read_frames, taken_at
+from heatsplat.preparation.frames import Reading, taken_at
 from heatsplat.preparation.meaning import Meaning
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from camera_files import dji_jpeg, fff, raw_for, temperatures, with_segment
-from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
+from recordings import START, STATED, flir_frame, read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
-from heatsplat.preparation.frames import Reading, read_frames, read_recording
+from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -1,11 +1,11 @@
 import cv2
 import numpy as np
 import pytest
-from recordings import write_flir, write_images
+from recordings import read_frames, write_flir, write_images
 
 from heatsplat.preparation import report
 from heatsplat.preparation.conditions import Given, Uncertainty
-from heatsplat.preparation.frames import Reading, read_frames
+from heatsplat.preparation.frames import Reading
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.writer import Writer
 

@@ -6,12 +6,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from recordings import write_flir, write_images
+from recordings import read_frames, write_flir, write_images
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.tiff import read_temperature
 from heatsplat.preparation.conditions import Given, Uncertainty
-from heatsplat.preparation.frames import read_frames
 from heatsplat.preparation.writer import Writer
 
 
