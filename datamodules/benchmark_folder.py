@@ -18,7 +18,7 @@ from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.posed_frames import FILES
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.datamodules.weather import write_weather
+from heatsplat.datamodules.weather_table import write_weather
 from heatsplat.geometry.transforms import camera_entry
 
 log = logging.getLogger("heatsplat")

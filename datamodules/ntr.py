@@ -9,7 +9,7 @@ from heatsplat.datamodules.bounds import range_in
 from heatsplat.datamodules.posed_frames import FILES, listed_frames, mesh_points
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.surroundings import OutdoorDataModule
-from heatsplat.datamodules.weather import utc_seconds
+from heatsplat.datamodules.weather_table import utc_seconds
 
 
 class NTR(OutdoorDataModule):

@@ -18,7 +18,7 @@ from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.posed_frames import FILES, image_index, listed_frames, match_model, mesh_points, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, mapping, shortened
 from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
-from heatsplat.datamodules.weather import utc_seconds
+from heatsplat.datamodules.weather_table import utc_seconds
 
 META_FILE = "meta.json"
 
