@@ -45,7 +45,7 @@ from heatsplat.physics.radiometry import (
     surface_temperature,
 )
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
 from heatsplat.preparation.target import CORRECTED, Target
@@ -142,7 +142,7 @@ def correct(
     Args:
         ckpt: checkpoint of a run on the scene.
         target: folder of the corrected scene.
-        conditions: arguments of ``Given``; None takes those of the preparation.
+        conditions: arguments of ``GivenConditions``; None takes those of the preparation.
         band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
         refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
         metres_per_unit: scale of the world; None takes the scene's.
@@ -162,7 +162,7 @@ def correct(
         trained.depth,
         folders,
         target,
-        Given(**conditions),
+        GivenConditions(**conditions),
         BandResponse(Band(*band_um, nodes=16)),
         refractive_index,
         metres_per_unit or trained.scene.metres_per_unit,
@@ -174,7 +174,7 @@ def correct_scene(
     depth_of: Any,
     folders: Sequence[Path],
     target: Path,
-    given: Given,
+    given: GivenConditions,
     response: Response,
     index: float | None,
     metres_per_unit: float | None,

@@ -20,7 +20,7 @@ from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.devices import Device, devices_of
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording, taken_at
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.report import Section, counted
@@ -149,7 +149,7 @@ def _recorded(device: Device, zone: str | None) -> Material:
     )
 
 
-def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
+def _bounds_of_greys(frame: ThermalFrame) -> tuple[float, float] | None:
     """°C of black and white where a frame is a grey of 8 bits with bounds; else None."""
     calibration = frame.calibration
     if calibration is None or calibration.scale is None or frame.load().dtype != np.uint8:
@@ -157,7 +157,7 @@ def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
     return calibration.offset_c, calibration.offset_c + np.iinfo(np.uint8).max * calibration.scale
 
 
-def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | None:
+def _photo_times(frames: Sequence[ThermalFrame], zone: str | None) -> list[float] | None:
     """When photos were taken, on their camera's clock; None where one does not say.
 
     Where only one of the two clocks says its zone, the other is taken to be in the zone that brings them closest: whole

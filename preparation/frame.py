@@ -48,7 +48,7 @@ class Attitude:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ThermalFrame:
     """One thermal frame.
 
     Args:

@@ -31,7 +31,7 @@ from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.preparation.devices import devices_of, listed
-from heatsplat.preparation.frame import Attitude, CameraInfo, Frame, Position
+from heatsplat.preparation.frame import Attitude, CameraInfo, Position, ThermalFrame
 from heatsplat.preparation.meaning import Meaning
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class Reading:
 class Recording:
     """The frames of a folder, in the order of their times, else of their names, and what was noticed on the way."""
 
-    frames: list[Frame]
+    frames: list[ThermalFrame]
     notes: list[str]
 
 
@@ -184,7 +184,9 @@ def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, li
     return kinds
 
 
-def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, notes: list[str]) -> Iterator[Frame]:
+def _frames_of(
+    kind: str, paths: list[Path], folder: Path, reading: Reading, notes: list[str]
+) -> Iterator[ThermalFrame]:
     if kind == "radiometric":
         for path in paths:
             yield from _radiometric(path, folder, reading, notes)
@@ -200,7 +202,7 @@ def _frames_of(kind: str, paths: list[Path], folder: Path, reading: Reading, not
         for number, page in enumerate(pages):
             name = _name(path, folder, number if several else None)
             load = partial(_grey if kind == "grey" else read_image, path, page if several else None)
-            found.append(Frame(name, path, number, load, camera=camera, size=size, **details))
+            found.append(ThermalFrame(name, path, number, load, camera=camera, size=size, **details))
     devices, calibrations = devices_of(found), {}
     for device in devices:
         sample = device.frames[0]
@@ -234,7 +236,7 @@ def _name(path: Path, folder: Path, number: int | None = None) -> str:
     return stem if number is None else f"{stem}_{number:06d}"
 
 
-def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -> Iterator[Frame]:
+def _radiometric(path: Path, folder: Path, reading: Reading, notes: list[str]) -> Iterator[ThermalFrame]:
     if path.suffix.lower() in SEQUENCES:
         places = flir.frames_in(path)
         if cut := path.stat().st_size - sum(places[-1]):
@@ -269,7 +271,7 @@ def _of_flir(
     read: Callable[[], bytes],
     data: bytes = b"",
     planck: Sequence[float] | None = None,
-) -> Frame:
+) -> ThermalFrame:
     """The frame of an FFF record, by the camera's own constants unless others are given.
 
     It is read anew for its pixels, so that a recording need not fit into memory.
@@ -285,7 +287,7 @@ def _of_flir(
     def again() -> flir.Record:
         return flir.Record(read(), record.name)
 
-    return Frame(
+    return ThermalFrame(
         name,
         path,
         number,
@@ -307,7 +309,7 @@ def _of_flir(
     )
 
 
-def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
+def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> ThermalFrame:
     if reading.meaning.planck is not None:
         raise SceneError(f"counts.planck are constants of FLIR's cameras; {path} is of DJI and holds kelvin")
     stated, xmp = dji.parameters_in(data), dji.xmp_in(data)
@@ -334,7 +336,7 @@ def _of_dji(path: Path, name: str, data: bytes, reading: Reading) -> Frame:
     angles = [number(f"Gimbal{axis}Degree") for axis in ("Yaw", "Pitch", "Roll")]
     if all(angle is not None for angle in angles):
         details["attitude"] = Attitude(*angles)
-    return Frame(
+    return ThermalFrame(
         name,
         path,
         0,
@@ -385,7 +387,7 @@ def _apart_s(one: Path, other: Path) -> float:
     return abs((first - second).total_seconds())
 
 
-def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
+def _paired(frames: Iterable[ThermalFrame], photos: list[Path]) -> list[ThermalFrame]:
     """Frames with the photo of the same exposure: of several that may be, one of the same name, in the same folder.
 
     Cards count from one in every folder: a photo beside a frame of its exposure is no other frame's. Counters restart within
@@ -413,7 +415,7 @@ def _paired(frames: Iterable[Frame], photos: list[Path]) -> list[Frame]:
     return [replace(frame, rgb=photo_of(frame.path)) for frame in frames]
 
 
-def _zoned(frame: Frame, zone: str | None) -> Frame:
+def _zoned(frame: ThermalFrame, zone: str | None) -> ThermalFrame:
     """The frame with a time, of its name where the file has none, in the zone that was given for those without one."""
     time = frame.time
     if time is None and frame.number == 0 and (seconds := dji_time(frame.path.name)) is not None:
@@ -423,7 +425,7 @@ def _zoned(frame: Frame, zone: str | None) -> Frame:
     return replace(frame, time=time)
 
 
-def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list[Frame]:
+def _with_table(frames: list[ThermalFrame], reading: Reading, notes: list[str]) -> list[ThermalFrame]:
     """Frames with what a table says of them, which goes before what their files say.
 
     Raises:
@@ -475,7 +477,7 @@ def _with_table(frames: list[Frame], reading: Reading, notes: list[str]) -> list
         )
     told: set[str] = set()
 
-    def of(frame: Frame) -> Frame:
+    def of(frame: ThermalFrame) -> ThermalFrame:
         if frame.name not in rows:
             return frame
         line, cells = rows[frame.name]
@@ -528,7 +530,7 @@ def _needed(kind: type[Position | Attitude]) -> set[str]:
     return {part.name for part in fields(kind) if part.default is MISSING}
 
 
-def _check_names(frames: list[Frame]) -> None:
+def _check_names(frames: list[ThermalFrame]) -> None:
     twice = [name for name, count in Counter(frame.name for frame in frames).items() if count > 1]
     if twice:
         first, second = [frame.path for frame in frames if frame.name == twice[0]][:2]

@@ -29,7 +29,7 @@ from heatsplat.io.results import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
 from heatsplat.preparation.features import Features, check_positive
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.target import WORK
@@ -102,7 +102,7 @@ class FindPoses:
         for value in self.gps_sd_m:
             check_positive("poses.gps_sd_m", value)
 
-    def __call__(self, frames: list[Frame], target: Path) -> Section:
+    def __call__(self, frames: list[ThermalFrame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns what was found, what was not, and why.
 
         Raises:
@@ -122,7 +122,7 @@ class FindPoses:
 class Search:
     """One search for cameras, step by step; what is done already in the folder is not done again."""
 
-    def __init__(self, options: FindPoses, frames: Sequence[Frame], target: Path) -> None:
+    def __init__(self, options: FindPoses, frames: Sequence[ThermalFrame], target: Path) -> None:
         self.options, self.target, self.work = options, target, target / WORK
         if len(frames) < 3:
             raise SceneError(
@@ -416,7 +416,7 @@ class Search:
             return None
         return known[0]
 
-    def _sd(self, frame: Frame) -> tuple[float, float]:
+    def _sd(self, frame: ThermalFrame) -> tuple[float, float]:
         position, (across, up) = frame.position, self.options.gps_sd_m
         return position.horizontal_sd_m or across, position.vertical_sd_m or up
 
@@ -600,7 +600,7 @@ def put_whole(fresh: Path, folder: Path) -> None:
     fresh.rename(folder)
 
 
-def _fix(frame: Frame) -> tuple[float, float, float] | None:
+def _fix(frame: ThermalFrame) -> tuple[float, float, float] | None:
     """Latitude, longitude and altitude of a frame; where take-off is the better zero, above it."""
     at = frame.position
     if at is None:

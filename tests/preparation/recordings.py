@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from camera_files import camera_record, fff, flir_jpeg, gps_record, raw_for, temperatures
 
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording
 
 START = datetime(2024, 7, 1, 12, 0, tzinfo=UTC)
@@ -47,6 +47,6 @@ def write_images(folder: Path, images: dict[str, np.ndarray]) -> Path:
     return folder
 
 
-def read_frames(folder: Path, reading: Reading | None = None) -> list[Frame]:
+def read_frames(folder: Path, reading: Reading | None = None) -> list[ThermalFrame]:
     """The thermal frames of all files in a folder, without the notes on them."""
     return read_recording(folder, reading).frames

@@ -17,7 +17,7 @@ from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
 from heatsplat.preparation.doctor import _photo_times, check, section
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading, taken_at
 from heatsplat.preparation.meaning import Meaning
 
@@ -67,7 +67,7 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
     write_camera(recording, tmp_path / "camera", Field(rgb=True))
     frames = read_frames(tmp_path / "camera")
 
-    def photos(hours: float, minutes: float = 0.0, zone: str = "") -> list[Frame]:
+    def photos(hours: float, minutes: float = 0.0, zone: str = "") -> list[ThermalFrame]:
         """The frames with photos of their moments, by a clock that shows the time of another zone."""
         found = []
         for number, frame in enumerate(frames):
@@ -81,7 +81,7 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
             found.append(replace(frame, rgb=tmp_path / f"{number}.jpg"))
         return found
 
-    def apart(photos: list[Frame], zone: str | None = None) -> float:
+    def apart(photos: list[ThermalFrame], zone: str | None = None) -> float:
         times = _photo_times(photos, zone)
         return float(np.median(np.array(times) - [frame.time.timestamp() for frame in photos]))
 

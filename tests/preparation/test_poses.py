@@ -16,7 +16,7 @@ from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, w
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import pose_errors
 from heatsplat.preparation.features import Sift
-from heatsplat.preparation.frame import Frame, Position
+from heatsplat.preparation.frame import Position, ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.poses import FindPoses, Search
 
@@ -28,7 +28,7 @@ def search_of(tmp_path: Path, frames: int, **options) -> Search:
         (tmp_path / "images" / f"f{i:03d}.tif").touch()
         place = Position(51.0 + 1e-4 * i, 4.0, 75.0)
         found.append(
-            Frame(
+            ThermalFrame(
                 f"f{i:03d}",
                 Path(f"f{i:03d}.tif"),
                 0,
@@ -100,7 +100,7 @@ def test_cameras_that_see_no_point_are_none(tmp_path):
     for i, picture in enumerate(np.random.default_rng(0).normal(0.0, 40.0, (3, 128, 160)).astype(np.float32)):
         (tmp_path / "images" / f"{i}.tiff").touch()
         smooth = cv2.GaussianBlur(picture, (0, 0), 4)
-        frames.append(Frame(f"{i}", Path(f"{i}.tiff"), 0, lambda smooth=smooth: smooth))
+        frames.append(ThermalFrame(f"{i}", Path(f"{i}.tiff"), 0, lambda smooth=smooth: smooth))
     search = Search(FindPoses(Sift()), frames, tmp_path)
     search.copies()
     search.find_features()
