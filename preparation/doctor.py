@@ -21,8 +21,8 @@ from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
 from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.frames import Reading, read_recording, taken_at
-from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.frames import Reading, read_recording, reading_of
+from heatsplat.preparation.makers import taken_at
 from heatsplat.preparation.report import Section, counted
 
 log = logging.getLogger(__name__)
@@ -54,8 +54,7 @@ def check(
     Raises:
         SceneError: the folder holds neither.
     """
-    rows = Path(table).expanduser() if table else None
-    reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
+    reading = reading_of(counts=counts, bounds_c=bounds_c, zone=zone, table=table, table_columns=table_columns)
     materials, notes = materials_in(Path(folder).expanduser(), downscale, reading)
     for note in notes:
         log.info("%s", note)

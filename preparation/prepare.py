@@ -17,8 +17,7 @@ from heatsplat.preparation import report
 from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.frames import Reading, read_recording
-from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.frames import Reading, read_recording, reading_of
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import PREPARED, Target
 from heatsplat.preparation.writer import Writer
@@ -76,11 +75,8 @@ def prepare(
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = GivenConditions(**conditions), InputUncertainty(**uncertainty)
-    reading = Reading(
-        Meaning(**counts, bounds_c=bounds_c, band_um=band_um),
-        zone,
-        Path(table).expanduser() if table else None,
-        table_columns or {},
+    reading = reading_of(
+        counts=counts, bounds_c=bounds_c, band_um=band_um, zone=zone, table=table, table_columns=table_columns
     )
     found = read_recording(folder, reading)
     for note in found.notes:
