@@ -177,8 +177,7 @@ class Writer:
         ]
         if found:
             low, high = min(q[0] for q in found), max(q[-1] for q in found)
-            bounds = {"absolute_min_temperature": low, "absolute_max_temperature": max(high, low + 1e-3)}
-            write_atomically(self.target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+            write_bounds(self.target, low, max(high, low + 1e-3))
         else:  # bounds of an earlier preparation would make temperatures of greys
             (self.target / BOUNDS_FILE).unlink(missing_ok=True)
 
@@ -195,6 +194,12 @@ def write_world(target: Path, metres_per_unit: float | None) -> None:
         path.unlink(missing_ok=True)
     else:
         write_atomically(path, json.dumps({"metres_per_unit": metres_per_unit}) + "\n")
+
+
+def write_bounds(target: Path, low: float, high: float) -> None:
+    """Says in a prepared folder between which temperatures in °C its images lie."""
+    bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
+    write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
 
 
 def uncertainty_at(

@@ -24,6 +24,7 @@ from heatsplat.physics.radiometry import (
     measured_signal,
     surface_temperature,
 )
+from heatsplat.preparation import correction
 from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.correction import PERCENT, Spread, _unsettled, correct_scene, corrected, preparation_of
 from heatsplat.preparation.prepare import prepare
@@ -160,6 +161,17 @@ def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_p
     assert (
         f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text
     )  # nobody asked for angles
+
+
+def test_air_that_nothing_tells_of_is_said_of_any_image(tmp_path, monkeypatch):
+    last = max(frame.name for part in (scene().train, scene().test) for frame in part.frames)
+
+    def prepared(name, folders):
+        return None, AIR if name == last else Conditions()
+
+    monkeypatch.setattr(correction, "preparation_of", prepared)
+    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
+    assert correction.ASSUMED in page.read_text()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.8])
