@@ -18,7 +18,7 @@ from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
-from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
+from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, warn, write_findings
 from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording, reading_of
@@ -74,8 +74,7 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     posed, found = any(material.cameras is not None for material in materials.values()), examined(materials)
     if not posed:
         found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
-    for one in found:
-        log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
+    warn(found)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
     if _more_with_cameras(materials, found):
         lines += ["", LATER]
