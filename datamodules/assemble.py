@@ -20,14 +20,12 @@ from torch import Tensor
 
 from heatsplat.contracts import (
     Camera,
-    Environment,
     Frame,
     SceneData,
     SceneError,
     ThermalRange,
     View,
     ViewSet,
-    Weather,
     evenly_spread,
 )
 from heatsplat.datamodules.bounds import celsius
@@ -37,6 +35,7 @@ from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, i
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
+from heatsplat.datamodules.weather import weather_at_frame
 
 log = logging.getLogger(__name__)
 
@@ -274,18 +273,10 @@ def _store(
     camera = Camera(torch.from_numpy(viewmat), torch.from_numpy(lens.matrix()), lens.width, lens.height)
     environment = frame.environment
     if raw.weather is not None and environment is None:
-        environment = weather_of(frame.name, raw.weather, time_s)
+        environment = weather_at_frame(raw.weather, frame.name, time_s)
     about = Frame(name=frame.name, frame_id=frame_id, camera=camera, time_s=time_s, environment=environment)
     zero, full = _scaling(np.dtype(pixels.found["type"]), raw.counts, raw.thermal_range)
     return _Stored(about, pixels.thermal, pixels.rgb, pixels.mask, zero, full, options.thermal_channels)
-
-
-def weather_of(name: str, weather: Weather, time_s: float) -> Environment:
-    """The weather at the time of a frame. Raises SceneError naming the frame where the record does not reach it."""
-    try:
-        return weather.at(time_s)
-    except SceneError as error:
-        raise SceneError(f"frame {name}: {error}") from error
 
 
 def _of_points(what: str, values: np.ndarray | None, kept: np.ndarray) -> np.ndarray | None:

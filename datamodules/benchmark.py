@@ -9,11 +9,12 @@ from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame
-from heatsplat.datamodules.benchmark_folder import FILES, META, SCENES, TRUTH
+from heatsplat.datamodules.benchmark_folder import META, SCENES, TRUTH
 from heatsplat.datamodules.bounds import celsius_in, range_in
 from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.points import ply_points
+from heatsplat.datamodules.posed_frames import FILES
 from heatsplat.datamodules.side_files import finite, json_object
 from heatsplat.datamodules.surroundings import OutdoorDataModule
 

@@ -16,15 +16,16 @@ from plyfile import PlyData, PlyElement
 from heatsplat.contracts import SceneData, SceneError, View
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.posed_frames import FILES
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.datamodules.weather import write_weather
+from heatsplat.datamodules.weather_table import write_weather
 from heatsplat.geometry.transforms import camera_entry
 
 log = logging.getLogger("heatsplat")
 
 SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
 UNTOLD = {"scene_seed": 0}  # of folders of before it was told
-META, FILES = "meta.json", {"train": "transforms_train.json", "test": "transforms_test.json"}
+META = "meta.json"
 
 
 def write_scenes(

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option
-from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, SceneDataModule
+from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.file_names import same_files
-from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
+from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
 from heatsplat.datamodules.points import random_points, told_random
+from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
 
@@ -113,7 +114,6 @@ class Colmap(SceneDataModule):
         raw = image_index(folder, self.raw, "data.raw") if self.raw else None
         rgb = image_index(folder, self.rgb, "data.rgb") if self.rgb else None
         index = raw or (image_index(folder, self.images, "data.images") if self.images else rgb)
-        masks = ImageIndex(folder / self.masks)
 
         files = {name: index.find(name) for name in model.names}
         kept, notes = match_model(model, files, index, self.raw or self.images or self.rgb)
@@ -123,22 +123,15 @@ class Colmap(SceneDataModule):
         bounds, bounds_source = self._bounds(folder)
         if bounds:
             notes["bounds_source"] = bounds_source
-        frames = []
-        for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
-            if name not in kept:
-                continue
+
+        def describe(name: str) -> dict[str, Any]:
             rgb_file = rgb.find(name) if rgb else None
-            frames.append(
-                RawFrame(
-                    name=name,
-                    viewmat=viewmat,
-                    lens=lens,
-                    read=partial(read, index.folder / files[name]) if self.images else None,
-                    time_s=times[name] if times else None,
-                    read_rgb=partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
-                    read_mask=self.mask_reader(masks, name),
-                )
-            )
+            return {
+                "time_s": times[name] if times else None,
+                "read_rgb": partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
+            }
+
+        frames = model_frames(self, folder, model, files, index.folder, read if self.images else None, describe)
         if masked := sum(f.read_mask is not None for f in frames):
             notes["masks"] = f"{masked} of {len(frames)} images have a mask in {self.masks}/ ({self.mask_keep} counts)"
         if rgb:
@@ -221,43 +214,6 @@ def _read_counts(path: Path) -> np.ndarray:
             "leave data.raw out to use the images as greys"
         )
     return pixels
-
-
-def image_index(folder: Path, images: str, key: str) -> ImageIndex:
-    """Files of an image folder of a scene. Raises SceneError naming the option ``key`` when the folder has none."""
-    index = ImageIndex(folder / images)
-    if not index.names:
-        what = "holds no image" if index.folder.is_dir() else "does not exist"
-        raise SceneError(f"{key}={images}: {index.folder} {what}")
-    return index
-
-
-def match_model(
-    model: SparseModel, files: dict[str, str | None], index: ImageIndex, folder: str
-) -> tuple[list[str], dict[str, Any]]:
-    """Names of the model that have a file, and notes about those that do not and about files that are not registered.
-
-    Raises:
-        SceneError: no name of the model has a file.
-    """
-    kept = [name for name in model.names if files[name] is not None]
-    if not kept:
-        raise SceneError(
-            f"none of the {len(model.names)} images of the sparse model {model.folder} is in {index.folder}: the model "
-            f"has names like {model.names[0]!r}, the folder like {index.names[0]!r}"
-        )
-    notes: dict[str, Any] = {"registered": len(model.names)}
-    if missing := [name for name in model.names if files[name] is None]:
-        notes["images_missing"] = (
-            f"{len(missing)} registered images have no file in {folder}/, dropped: {_some(missing)}"
-        )
-    if unregistered := index.unused(f for f in files.values() if f):
-        notes["images_unregistered"] = f"{len(unregistered)} files are not in the model, unused: {_some(unregistered)}"
-    return kept, notes
-
-
-def _some(names: Sequence[str], most: int = 5) -> str:
-    return ", ".join(names[:most]) + (" ..." if len(names) > most else "")
 
 
 def _looked_up(times: Mapping[str, float], names: Sequence[str], path: Path) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -31,6 +32,24 @@ from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
 log = logging.getLogger(__name__)
 
 THERMAL_FOLDERS = ("thermal", "ir", "infrared")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A frame as a transforms file lists it, and its stored files.
+
+    Args:
+        transforms: file that lists it.
+        subset: that the whole file is of, or None.
+        frame: its keys.
+        thermal, visible: stored images relative to the scene, or None; one that nothing calls thermal is visible.
+    """
+
+    transforms: Transforms
+    subset: str | None
+    frame: Mapping[str, Any]
+    thermal: str | None
+    visible: str | None
 
 
 class Nerfstudio(SceneDataModule):
@@ -103,47 +122,44 @@ class Nerfstudio(SceneDataModule):
     ) -> tuple[list[RawFrame], dict[str, Any]]:
         index, masks = ImageIndex(folder), ImageIndex(folder / self.masks)
         entries = [
-            (transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
+            Entry(transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
             for transforms, subset in listed.items()
             for frame in transforms.frames
         ]
         notes: dict[str, Any] = {"registered": len(entries)}
         photos = False
-        plain = [visible for *_, visible in entries if visible]
-        named = any(thermal or "thermal_file_path" in frame for _, _, frame, thermal, _ in entries)
-        if plain and not named:
-            pixels, _ = split_alpha(read_image(folder / plain[0]))
+        unnamed = [entry.visible for entry in entries if entry.visible]
+        if unnamed and not any(entry.thermal or "thermal_file_path" in entry.frame for entry in entries):
+            pixels, _ = split_alpha(read_image(folder / unnamed[0]))
             photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and self.thermal_channels == 1
             what = "photos (they are in colour)" if photos else "thermal images"
             notes["images_assumed"] = (
-                f"images such as {plain[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
+                f"images such as {unnamed[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
                 "thermal ones thermal_file_path, or set data.thermal_channels=3 for pseudo-colour"
             )
             if not photos:
-                entries = [(*entry[:3], entry[4], None) for entry in entries]
+                entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]
         subsets = _listed_subsets([*listed], entries)
-        mains = [entry[4] if photos else entry[3] for entry in entries]
+        mains = [entry.visible if photos else entry.thermal for entry in entries]
         plain_names = [PurePosixPath(main).name for main in mains if main is not None]
         with_folders = len(listed) > 1 or len(set(plain_names)) < len(plain_names)
-        frames, missing, visible = [], [], 0
-        for (transforms, subset, frame, file, rgb_file), in_list in zip(entries, subsets, strict=True):
-            main = rgb_file if photos else file
+        frames, missing = [], []
+        for entry, main, in_list in zip(entries, mains, subsets, strict=True):
             if main is None:
-                missing.append(str(frame["file_path"]))
+                missing.append(str(entry.frame["file_path"]))
                 continue
-            rgb_file = rgb_file if self.rgb or photos else None
-            visible += rgb_file is not None
+            rgb_file = entry.visible if self.rgb or photos else None
             read = partial(read_image, folder / main)
             name = main if with_folders else PurePosixPath(main).name
             frames.append(
                 RawFrame(
                     name=name,
-                    viewmat=viewmat_of(transforms, frame, opengl=True),
-                    lens=lens_in(transforms, frame, lambda read=read: read().shape[1::-1]),
+                    viewmat=viewmat_of(entry.transforms, entry.frame, opengl=True),
+                    lens=lens_in(entry.transforms, entry.frame, lambda read=read: read().shape[1::-1]),
                     read=None if photos else read,
                     read_rgb=partial(read_image, folder / rgb_file) if rgb_file else None,
                     read_mask=self.mask_reader(masks, name),
-                    subset=subset or in_list,
+                    subset=entry.subset or in_list,
                 )
             )
         if not frames:
@@ -154,7 +170,7 @@ class Nerfstudio(SceneDataModule):
         if missing:
             notes["images_missing"] = f"{len(missing)} frames have no thermal image, dropped: {', '.join(missing[:5])}"
         if self.rgb:
-            notes["rgb"] = f"{visible} of {len(frames)} images have a visible one"
+            notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         return frames, notes
 
     def _points(
@@ -216,7 +232,7 @@ def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
     return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
 
 
-def _listed_subsets(files: Sequence[Transforms], entries: Sequence[tuple[Any, ...]]) -> list[str | None]:
+def _listed_subsets(files: Sequence[Transforms], entries: Sequence[Entry]) -> list[str | None]:
     """Subset of each frame, from the lists that a transforms file may have (train_filenames, ...).
 
     They name what stands under file_path, or the stored image.
@@ -233,8 +249,8 @@ def _listed_subsets(files: Sequence[Transforms], entries: Sequence[tuple[Any, ..
                     f"{transforms.path}: {key}_filenames is {shortened(listed)}, a list of names is needed"
                 )
             subset_of |= {str(name): subset for name in listed}
-    paths = [str(frame["file_path"]) for _, _, frame, *_ in entries]
-    stored = [file or visible or path for (*_, file, visible), path in zip(entries, paths, strict=True)]
+    paths = [str(entry.frame["file_path"]) for entry in entries]
+    stored = [entry.thermal or entry.visible or path for entry, path in zip(entries, paths, strict=True)]
     found = [same_files(names, subset_of) for names in (paths, stored)]
     subsets = []
     for path, file in zip(paths, stored, strict=True):

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
-from heatsplat.contracts import SceneData, SceneError
-from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.contracts import SceneData
 from heatsplat.datamodules.bounds import range_in
-from heatsplat.datamodules.formats.images import ImageIndex, read_image
-from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
-from heatsplat.datamodules.points import obj_vertices, random_points, told_random
+from heatsplat.datamodules.posed_frames import FILES, listed_frames, mesh_points
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.surroundings import OutdoorDataModule
-from heatsplat.datamodules.weather import utc_seconds
-
-FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
+from heatsplat.datamodules.weather_table import utc_seconds
 
 
 class NTR(OutdoorDataModule):
@@ -92,54 +82,3 @@ class NTR(OutdoorDataModule):
             notes=notes | origin,
             **self.surroundings.read(folder, {}, frames),
         )
-
-
-def listed_frames(
-    module: SceneDataModule, folder: Path, describe: Callable[[dict[str, Any], str], dict[str, Any]]
-) -> tuple[list[RawFrame], list[str]]:
-    """The frames of transforms_train.json and transforms_test.json that have an image, and the names of those without.
-
-    Args:
-        module: whose masks are looked up.
-        folder: of the scene.
-        describe: function from the entry of a frame and its file to further fields of ``RawFrame``, such as time_s.
-
-    Raises:
-        SceneError: no frame has an image.
-    """
-    index, masks = ImageIndex(folder), ImageIndex(folder / module.masks)
-    frames: list[RawFrame] = []
-    missing: list[str] = []
-    for subset, file_name in FILES.items():
-        transforms = read_transforms(folder / file_name)
-        for frame in transforms.frames:
-            path = PurePosixPath(str(frame["file_path"]))
-            file = index.find(str(path)) or index.find(f"{path}.png")
-            if file is None:
-                missing.append(str(path))
-                continue
-            read = partial(read_image, folder / file)
-            # Some frames carry their own field of view; the file's holds for the others.
-            own = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
-            frames.append(
-                RawFrame(
-                    name=file,
-                    viewmat=viewmat_of(transforms, frame, opengl=False),
-                    lens=lens_in(transforms, {**frame, **own}, lambda read=read: read().shape[1::-1]),
-                    read=read,
-                    read_mask=module.mask_reader(masks, file),
-                    **{"subset": subset, **describe(frame, file)},
-                )
-            )
-    if not frames:
-        raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
-    return frames, missing
-
-
-def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
-    """Points [P, 3] of a scene and notes on their origin: vertices of mesh.obj, or ``count`` random ones without it."""
-    mesh = folder / "mesh.obj"
-    if mesh.is_file():
-        return obj_vertices(mesh), {"points_source": "vertices of mesh.obj"}
-    points = random_points([f.viewmat for f in frames], count, seed)
-    return points, told_random(len(points), ": no mesh.obj")

@@ -8,9 +8,9 @@ from typing import Any
 
 from heatsplat.contracts import SceneData
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
-from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 
 SUBSETS = {"train": "train", "test": "test", "eval": "test", "val": "test"}
 
@@ -49,31 +49,22 @@ def paired_frames(
     """
     thermal = image_index(folder, "thermal", "the folder of thermal images")
     rgb = ImageIndex(folder / "rgb")
-    masks = ImageIndex(folder / module.masks)
     files: dict[str, str | None] = {}
     subsets: dict[str, str | None] = {}
     for name in model.names:
         places = [(thermal.find(f"{place}/{name}"), subset) for place, subset in SUBSETS.items()]
         places.append((thermal.find(name), None))
         files[name], subsets[name] = next((p for p in places if p[0]), (None, None))
-    kept, notes = match_model(model, files, thermal, "thermal")
-    frames = []
-    for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
-        if name not in kept:
-            continue
-        file = files[name]
-        rgb_file = rgb.find(file) if with_rgb else None
-        frames.append(
-            RawFrame(
-                name=name,
-                viewmat=viewmat,
-                lens=lens,
-                read=partial(read_image, thermal.folder / file),
-                read_rgb=partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
-                read_mask=module.mask_reader(masks, name),
-                subset=subsets[name],
-            )
-        )
+    _, notes = match_model(model, files, thermal, "thermal")
+
+    def describe(name: str) -> dict[str, Any]:
+        rgb_file = rgb.find(files[name]) if with_rgb else None
+        return {
+            "read_rgb": partial(read_image, rgb.folder / rgb_file) if rgb_file else None,
+            "subset": subsets[name],
+        }
+
+    frames = model_frames(module, folder, model, files, thermal.folder, describe=describe)
     if with_rgb:
         notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
     notes["time_source"] = "none: the data set has no times"

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 import re
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from heatsplat.contracts import SceneData, ThermalRange
-from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.bounds import celsius_in, range_in
-from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.formats.colmap import find_model, read_model
-from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.images import ImageIndex
+from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 from heatsplat.datamodules.side_files import json_object
 from heatsplat.datamodules.timestamps import seconds_of_day, unrolled_midnight
 
@@ -47,7 +46,6 @@ class RHD(SceneDataModule):
         name = scene.parent.name if scene.name == "thermal" else scene.name
         model = read_model(folder)
         index = image_index(folder, "images", "the folder of thermal images")
-        masks = ImageIndex(folder / self.masks)
         files = _files_of(model.names, index)
         kept, notes = match_model(model, files, index, "images")
         times, time_notes = _times([files[name] for name in kept])
@@ -55,21 +53,12 @@ class RHD(SceneDataModule):
         notes |= time_notes | info_notes
         if (scene / "rgb").is_dir():
             notes["rgb"] = "visible images have cameras of their own and are not used"
-        frames = []
-        for name_in_model, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
+
+        def describe(name_in_model: str) -> dict[str, Any]:
             file = files[name_in_model]
-            if file is None:
-                continue
-            frames.append(
-                RawFrame(
-                    name=file,
-                    viewmat=viewmat,
-                    lens=lens,
-                    read=partial(read_image, index.folder / file),
-                    time_s=times[file] if times else None,
-                    read_mask=self.mask_reader(masks, file),
-                )
-            )
+            return {"name": file, "time_s": times[file] if times else None}
+
+        frames = model_frames(self, folder, model, files, index.folder, describe=describe)
         return self.finish(
             name,
             frames,

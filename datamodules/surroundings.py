@@ -22,7 +22,7 @@ class Surroundings:
     """Options of loaders whose scenes have weather. Files are relative to the scene.
 
     Args:
-        weather: table of the weather (``heatsplat.datamodules.weather``), or None for none; weather.csv may be absent.
+        weather: table of the weather (``heatsplat.datamodules.weather_table``), or None for none; weather.csv may be absent.
         zone: time zone of its times where they have no offset.
         max_gap_h: longest gap in it that is interpolated, in hours.
         site: latitude, longitude, altitude_m, up and north where they are known (``heatsplat.datamodules.sun``).

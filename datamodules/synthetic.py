@@ -15,13 +15,8 @@ from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.drawn import DRAWN, Drawn, drawn
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, misplaced, own_threads
-from heatsplat.datamodules.synthetic_scene.outdoor import (
-    SKIES,
-    OutdoorPreset,
-    OutdoorScene,
-    in_weather,
-    training_frames,
-)
+from heatsplat.datamodules.synthetic_scene.outdoor import OutdoorPreset, OutdoorScene, in_weather, training_frames
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import SKIES
 from heatsplat.datamodules.synthetic_scene.outdoor_true import MOST_DAYS, OF_ANY_LENGTH, YARDS
 from heatsplat.datamodules.synthetic_scene.parts import TRAIN, parts_of, rules
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS

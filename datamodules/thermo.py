@@ -13,14 +13,12 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame
 from heatsplat.datamodules.bounds import celsius_in, range_in
-from heatsplat.datamodules.colmap import image_index, match_model
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import find_model, read_model
-from heatsplat.datamodules.formats.images import ImageIndex, read_image
-from heatsplat.datamodules.ntr import FILES, listed_frames, mesh_points
+from heatsplat.datamodules.posed_frames import FILES, image_index, listed_frames, match_model, mesh_points, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, mapping, shortened
 from heatsplat.datamodules.surroundings import OutdoorDataModule, environment_of
-from heatsplat.datamodules.weather import utc_seconds
+from heatsplat.datamodules.weather_table import utc_seconds
 
 META_FILE = "meta.json"
 
@@ -119,21 +117,10 @@ class Thermo(OutdoorDataModule):
                 notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
             return frames, {"points": points}, notes
         model = read_model(folder)
-        index, masks = image_index(folder, "images", "the folder of thermal images"), ImageIndex(folder / self.masks)
+        index = image_index(folder, "images", "the folder of thermal images")
         files = {name: index.find(name) for name in model.names}
-        kept, notes = match_model(model, files, index, "images")
-        frames = [
-            RawFrame(
-                name=name,
-                viewmat=viewmat,
-                lens=lens,
-                read=partial(read_image, index.folder / files[name]),
-                read_mask=self.mask_reader(masks, name),
-                **self._described(meta, {}, name),
-            )
-            for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True)
-            if name in set(kept)
-        ]
+        _, notes = match_model(model, files, index, "images")
+        frames = model_frames(self, folder, model, files, index.folder, describe=partial(self._described, meta, {}))
         return frames, {"points": model.points, "point_colors": model.colors}, {"cameras": "sparse/0", **notes}
 
     def _described(self, meta: Mapping[str, Any], entry: Mapping[str, Any], file: str) -> dict[str, Any]:

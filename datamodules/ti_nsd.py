@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from typing import Any
 
 from heatsplat.contracts import SceneData, SceneError
-from heatsplat.datamodules.base import RawFrame, SceneDataModule
-from heatsplat.datamodules.colmap import image_index, match_model
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import find_model, read_model
-from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 
 # Frames of the second part of a two-part scene (s2_<n>) are numbered on from here (Thermal3D-GS).
 SECOND_PART = 486
@@ -36,7 +34,6 @@ class TINSD(SceneDataModule):
         folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)")
         model = read_model(folder)
         index = image_index(folder, "images", "the folder of thermal images")
-        masks = ImageIndex(folder / self.masks)
         files = {name: index.find(name) for name in model.names}
         kept, notes = match_model(model, files, index, "images")
         numbers = {name: frame_number(name) for name in kept}
@@ -49,18 +46,11 @@ class TINSD(SceneDataModule):
         else:
             unnumbered = next(name for name, number in numbers.items() if number is None)
             notes["time_source"] = f"none: {unnumbered} is no frame number"
-        frames = [
-            RawFrame(
-                name=name,
-                viewmat=viewmat,
-                lens=lens,
-                read=partial(read_image, index.folder / files[name]),
-                time_s=numbers[name] * step if timed else None,
-                read_mask=self.mask_reader(masks, name),
-            )
-            for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True)
-            if name in numbers
-        ]
+
+        def describe(name: str) -> dict[str, Any]:
+            return {"time_s": numbers[name] * step if timed else None}
+
+        frames = model_frames(self, folder, model, files, index.folder, describe=describe)
         return self.finish(folder.name, frames, model.points, point_colors=model.colors, notes=notes)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.physics.radiometry import LIMITS, Conditions
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 
 # The name of a setting -> that of the condition, and how its value becomes one.
 UNITS = {
@@ -30,7 +30,7 @@ NEEDS = {
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenConditions:
     """Conditions that go before those of the files; None takes the file's.
 
     Args:
@@ -69,7 +69,7 @@ class Given:
         """These conditions, the rest from others."""
         return replace(others, **self._given())
 
-    def check_use(self, frames: Sequence[Frame]) -> None:
+    def check_use(self, frames: Sequence[ThermalFrame]) -> None:
         """Raises SceneError where something is given that changes nothing for any of the frames, which are settled."""
         given = [name for name in UNITS if getattr(self, name) is not None]
         warm = [frame.conditions for frame in frames if frame.calibration is not None]
@@ -85,7 +85,7 @@ class Given:
                     f"all frames; give conditions.{needed}, too, or leave it out"
                 )
 
-    def settled(self, frame: Frame) -> Frame:
+    def settled(self, frame: ThermalFrame) -> ThermalFrame:
         """The frame under these conditions, the rest from its file."""
         given = self._given()
         conditions = self.conditions(frame.conditions)
@@ -98,8 +98,8 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Uncertainty:
-    """Standard uncertainties (one standard deviation), in the units of ``Given``; of the distance in per cent of it.
+class InputUncertainty:
+    """Standard uncertainties (one standard deviation), in the units of ``GivenConditions``; of the distance in per cent of it.
 
     Args:
         camera_c: of the apparent temperature, from the camera's data sheet.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ViewSet, check_numbers
-from heatsplat.datamodules.bounds import BOUNDS_FILE
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet, check_numbers
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import write_model
@@ -45,16 +44,16 @@ from heatsplat.physics.radiometry import (
     surface_temperature,
 )
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.conditions import Given
+from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
 from heatsplat.preparation.target import CORRECTED, Target
-from heatsplat.preparation.writer import write_world
+from heatsplat.preparation.writer import write_bounds, write_world
 from heatsplat.runs.run import load
 
 log = logging.getLogger(__name__)
 
-PLACED = [field.name for kind in (Position, Attitude) for field in fields(kind)]  # columns of frames.csv
+PLACED = [part.name for kind in (Position, Attitude) for part in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
 ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
@@ -142,7 +141,7 @@ def correct(
     Args:
         ckpt: checkpoint of a run on the scene.
         target: folder of the corrected scene.
-        conditions: arguments of ``Given``; None takes those of the preparation.
+        conditions: arguments of ``GivenConditions``; None takes those of the preparation.
         band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
         refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
         metres_per_unit: scale of the world; None takes the scene's.
@@ -162,7 +161,7 @@ def correct(
         trained.depth,
         folders,
         target,
-        Given(**conditions),
+        GivenConditions(**conditions),
         BandResponse(Band(*band_um, nodes=16)),
         refractive_index,
         metres_per_unit or trained.scene.metres_per_unit,
@@ -174,12 +173,70 @@ def correct_scene(
     depth_of: Any,
     folders: Sequence[Path],
     target: Path,
-    given: Given,
+    given: GivenConditions,
     response: Response,
     index: float | None,
     metres_per_unit: float | None,
 ) -> Path:
     """As ``correct``, of a scene whose depth [H, W] in a frame ``depth_of`` gives; ``folders`` may hold its preparation."""
+    _check(scene, folders, target, index, metres_per_unit)
+    place = Target(target, CORRECTED)
+    place.claim()
+    views = _by_name(scene)
+    few = views.frames[:: max(1, len(views) // 8)]
+    far = typical_distance(few, depth_of) * metres_per_unit
+    doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
+    for doubt in filter(None, doubts):
+        log.warning("%s", doubt)
+
+    outcome, recorded = Outcome(), _recorded(folders)
+    for number, view in enumerate(track(views, "correcting")):
+        calibration, done = preparation_of(view.frame.name, folders)
+        wanted = given.conditions(done)
+        if wanted.distance_m == 0:
+            wanted = replace(wanted, distance_m=far)
+        image = corrected(
+            _celsius(scene, view),
+            view.camera,
+            depth_of(view.frame),
+            metres_per_unit,
+            calibration or response,
+            done,
+            wanted,
+            index,
+        )
+        file = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
+        write_temperature(target / "images" / file, image.celsius.float().numpy())
+        outcome.add(file, view.camera, image, wanted, air_assumed=given.air_c is None and done.distance_m == 0)
+        timed = {} if view.frame.time_s is None else {"time_s": view.frame.time_s}
+        outcome.rows.append({"file": file, **timed, **recorded.get(stem_of(file), {})})
+        if number == len(views) // 2:
+            outcome.shown = image
+    if not outcome.low < outcome.high:
+        raise SceneError(
+            f"under these conditions no pixel of {scene.name} has a temperature; are they those of the recording?"
+        )
+
+    _write_cameras(target, scene, outcome.cameras)
+    place.has_cameras()
+    write_csv(target / FRAMES_FILE, outcome.rows)
+    write_world(target, metres_per_unit)
+    write_bounds(target, outcome.low, outcome.high)
+    write_png(target / "report" / "correction.png", _picture(outcome.shown))
+    if outcome.air_assumed:
+        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
+        log.warning("%s", doubts[-1])
+    page = write_report(
+        target, [_section(outcome, far, index, doubts)], f"{CORRECTED} by the trained scene {scene.name}"
+    )
+    log.info("%s", page.with_suffix(".html"))
+    return page
+
+
+def _check(
+    scene: SceneData, folders: Sequence[Path], target: Path, index: float | None, metres_per_unit: float | None
+) -> None:
+    """Raises SceneError where a scene cannot be corrected so, or would be lost."""
     if scene.thermal_range is None:
         raise SceneError(
             f"{scene.name} has no temperatures to correct; prepare it from a camera's files, or give it bounds"
@@ -194,64 +251,17 @@ def correct_scene(
         check_numbers("correct.refractive_index", index, error=SceneError)
     if index is not None and not index > 1:
         raise SceneError(f"correct.refractive_index must be above 1, got {index}; null is for no angle")
-    own = next((folder for folder in reversed(folders) if folder.is_dir()), None)  # a root may hold several scenes
-    if own is not None and target.resolve() == own.resolve():
+    scene_folder = next((folder for folder in reversed(folders) if folder.is_dir()), None)  # a root may hold several
+    if scene_folder is not None and target.resolve() == scene_folder.resolve():
         raise SceneError(
             f"target={target} is the folder of the scene that is to be corrected, whose images would be lost: give another one"
         )
-    place = Target(target, CORRECTED)
-    place.claim()
-    views = _by_name(scene)
-    few = views.frames[:: max(1, len(views) // 8)]
-    far = typical_distance(few, depth_of) * metres_per_unit
-    doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
-    for doubt in filter(None, doubts):
-        log.warning("%s", doubt)
-    changes = {"distance": Spread(), "angle": Spread(), "both": Spread()}
-    rows, cameras, shown, known_of, without = [], {}, None, _told(folders), []
-    low, high = np.inf, -np.inf
-    for number, view in enumerate(track(views, "correcting")):
-        own, done = preparation_of(view.frame.name, folders)
-        wanted = given.conditions(done)
-        assumed = given.air_c is None and done.distance_m == 0
-        if wanted.distance_m == 0:
-            wanted = replace(wanted, distance_m=far)
-        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].double())
-        if view.mask is not None:
-            celsius = celsius.where(view.mask, torch.nan)
-        depth = depth_of(view.frame)
-        found = corrected(celsius, view.camera, depth, metres_per_unit, own or response, done, wanted, index)
-        changes["distance"].add(found.distance_only - found.one)
-        changes["angle"].add(found.celsius - found.distance_only)
-        without.append(float(found.angle_deg.isnan().double().mean()))
-        changes["both"].add(found.celsius - found.one)
-        name = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
-        image = found.celsius.float().numpy()
-        write_temperature(target / "images" / name, image)
-        if np.isfinite(image).any():
-            low, high = min(low, float(np.nanmin(image))), max(high, float(np.nanmax(image)))
-        timed = {} if view.frame.time_s is None else {"time_s": view.frame.time_s}
-        rows.append({"file": name, **timed, **known_of.get(stem_of(name), {})})
-        cameras[name] = view.camera
-        shown = found if number == len(views) // 2 else shown
-    if not low < high:
-        raise SceneError(
-            f"under these conditions no pixel of {scene.name} has a temperature; are they those of the recording?"
-        )
-    _write_cameras(target, scene, cameras)
-    place.has_cameras()
-    write_csv(target / FRAMES_FILE, rows)
-    write_world(target, metres_per_unit)
-    bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
-    write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
-    write_png(target / "report" / "correction.png", _picture(shown))
-    if assumed:
-        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
-        log.warning("%s", doubts[-1])
-    section = _section(changes, far, wanted, index, float(np.mean(without)), len(views), doubts)
-    page = write_report(target, [section], f"{CORRECTED} by the trained scene {scene.name}")
-    log.info("%s", page.with_suffix(".html"))
-    return page
+
+
+def _celsius(scene: SceneData, view: View) -> Tensor:
+    """Temperatures [H, W] float64 in °C that a view was trained on, NaN where a pixel does not count."""
+    celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].double())
+    return celsius if view.mask is None else celsius.where(view.mask, torch.nan)
 
 
 class Spread:
@@ -287,6 +297,45 @@ class Spread:
         ends = np.concatenate([middles[:1], 0.5 * (middles[1:] + middles[:-1]), middles[-1:]])
         below = np.concatenate([[0], self._counts[rising].cumsum()])
         return np.round(np.interp(np.asarray(shares) / 100 * self.count, below, ends), 4) + 0.0  # no -0
+
+
+@dataclass
+class Outcome:
+    """What a correction did, gathered image by image.
+
+    Args:
+        changes: in °C, by what each pixel was given: its distance, its angle, both.
+        without_angle: share of the pixels of each image that have no known angle.
+        low, high: bounds of the temperatures in °C; empty (low > high) where there are none.
+        rows: of frames.csv.
+        cameras: by file of the image.
+        conditions: those that the last image was corrected for.
+        air_assumed: whether nothing says of the air of some image what it was.
+        shown: the image that the report shows.
+    """
+
+    changes: dict[str, Spread] = field(default_factory=lambda: {key: Spread() for key in ("distance", "angle", "both")})
+    without_angle: list[float] = field(default_factory=list)
+    low: float = np.inf
+    high: float = -np.inf
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    conditions: Conditions = Conditions()
+    air_assumed: bool = False
+    shown: Corrected | None = None
+
+    def add(self, file: str, camera: Camera, image: Corrected, conditions: Conditions, air_assumed: bool) -> None:
+        """Counts an image."""
+        self.changes["distance"].add(image.distance_only - image.one)
+        self.changes["angle"].add(image.celsius - image.distance_only)
+        self.changes["both"].add(image.celsius - image.one)
+        self.without_angle.append(float(image.angle_deg.isnan().double().mean()))
+        known = image.celsius.float().numpy()
+        if np.isfinite(known).any():
+            self.low, self.high = min(self.low, float(np.nanmin(known))), max(self.high, float(np.nanmax(known)))
+        self.cameras[file] = camera
+        self.conditions = conditions
+        self.air_assumed |= air_assumed
 
 
 def _by_name(scene: SceneData) -> ViewSet:
@@ -346,7 +395,7 @@ def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     return at[within].long(), within
 
 
-def _told(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
+def _recorded(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
     """By name of a frame, what its preparation's table tells beside its temperatures: date, place, attitude."""
     path = next((p for f in folders if (p := f / FRAMES_FILE).is_file()), None)
     if path is None:
@@ -418,22 +467,15 @@ def _picture(found: Corrected) -> np.ndarray:
     return side_by_side(panels)
 
 
-def _section(
-    changes: Mapping[str, Spread],
-    far: float,
-    c: Conditions,
-    index: float | None,
-    without: float,
-    count: int,
-    doubts: Sequence[str],
-) -> Section:
-    """What a distance (and an angle, where it counts) for each pixel changed, in °C; a share ``without`` has no angle."""
+def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence[str]) -> Section:
+    """What a distance (and an angle, where it counts) for each pixel changed, in °C."""
+    conditions, without_angle = outcome.conditions, float(np.mean(outcome.without_angle))
     names = {"distance": "distance of each pixel"}
     if index is not None:
         names |= {"angle": "angle of each pixel", "both": "both"}
     table, values = [], {}
     for key, name in names.items():
-        size, quantiles = changes[key].mean_size, changes[key].percentiles(PERCENT)
+        size, quantiles = outcome.changes[key].mean_size, outcome.changes[key].percentiles(PERCENT)
         table.append([name, f"{size:.3f}", *(f"{q:+.3f}" for q in quantiles)])
         values[key] = {
             "mean_abs_c": size,
@@ -441,11 +483,12 @@ def _section(
         }
     lines = [
         *(line for doubt in doubts if doubt for line in (f"**{doubt}.**", "")),
-        f"{count} images, against one distance of {float(c.distance_m):.1f} m for all pixels (the scene's median is {far:.1f} m) "
-        f"and an emissivity of {float(c.emissivity):g} at every angle. Air {float(c.air_k) - KELVIN_AT_0_C:.1f} °C, "
-        f"{100 * float(c.humidity):.0f} %, reflected {float(c.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
+        f"{len(outcome.cameras)} images, against one distance of {float(conditions.distance_m):.1f} m for all pixels (the "
+        f"scene's median is {far:.1f} m) and an emissivity of {float(conditions.emissivity):g} at every angle. Air "
+        f"{float(conditions.air_k) - KELVIN_AT_0_C:.1f} °C, {100 * float(conditions.humidity):.0f} %, reflected "
+        f"{float(conditions.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
         + (
-            f"refractive index {index:g}; {100 * without:.0f} % of the pixels have no known angle (edges, and what is too "
+            f"refractive index {index:g}; {100 * without_angle:.0f} % of the pixels have no known angle (edges, and what is too "
             "rough for a plane) and keep the emissivity along the normal."
             if index is not None
             else "no angle."

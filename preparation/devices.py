@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 
 FOCUS = 0.05  # by which the focal length that files say changes with the focus of one lens
 
@@ -20,8 +20,8 @@ class Device:
         like: the frame that says most of the camera.
     """
 
-    frames: list[Frame]
-    like: Frame
+    frames: list[ThermalFrame]
+    like: ThermalFrame
 
     @property
     def label(self) -> str:
@@ -35,13 +35,13 @@ class Device:
         return ", ".join(filter(None, (name, size, lens)))
 
 
-def devices_of(frames: Sequence[Frame]) -> list[Device]:
+def devices_of(frames: Sequence[ThermalFrame]) -> list[Device]:
     """The cameras that took the frames, in the order of their first ones.
 
     Frames are of one camera where nothing that both say of it differs: make, model, serial number, image size, and focal
     length or field of view to 5 %. A frame that says little belongs to the first camera that it does not contradict.
     """
-    found: list[tuple[Frame, list[int]]] = []
+    found: list[tuple[ThermalFrame, list[int]]] = []
     for i in sorted(range(len(frames)), key=lambda i: -_said(frames[i])):
         members = next((members for like, members in found if _agree(like, frames[i])), None)
         if members is None:
@@ -57,17 +57,17 @@ def listed(devices: Sequence[Device]) -> str:
     return "; ".join(f"{d.label} ({len(d.frames)}, such as {d.frames[0].name})" for d in devices)
 
 
-def _facts(frame: Frame) -> tuple[list[object], list[float | None]]:
+def _facts(frame: ThermalFrame) -> tuple[list[object], list[float | None]]:
     """What a frame says of its camera: what has to be equal, and what may differ by a little."""
     about = frame.camera
     return [about.make, about.model, about.serial, frame.size], [about.field_of_view_deg, about.focal_mm]
 
 
-def _said(frame: Frame) -> int:
+def _said(frame: ThermalFrame) -> int:
     return sum(fact is not None for facts in _facts(frame) for fact in facts)
 
 
-def _agree(one: Frame, other: Frame) -> bool:
+def _agree(one: ThermalFrame, other: ThermalFrame) -> bool:
     (equal, close), (others_equal, others_close) = _facts(one), _facts(other)
     same = all(a is None or b is None or a == b for a, b in zip(equal, others_equal, strict=True))
     near = (math.isclose(a, b, rel_tol=FOCUS) for a, b in zip(close, others_close, strict=True) if a and b)

@@ -18,11 +18,11 @@ from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
-from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, write_findings
+from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, warn, write_findings
 from heatsplat.preparation.devices import Device, devices_of
-from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import Reading, read_recording, taken_at
-from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frames import Reading, read_recording, reading_of
+from heatsplat.preparation.makers import taken_at
 from heatsplat.preparation.report import Section, counted
 
 log = logging.getLogger(__name__)
@@ -54,8 +54,7 @@ def check(
     Raises:
         SceneError: the folder holds neither.
     """
-    rows = Path(table).expanduser() if table else None
-    reading = Reading(Meaning(**(counts or {}), bounds_c=bounds_c), zone, rows, table_columns or {})
+    reading = reading_of(counts=counts, bounds_c=bounds_c, zone=zone, table=table, table_columns=table_columns)
     materials, notes = materials_in(Path(folder).expanduser(), downscale, reading)
     for note in notes:
         log.info("%s", note)
@@ -75,8 +74,7 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     posed, found = any(material.cameras is not None for material in materials.values()), examined(materials)
     if not posed:
         found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
-    for one in found:
-        log.warning("doctor, %s: %s %s", one.check, one.what, one.remedy)
+    warn(found)
     lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
     if _more_with_cameras(materials, found):
         lines += ["", LATER]
@@ -149,7 +147,7 @@ def _recorded(device: Device, zone: str | None) -> Material:
     )
 
 
-def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
+def _bounds_of_greys(frame: ThermalFrame) -> tuple[float, float] | None:
     """°C of black and white where a frame is a grey of 8 bits with bounds; else None."""
     calibration = frame.calibration
     if calibration is None or calibration.scale is None or frame.load().dtype != np.uint8:
@@ -157,7 +155,7 @@ def _bounds_of_greys(frame: Frame) -> tuple[float, float] | None:
     return calibration.offset_c, calibration.offset_c + np.iinfo(np.uint8).max * calibration.scale
 
 
-def _photo_times(frames: Sequence[Frame], zone: str | None) -> list[float] | None:
+def _photo_times(frames: Sequence[ThermalFrame], zone: str | None) -> list[float] | None:
     """When photos were taken, on their camera's clock; None where one does not say.
 
     Where only one of the two clocks says its zone, the other is taken to be in the zone that brings them closest: whole

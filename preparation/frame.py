@@ -48,7 +48,7 @@ class Attitude:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ThermalFrame:
     """One thermal frame.
 
     Args:
@@ -94,3 +94,9 @@ class Frame:
     def pixels(self) -> np.ndarray:
         """Temperatures, or greys where there are none, [H, W] float32: what can be matched and looked at."""
         return self.load().astype(np.float32) if self.calibration is None else self.temperature()
+
+
+def frame_name(path: Path, folder: Path, number: int | None = None) -> str:
+    """Name of a frame by its path below the folder of the recording, and by its number where the file holds several."""
+    stem = path.relative_to(folder).with_suffix("").as_posix().replace("/", "_")
+    return stem if number is None else f"{stem}_{number:06d}"

@@ -17,7 +17,7 @@ from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, v
 from heatsplat.datamodules.nerfstudio import find_transforms
 from heatsplat.datamodules.points import ply_points
 from heatsplat.preparation.cameras_picture import draw_cameras
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.poses import PICTURE, put_whole
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import WORK
@@ -55,7 +55,7 @@ class GivenPoses:
 
     model: str
 
-    def __call__(self, frames: list[Frame], target: Path) -> Section:
+    def __call__(self, frames: list[ThermalFrame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns which frames have a camera and which have none.
 
         Raises:
@@ -94,7 +94,7 @@ class GivenPoses:
         return Section("Poses", lines, {**values, "not_registered": missing, "metres_per_unit": None})
 
 
-def model_in(folder: Path, frames: Sequence[Frame]) -> Model:
+def model_in(folder: Path, frames: Sequence[ThermalFrame]) -> Model:
     """The cameras in a folder, a COLMAP model before a transforms.json. Raises SceneError where it holds neither."""
     for place in (folder, folder.parent, folder.parent.parent):  # the folder of the model itself is as good
         if (found := find_model(place)) is not None and (place == folder or found == folder):
@@ -120,7 +120,7 @@ def model_in(folder: Path, frames: Sequence[Frame]) -> Model:
     return Model(next(iter(files)), cameras, points, np.full(points.shape, 0.5) if colors is None else colors)
 
 
-def matched(frames: Sequence[Frame], model: Model) -> dict[str, str]:
+def matched(frames: Sequence[ThermalFrame], model: Model) -> dict[str, str]:
     """By name of a frame, which image of a model it is: that with the name of its file, whatever ending it has.
 
     Folders count where they tell images of one name apart, such as those of a visible camera beside.
@@ -165,7 +165,7 @@ def _alone(same: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     return {frame: [name for name in names if frames[name] == 1] for frame, names in same.items()}
 
 
-def _check_shape(frame: Frame, lens: Lens, source: Path) -> None:
+def _check_shape(frame: ThermalFrame, lens: Lens, source: Path) -> None:
     height, width = frame.load().shape
     if abs(lens.width / lens.height / (width / height) - 1.0) > OTHER_SHAPE:
         raise SceneError(

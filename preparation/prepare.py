@@ -14,11 +14,10 @@ from rich.progress import track
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting, typed
 from heatsplat.preparation import report
-from heatsplat.preparation.conditions import Given, Uncertainty
+from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
 from heatsplat.preparation.devices import devices_of, listed
-from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import Reading, read_recording
-from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frames import Reading, read_recording, reading_of
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import PREPARED, Target
 from heatsplat.preparation.writer import Writer
@@ -26,7 +25,7 @@ from heatsplat.preparation.writer import Writer
 log = logging.getLogger(__name__)
 
 # How cameras are found: gets the frames and the prepared folder, whose images/ has a file for each frame, and writes sparse/0.
-Poses = Callable[[list[Frame], Path], Section]
+Poses = Callable[[list[ThermalFrame], Path], Section]
 # What is wrong with the files of a folder (prepared or not), read as they are here, the most costly first.
 Doctor = Callable[[Path, Reading], Section]
 
@@ -56,8 +55,8 @@ def prepare(
     Args:
         source: folder of the camera's files.
         target: folder of the scene; what a preparation that was stopped left there is used.
-        conditions: arguments of ``Given``; None takes those of the files.
-        uncertainty: arguments of ``Uncertainty``.
+        conditions: arguments of ``GivenConditions``; None takes those of the files.
+        uncertainty: arguments of ``InputUncertainty``.
         counts: ``scale``, ``offset_c`` and ``planck`` of ``Meaning``.
         bounds_c, band_um: of ``Meaning``.
         zone, table, table_columns: of ``Reading``.
@@ -75,12 +74,9 @@ def prepare(
         raise SceneError(f"source={source}: {what}")
     if folder == target.resolve() or folder in target.resolve().parents:
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
-    given, uncertain = Given(**conditions), Uncertainty(**uncertainty)
-    reading = Reading(
-        Meaning(**counts, bounds_c=bounds_c, band_um=band_um),
-        zone,
-        Path(table).expanduser() if table else None,
-        table_columns or {},
+    given, uncertain = GivenConditions(**conditions), InputUncertainty(**uncertainty)
+    reading = reading_of(
+        counts=counts, bounds_c=bounds_c, band_um=band_um, zone=zone, table=table, table_columns=table_columns
     )
     found = read_recording(folder, reading)
     for note in found.notes:
@@ -122,7 +118,11 @@ def prepare(
 
 
 def _cameras(
-    poses: Poses, doctor: Callable[[], Section] | None, frames: list[Frame], place: Target, before: Sequence[Section]
+    poses: Poses,
+    doctor: Callable[[], Section] | None,
+    frames: list[ThermalFrame],
+    place: Target,
+    before: Sequence[Section],
 ) -> list[Section]:
     """What became of the cameras, and what the doctor sees with them. Where there are none the report says why."""
     target = place.folder

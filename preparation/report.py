@@ -20,9 +20,9 @@ from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.target import PREPARED, REPORT
 from heatsplat.preparation.writer import QUANTILES, rows
 
@@ -78,7 +78,7 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
+def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
     """What was read."""
     devices = devices_of(frames)
     lines = [f"- {counted(len(frames), 'frame')}, camera {devices[0].label}"]
@@ -107,7 +107,9 @@ def recording(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], not
     return Section("The recording", [*lines, *(f"- {note}" for note in notes)])
 
 
-def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], uncertain: Uncertainty) -> Section | None:
+def radiometry(
+    frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], uncertain: InputUncertainty
+) -> Section | None:
     """What each condition is, where it comes from, what it changes and what uncertainty it brings; None for greys.
 
     At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below.
@@ -167,7 +169,7 @@ def radiometry(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]], un
     return Section("Radiometry", lines + _doubts(frames), values)
 
 
-def _is_corrected(frame: Frame) -> bool:
+def _is_corrected(frame: ThermalFrame) -> bool:
     """Whether its temperatures are those of surfaces; without an effect of emissivity, air and window they are apparent."""
     return any(float(getattr(frame.conditions, name)) != neutral for name, neutral in NEUTRAL.items())
 
@@ -177,7 +179,7 @@ def _plus_minus(name: str, value: float) -> str:
     return f"{shown:.3g}{SUFFIX.get(name, ' °C' if name == 'camera' else '')}"
 
 
-def _doubts(frames: Sequence[Frame]) -> list[str]:
+def _doubts(frames: Sequence[ThermalFrame]) -> list[str]:
     """What the files say and a thermographer would ask about."""
     found = []
     if any(f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file" for f in frames):
@@ -196,7 +198,7 @@ def _doubts(frames: Sequence[Frame]) -> list[str]:
     return ["", *(f"**{text}**" for text in found)] if found else []
 
 
-def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> Section:
+def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> Section:
     """A few frames, the histogram of every frame, and how temperatures run over time where there are several."""
     shown = [frame for frame, record in zip(frames, records, strict=True) if record["quantiles"]]
     known = [(row, r["quantiles"]) for row, r in zip(rows(frames, records), records, strict=True) if r["quantiles"]]
@@ -262,7 +264,7 @@ def pictures(target: Path, frames: Sequence[Frame], records: Sequence[Mapping[st
     return Section("Pictures", lines, {"median_span": float(np.ptp(middle)), "largest_step": float(jump)})
 
 
-def _few_frames(frames: Sequence[Frame], quantiles: np.ndarray, unit: str) -> Figure:
+def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str) -> Figure:
     """Frames spread over the recording, in colours that they share, from their quantiles [n, q]."""
     few = [frames[i] for i in evenly_spread(len(frames), SHOWN)]
     columns = min(len(few), ACROSS)

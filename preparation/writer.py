@@ -31,9 +31,9 @@ from heatsplat.io.tiff import write_temperature
 from heatsplat.physics.defects import dead_pixels
 from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, measured_signal, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.conditions import Uncertainty
+from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.target import PARTIAL
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
@@ -50,14 +50,14 @@ class Writer:
         keep_counts: also write the numbers as the camera stored them, as 16-bit PNG in counts/.
     """
 
-    def __init__(self, target: Path, uncertain: Uncertainty, keep_counts: bool) -> None:
+    def __init__(self, target: Path, uncertain: InputUncertainty, keep_counts: bool) -> None:
         self.target, self.uncertain, self.keep_counts = target, uncertain, keep_counts
         self.images = target / "images"
         self.dead: dict[
             str, np.ndarray
         ] = {}  # by name of a frame: [H, W] bool, pixels of its detector that say nothing
 
-    def check(self, frames: Sequence[Frame]) -> None:
+    def check(self, frames: Sequence[ThermalFrame]) -> None:
         """Raises SceneError where the folder holds images of another recording, or there are no counts to keep."""
         if self.keep_counts and not any(d.frames[0].load().dtype == np.uint16 for d in devices_of(frames)):
             raise SceneError(
@@ -68,11 +68,11 @@ class Writer:
         if foreign := next((p for p in there if p.stem not in ours), None):
             raise SceneError(f"{foreign} is no frame of this recording; give an empty folder as target, or remove it")
 
-    def image_of(self, frame: Frame) -> Path:
+    def image_of(self, frame: ThermalFrame) -> Path:
         """Its file in the prepared folder."""
         return self.images / image_name(frame)
 
-    def write(self, frame: Frame) -> tuple[dict[str, Any], bool]:
+    def write(self, frame: ThermalFrame) -> tuple[dict[str, Any], bool]:
         """The record of a frame, and whether its image had to be written."""
         record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
         done = read_json_object(record_file) or {}
@@ -99,7 +99,7 @@ class Writer:
         write_atomically(record_file, json.dumps(record, indent=1, allow_nan=False) + "\n")
         return record, True
 
-    def photo_of(self, frame: Frame) -> Path:
+    def photo_of(self, frame: ThermalFrame) -> Path:
         """Where the photo inside a frame's file goes."""
         return self.target / "visible" / f"{frame.name}.jpg"
 
@@ -107,13 +107,13 @@ class Writer:
     def _replace(path: Path, content: Any) -> None:
         write_atomically(path, memoryview(np.frombuffer(content, np.uint8)))
 
-    def _made_of(self, frame: Frame) -> str:
+    def _made_of(self, frame: ThermalFrame) -> str:
         file = frame.path.stat()
         parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
         dead = np.flatnonzero(self.dead[frame.name]).tolist() if frame.name in self.dead else []
         return hashlib.sha256(json.dumps([*parts, repr(self.uncertain), dead]).encode()).hexdigest()[:32]
 
-    def _record(self, frame: Frame, pixels: np.ndarray) -> dict[str, Any]:
+    def _record(self, frame: ThermalFrame, pixels: np.ndarray) -> dict[str, Any]:
         finite = np.isfinite(pixels)
         known = pixels[finite & ~self.dead[frame.name] if frame.name in self.dead else finite]
         record: dict[str, Any] = {
@@ -149,7 +149,7 @@ class Writer:
             record["uncertainty_c"] = {"at_c": median} | {n: x if np.isfinite(x) else None for n, x in parts.items()}
         return record
 
-    def find_dead_pixels(self, frames: Sequence[Frame]) -> int:
+    def find_dead_pixels(self, frames: Sequence[ThermalFrame]) -> int:
         """How many pixels of the detector (of each camera's) are dead; from here on no record counts them."""
         count = 0
         for device in devices_of(frames):
@@ -161,14 +161,14 @@ class Writer:
                 count += int(dead.sum())
         return count
 
-    def write_masks(self, frames: Sequence[Frame]) -> None:
+    def write_masks(self, frames: Sequence[ThermalFrame]) -> None:
         """Leaves dead pixels out of every image: masks/ (white counts)."""
         for frame in frames:
             if frame.name in self.dead:
                 mask = cv2.imencode(".png", np.where(self.dead[frame.name], 0, 255).astype(np.uint8))[1]
                 self._replace(self.target / "masks" / f"{self.image_of(frame).name}.png", mask)
 
-    def finish(self, frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> None:
+    def finish(self, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> None:
         """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""
         shutil.rmtree(self.target / PARTIAL, ignore_errors=True)
         write_csv(self.target / FRAMES_FILE, rows(frames, records))
@@ -177,13 +177,12 @@ class Writer:
         ]
         if found:
             low, high = min(q[0] for q in found), max(q[-1] for q in found)
-            bounds = {"absolute_min_temperature": low, "absolute_max_temperature": max(high, low + 1e-3)}
-            write_atomically(self.target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+            write_bounds(self.target, low, max(high, low + 1e-3))
         else:  # bounds of an earlier preparation would make temperatures of greys
             (self.target / BOUNDS_FILE).unlink(missing_ok=True)
 
 
-def image_name(frame: Frame) -> str:
+def image_name(frame: ThermalFrame) -> str:
     """Name of a frame's image in a prepared folder: float32 TIFF in °C, PNG for greys."""
     return f"{frame.name}.{ENDINGS[frame.calibration is not None]}"
 
@@ -195,6 +194,12 @@ def write_world(target: Path, metres_per_unit: float | None) -> None:
         path.unlink(missing_ok=True)
     else:
         write_atomically(path, json.dumps({"metres_per_unit": metres_per_unit}) + "\n")
+
+
+def write_bounds(target: Path, low: float, high: float) -> None:
+    """Says in a prepared folder between which temperatures in °C its images lie."""
+    bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
+    write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
 
 
 def uncertainty_at(
@@ -219,7 +224,7 @@ def calibration_as_json(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def rows(frames: Sequence[Frame], records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def rows(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row for each frame: file, time, place, temperatures."""
     timed = all(frame.time is not None for frame in frames)
     first = instant(frames[0].time) if timed else 0.0

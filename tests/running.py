@@ -14,8 +14,8 @@ TINY = (
 )  # fmt: skip
 
 
-def compose_run(output_dir: Path, *overrides: str, config_name: str = "train") -> DictConfig:
-    """The configuration of ``python src/train.py OVERRIDES``, its interpolations not resolved; the same for any folder."""
+def compose_run(*overrides: str, config_name: str = "train") -> DictConfig:
+    """The configuration of ``python src/train.py OVERRIDES``, its interpolations not resolved."""
     return compose_unresolved(overrides, config_name)
 
 

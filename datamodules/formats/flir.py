@@ -34,7 +34,7 @@ class Measured:
         response: the camera's calibration.
         conditions: its object parameters; what is implausible in the file has the neutral value and no place in ``given``.
         given: names of the conditions that the file states.
-        model, serial, focus, field_of_view_deg, frame_rate_hz: of the camera; None where the file does not say.
+        model, serial, field_of_view_deg, frame_rate_hz: of the camera; None where the file does not say.
         time: with the camera's zone, or None.
         latitude_deg, longitude_deg, altitude_m: of GPS, or None.
     """

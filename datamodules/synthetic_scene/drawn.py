@@ -10,7 +10,8 @@ import torch
 
 from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws, Gloss, Haze
 from heatsplat.datamodules.synthetic_scene.heat import Material, periodic
-from heatsplat.datamodules.synthetic_scene.outdoor import NIGHT_S, SKIES, YARD, OutdoorPreset
+from heatsplat.datamodules.synthetic_scene.outdoor import NIGHT_S, YARD, OutdoorPreset
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import SKIES
 from heatsplat.datamodules.synthetic_scene.presets import PANE, Lamp, Pattern, Preset
 from heatsplat.datamodules.synthetic_scene.rooms import room
 from heatsplat.datamodules.synthetic_scene.shapes import Box

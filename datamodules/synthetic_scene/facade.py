@@ -16,23 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneError, ThermalRange, Weather
+from heatsplat.contracts import SceneError, Weather
 from heatsplat.datamodules.sun import clear_sky, clouds, split_irradiance, sun_directions
 from heatsplat.datamodules.synthetic_scene import layered_heat
 from heatsplat.datamodules.synthetic_scene.layered_heat import Body, Course, Layer, Patches
 from heatsplat.datamodules.synthetic_scene.outdoor import (
     CLASSES,
-    SAMPLE_S,
-    SITE,
     OutdoorPreset,
     OutdoorScene,
     OutdoorSurface,
-    Sky,
-    _normals,
-    _series,
-    _shades,
-    forcing_of,
+    face_normals,
+    shades_of,
 )
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import SAMPLE_S, SITE, Sky, forcing_of, series
 from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
@@ -75,7 +71,6 @@ BODIES = {
     "limestone": _stone(LIMESTONE),
     "granite": _stone(GRANITE),
 }
-DEFECTS = ("thin insulation", "no insulation", "slab edge")
 
 
 def u_value(body: Body) -> float:
@@ -165,21 +160,15 @@ class FacadeScene(OutdoorScene):
 
     probe_reach_m = 0.15
 
-    def __init__(self, preset: FacadePreset) -> None:
-        if preset.weather != FACADE.weather:
-            raise SceneError(f"data.weather={preset.weather}: these fronts have the weather of two winter nights only")
-        self.preset = preset
-        self.shapes = [surface.shape for surface in preset.surfaces]
-        self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
-        self.emissivity = torch.ones(len(preset.surfaces) + 1, dtype=torch.float64)  # to the camera, once corrected
-        self.materials = [surface.material for surface in preset.surfaces]
-        self.thermal_range = ThermalRange(*preset.bounds_c)
-        self.weather = winter_weather(0.0, preset.duration_s)
-        faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
-        self.face_surface = torch.tensor([number for number, _ in faces])
-        self.face_normals = torch.tensor([normal for _, normal in faces], dtype=torch.float64)
-        self.shades = torch.stack([_shades(preset.surfaces[number].absorbs) for number, _ in faces])
-        self.history = _History(_solved(preset.surfaces, preset.duration_s))
+    def _weather(self) -> Weather:
+        if self.preset.weather != FACADE.weather:
+            raise SceneError(
+                f"data.weather={self.preset.weather}: these fronts have the weather of two winter nights only"
+            )
+        return winter_weather(0.0, self.preset.duration_s)
+
+    def _history(self) -> _History:  # type: ignore[override]
+        return _History(_solved(self.preset.surfaces, self.preset.duration_s))
 
     def how_solved(self) -> str:
         return (
@@ -222,10 +211,10 @@ def winter_weather(start_s: float, end_s: float) -> Weather:
     """The weather every ten minutes, on the clock of the record; the same bits on every call."""
     times = np.arange(start_s, end_s + 0.5 * SAMPLE_S, SAMPLE_S)
     utc_s = START_UTC_S + times
-    air, wind, humidity, passing = _series(WINTER, times + START_UTC_S % DAY_S)
+    air, wind, humidity, passing = series(WINTER, times + START_UTC_S % DAY_S)
     irradiance = clear_sky(SITE, utc_s) * passing
     direct, diffuse = split_irradiance(SITE, utc_s, irradiance)
-    series = {
+    columns = {
         "air_c": air,
         "wind_m_s": wind,
         "humidity_percent": humidity,
@@ -241,14 +230,14 @@ def winter_weather(start_s: float, end_s: float) -> Weather:
         "north": list(SITE.north),
         "indoor_c": INDOOR_C,
     }
-    return Weather(torch.from_numpy(times), **{k: torch.from_numpy(v) for k, v in series.items()}, notes=notes)
+    return Weather(torch.from_numpy(times), **{k: torch.from_numpy(v) for k, v in columns.items()}, notes=notes)
 
 
 @cache
 def _solved(surfaces: tuple[OutdoorSurface, ...], duration_s: float) -> Course:
     """Surface temperatures of all faces in all their shades, after days of the same weather."""
-    faces = [(number, normal) for number, surface in enumerate(surfaces) for normal in _normals(surface.shape)]
-    shades = [_shades(surfaces[number].absorbs).numpy() for number, _ in faces]
+    faces = [(number, normal) for number, surface in enumerate(surfaces) for normal in face_normals(surface.shape)]
+    shades = [shades_of(surfaces[number].absorbs).numpy() for number, _ in faces]
     count = len(shades[0])
     body, normals = np.repeat([number for number, _ in faces], count), np.array([normal for _, normal in faces])
     up = np.array(SITE.up)

@@ -15,28 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneError, ThermalRange, Weather
-from heatsplat.datamodules.sun import Site, clear_sky, clouds, cover_of, light_taken, split_irradiance, sun_directions
-from heatsplat.datamodules.synthetic_scene.outdoor_heat import (
-    Forcing,
-    History,
-    OutdoorMaterial,
-    Slab,
-    integrate,
-    solve,
-)
+from heatsplat.contracts import ThermalRange, Weather
+from heatsplat.datamodules.synthetic_scene.outdoor_heat import History, OutdoorMaterial, Slab, integrate, solve
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import DURATION_S, forcing_of, outdoor_weather, part_of
 from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
-from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
+from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
 from heatsplat.training.rng import generator_for
 
-SITE = Site(latitude=47.0, longitude=9.0, altitude_m=500.0)
-START_UTC = "2024-07-11T00:00:00+00:00"
-START_UTC_S = 1720656000.0
-DURATION_S = 2.0 * DAY_S
-SAMPLE_S = 600.0
 NIGHT_S = (19.7 * 3600.0, 27.4 * 3600.0)  # from sunset to sunrise
 # Weather before the record, so that its start finds the surfaces in the middle of things and not at one temperature.
 _BEFORE_S = 0.5 * DAY_S
@@ -124,34 +112,6 @@ YARD = (
 
 
 @dataclass(frozen=True)
-class Sky:
-    """How the days go.
-
-    Args:
-        warm_c, swing_k: mean and half the range of the day's air temperature.
-        dew_point_c: moisture of the air.
-        cloud: added to the share of the sky that clouds take; -1 clears it, 1 closes it.
-        wind_factor, wind_added: what becomes of the wind, in m/s.
-    """
-
-    warm_c: float = 18.0
-    swing_k: float = 6.5
-    dew_point_c: float = 9.5
-    cloud: float = 0.0
-    wind_factor: float = 1.0
-    wind_added: float = 0.0
-
-
-# "fair" is the weather of the record; the others are asked for with data.weather, and start from the same midnight.
-SKIES: dict[str, Sky] = {
-    "fair": Sky(),
-    "calm": Sky(wind_factor=0.12),
-    "windy": Sky(wind_added=7.0),
-    "overcast": Sky(warm_c=15.5, swing_k=2.5, dew_point_c=11.5, cloud=2.2),
-}
-
-
-@dataclass(frozen=True)
 class OutdoorPreset(Preset):
     """A scene under the sky.
 
@@ -181,124 +141,6 @@ class OutdoorPreset(Preset):
 OUTDOOR: dict[str, OutdoorPreset] = {"outdoor": OutdoorPreset()}
 
 
-def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) -> Weather:
-    """The weather of a sky in ``SKIES`` every ten minutes, on the clock of the record; the same bits on every call.
-
-    Another sky than "fair" takes over from it within the first hour of the record, so that all begin alike.
-
-    Breeze and clouds are sums of slow waves of random phase. Clouds of cover c let 1 - 0.75 c^3.4 of the clear sky's
-    light pass (Kasten and Czeplak 1980); what passes is split into sun and sky as a measured irradiance would be.
-    """
-    times = np.arange(start_s, end_s + 0.5 * SAMPLE_S, SAMPLE_S)
-    air, wind, humidity, passing = _under(name, times)
-    utc_s = START_UTC_S + times
-    irradiance = clear_sky(SITE, utc_s) * passing
-    direct, diffuse = split_irradiance(SITE, utc_s, irradiance)
-    return Weather(
-        times_s=torch.from_numpy(times),
-        air_c=torch.from_numpy(air),
-        wind_m_s=torch.from_numpy(wind),
-        humidity_percent=torch.from_numpy(humidity),
-        irradiance_w_m2=torch.from_numpy(irradiance),
-        pressure_hpa=torch.from_numpy(955.0 + 4.0 * _drift("pressure", times, (53.0, 23.0))),
-        direct_w_m2=torch.from_numpy(direct),
-        diffuse_w_m2=torch.from_numpy(diffuse),
-        clouds=clouds_of_light(utc_s, irradiance),
-        sun=torch.from_numpy(sun_directions(SITE, utc_s)),
-        notes={
-            "source": f"made up: {name}",
-            "latitude": SITE.latitude,
-            "longitude": SITE.longitude,
-            "altitude_m": SITE.altitude_m,
-            "up": list(SITE.up),
-            "north": list(SITE.north),
-            "utc_at_zero_s": START_UTC_S,
-        },
-    )
-
-
-def cloud_cover(name: str, times_s: np.ndarray) -> np.ndarray:
-    """Share of the sky [T] that clouds of a sky in ``SKIES`` take, by night too."""
-    return cover_of(1.0 - _under(name, times_s)[3])
-
-
-def clouds_of_light(utc_s: np.ndarray, irradiance_w_m2: np.ndarray) -> Tensor | None:
-    """What a record of this light tells of clouds (``Weather.clouds``)."""
-    told = clouds(SITE, utc_s, irradiance_w_m2)
-    return None if told is None else torch.from_numpy(told)
-
-
-def _under(name: str, times_s: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``_series`` of a sky in ``SKIES``, which takes over from "fair" within the first hour of the record."""
-    fair = _series(SKIES["fair"], times_s)
-    if name == "fair":
-        return fair
-    share = np.clip(times_s / 3600.0, 0.0, 1.0)
-    return tuple(one + share * (other - one) for one, other in zip(fair, _series(SKIES[name], times_s), strict=True))
-
-
-def _within(weather: Weather, part_s: tuple[float, float]) -> Weather:
-    """The samples of a record between two times in seconds, and one more on either side."""
-    kept = (weather.times_s >= part_s[0] - SAMPLE_S) & (weather.times_s <= part_s[1] + SAMPLE_S)
-    told = {name: value for name, value in vars(weather).items() if name not in ("up", "notes") and value is not None}
-    series = {name: value[kept] for name, value in told.items()}
-    return replace(weather, **series)
-
-
-def _drift(purpose: str, times_s: np.ndarray, periods_h: tuple[float, ...]) -> np.ndarray:
-    """Slow waves [T] of random phase, their mean, in [-1, 1]."""
-    phases = torch.rand(len(periods_h), generator=generator_for(0, 0, f"outdoor {purpose}"), dtype=torch.float64)
-    periods = zip(periods_h, phases.tolist(), strict=True)
-    return np.mean([np.sin(2.0 * np.pi * (times_s / 3600.0 / period + phase)) for period, phase in periods], axis=0)
-
-
-def _series(sky: Sky, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Air in °C, wind in m/s, humidity in % and the share of light that clouds let pass, each [T]."""
-    solar_hours = times_s / 3600.0 + SITE.longitude / 15.0
-
-    def drift(purpose: str, periods_h: tuple[float, ...]) -> np.ndarray:
-        return _drift(purpose, times_s, periods_h)
-
-    day = np.cos(2.0 * np.pi * (solar_hours - 15.0) / 24.0)
-    second_harmonic = 0.15 * np.cos(4.0 * np.pi * (solar_hours - 14.0) / 24.0)
-    air = sky.warm_c + sky.swing_k * (day + second_harmonic) + 1.2 * drift("air", (31.0, 9.0, 3.7)) + times_s / DAY_S
-    dew_point = sky.dew_point_c + 1.5 * drift("moisture", (40.0, 11.0))
-    humidity = np.clip(100.0 * _vapour_hpa(dew_point) / _vapour_hpa(air), 5.0, 100.0)
-    wind_m_s = (
-        2.6 + 1.1 * np.cos(2.0 * np.pi * (solar_hours - 16.0) / 24.0) + 2.2 * drift("wind", (17.0, 5.3, 1.9, 0.7))
-    )
-    wind = np.clip(wind_m_s, 0.2, None) * sky.wind_factor + sky.wind_added * (1.0 + 0.3 * drift("gusts", (6.1, 1.3)))
-    cover = np.clip(0.25 + 1.3 * drift("clouds", (19.0, 5.9, 1.1, 0.43)) + sky.cloud, 0.0, 1.0)
-    return air, wind, humidity, 1.0 - light_taken(cover)
-
-
-def _vapour_hpa(celsius: np.ndarray) -> np.ndarray:
-    """Saturation pressure of water vapour (Magnus; Alduchov and Eskridge 1996)."""
-    return 6.1094 * np.exp(17.625 * celsius / (celsius + 243.04))
-
-
-def sky_long_waves(weather: Weather) -> np.ndarray:
-    """Long-wave irradiance [T] of a whole clear sky in W/m²: Brutsaert's emissivity 1.24 (e / T)^(1/7), e in hPa."""
-    air_k = weather.air_c.numpy() + KELVIN_AT_0_C
-    vapour = 0.01 * weather.humidity_percent.numpy() * _vapour_hpa(weather.air_c.numpy())
-    return 1.24 * (vapour / air_k) ** (1.0 / 7.0) * STEFAN_BOLTZMANN * air_k**4
-
-
-def forcing_of(weather: Weather, normals: np.ndarray) -> Forcing:
-    """What a weather does to faces with outward ``normals`` [F, 3]; sun and sky are as bright all over (isotropic)."""
-    air_k = weather.air_c.numpy() + KELVIN_AT_0_C
-    sky_share = 0.5 * (1.0 + normals @ weather.up.numpy())
-    beam = weather.direct_w_m2.numpy()[:, None] * np.clip(weather.sun.numpy() @ normals.T, 0.0, None)
-    around = STEFAN_BOLTZMANN * air_k**4
-    return Forcing(
-        times_s=weather.times_s.numpy(),
-        air_k=air_k,
-        wind_m_s=weather.wind_m_s.numpy(),
-        sunlight_w_m2=beam + weather.diffuse_w_m2.numpy()[:, None] * sky_share,
-        long_waves_w_m2=sky_long_waves(weather)[:, None] * sky_share + around[:, None] * (1.0 - sky_share),
-    )
-
-
 @dataclass(frozen=True)
 class OutdoorHeat:
     """What decides the temperature of n surface points over time.
@@ -318,25 +160,34 @@ class OutdoorScene(Scene):
     probe_reach_m = 0.25
 
     def __init__(self, preset: OutdoorPreset) -> None:
-        if preset.weather not in SKIES:
-            raise SceneError(f"data.weather={preset.weather}: this scene knows {', '.join(SKIES)}")
         self.preset = preset
         self.shapes = [surface.shape for surface in preset.surfaces]
         self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
-        self.emissivity = torch.ones(
-            len(preset.surfaces) + 1, dtype=torch.float64
-        )  # to the camera, as after correction
-        self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
+        # To the camera, as after correction.
+        self.emissivity = torch.ones(len(preset.surfaces) + 1, dtype=torch.float64)
+        self.materials = [surface.material for surface in preset.surfaces]
         self.thermal_range = ThermalRange(*preset.bounds_c)
-        self.weather = outdoor_weather(preset.weather, 0.0, preset.duration_s)
-        if preset.part_s is not None:
-            self.weather = _within(self.weather, preset.part_s)
+        self.weather = self._weather()
+        self._solve()
+
+    def _weather(self) -> Weather:
+        """What drives the heat. Raises SceneError where the scene does not know the preset's weather."""
+        weather = outdoor_weather(self.preset.weather, 0.0, self.preset.duration_s)
+        return weather if self.preset.part_s is None else part_of(weather, self.preset.part_s)
+
+    def _solve(self) -> None:
+        """Sets what ``heat_at`` and ``celsius`` look temperatures up in."""
         # Faces in the order of the surfaces; of each its surface, its normal and the shades that it is solved for.
-        faces = [(number, normal) for number, s in enumerate(preset.surfaces) for normal in _normals(s.shape)]
+        surfaces = self.preset.surfaces
+        faces = [(number, normal) for number, s in enumerate(surfaces) for normal in face_normals(s.shape)]
         self.face_surface = torch.tensor([number for number, _ in faces])
         self.face_normals = torch.tensor([normal for _, normal in faces], dtype=torch.float64)
-        self.shades = torch.stack([_shades(preset.surfaces[number].absorbs) for number, _ in faces])
-        self.history = _solved(preset.surfaces, preset.weather, preset.duration_s)
+        self.shades = torch.stack([shades_of(surfaces[number].absorbs) for number, _ in faces])
+        self.history = self._history()
+
+    def _history(self) -> History:
+        """Temperatures of all faces in all their shades over time."""
+        return _solved(self.preset.surfaces, self.preset.weather, self.preset.duration_s)
 
     def heat_at(self, points: Tensor, which: Tensor) -> OutdoorHeat:  # type: ignore[override]
         """Face and absorptivity at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
@@ -369,7 +220,7 @@ class OutdoorScene(Scene):
 
     def how_solved(self) -> str:
         return (
-            f"conduction into {len(self.materials)} materials by implicit finite volumes (grids differ by "
+            f"conduction into {len(set(self.materials))} materials by implicit finite volumes (grids differ by "
             f"{1e3 * self.history.error_k:.0f} mK before extrapolation), sun by orientation without cast shadows, wind, "
             f"long waves of a clear sky; weather: {self.preset.weather}"
         )
@@ -381,11 +232,10 @@ class OutdoorScene(Scene):
     def attributes(self, points: Tensor) -> dict[str, Tensor]:
         """True properties [n] of the surface nearest to each of ``points`` [n, 3], by name with unit."""
         on_surface, which = self.nearest(points)
-        materials = [surface.material for surface in self.preset.surfaces]
         wind = float(self.weather.wind_m_s.mean())
 
         def by_surface(value) -> Tensor:
-            return torch.tensor([value(m) for m in materials], dtype=torch.float64)[which]
+            return torch.tensor([value(m) for m in self.materials], dtype=torch.float64)[which]
 
         return {
             "absorptivity": self.heat_at(on_surface, which).absorptivity,
@@ -453,8 +303,8 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str, duration_s: floa
     """Surface temperatures of all faces in all their shades; every weather starts from the same midnight."""
     slabs, normals = [], []
     for surface in surfaces:
-        for normal in _normals(surface.shape):
-            slabs += [Slab(surface.material, float(a), len(normals)) for a in _shades(surface.absorbs)]
+        for normal in face_normals(surface.shape):
+            slabs += [Slab(surface.material, float(a), len(normals)) for a in shades_of(surface.absorbs)]
             normals.append(normal)
     before = forcing_of(outdoor_weather("fair", -_BEFORE_S, 0.0), np.array(normals))
     # How the surfaces got to their state at midnight need not be converged: it defines the start.
@@ -462,17 +312,17 @@ def _solved(surfaces: tuple[OutdoorSurface, ...], weather: str, duration_s: floa
     return solve(slabs, forcing_of(outdoor_weather(weather, 0.0, duration_s), np.array(normals)), midnight)
 
 
-def _normals(shape: Box | Plane) -> list[tuple[float, float, float]]:
+def face_normals(shape: Box | Plane) -> list[tuple[float, float, float]]:
     """Outward normals of the flat faces of a shape that do not look down; those that do touch the ground."""
     if isinstance(shape, Plane):
         return [shape.normal]
-    turn = shape._turn()
+    axes = shape.rotation()
     return [
-        tuple(side * turn[:, axis].numpy()) for axis in range(3) for side in (1.0, -1.0) if side * turn[2, axis] > -0.5
+        tuple(side * axes[:, axis].numpy()) for axis in range(3) for side in (1.0, -1.0) if side * axes[2, axis] > -0.5
     ]
 
 
-def _shades(absorbs: Pattern) -> Tensor:
+def shades_of(absorbs: Pattern) -> Tensor:
     """The absorptivities [3] between which a face's temperature is interpolated: those of Chebyshev over its range."""
     reach = absorbs.swing + absorbs.step
     return absorbs.level + reach * torch.cos(math.pi * (torch.arange(3, dtype=torch.float64) + 0.5) / 3)

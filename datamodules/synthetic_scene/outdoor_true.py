@@ -17,19 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneError, ThermalRange, Weather
+from heatsplat.contracts import Weather
 from heatsplat.datamodules.sun import split_irradiance
 from heatsplat.datamodules.synthetic_scene import layered_heat
 from heatsplat.datamodules.synthetic_scene.facade import FACADE, STONE, FacadeScene
 from heatsplat.datamodules.synthetic_scene.layered_heat import VAPOUR_J_KG_K, Body, Course, Layer, Patches
-from heatsplat.datamodules.synthetic_scene.outdoor import (
-    OUTDOOR,
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, YARD, OutdoorPreset, OutdoorScene
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import (
     SITE,
-    SKIES,
     START_UTC_S,
-    YARD,
-    OutdoorPreset,
-    OutdoorScene,
     cloud_cover,
     clouds_of_light,
     outdoor_weather,
@@ -84,15 +80,11 @@ class PatchHeat:
 class OutdoorTrueScene(OutdoorScene):
     """A yard whose heat was solved patch by patch under a weather; see ``OutdoorScene``."""
 
-    def __init__(self, preset: TrueScenePreset) -> None:
-        if preset.weather not in SKIES:
-            raise SceneError(f"data.weather={preset.weather}: this scene knows {', '.join(SKIES)}")
-        self.preset = preset
-        self.shapes = [surface.shape for surface in preset.surfaces]
-        self.transmits = torch.zeros(len(preset.surfaces) + 1, dtype=torch.float64)
-        self.materials = [surface.material for surface in preset.surfaces]
-        self.thermal_range = ThermalRange(*preset.bounds_c)
-        self.weather = true_weather(preset.weather, preset.duration_s)
+    def _weather(self) -> Weather:
+        return true_weather(self.preset.weather, self.preset.duration_s)
+
+    def _solve(self) -> None:
+        preset = self.preset
         self.light, self.course = _solved(
             preset.surfaces, preset.weather, preset.duration_s, preset.patch_m, preset.ground_m
         )

@@ -131,7 +131,7 @@ class Box:
     yaw_deg: float = 0.0
     tilt_deg: float = 0.0
 
-    def _turn(self) -> Tensor:
+    def rotation(self) -> Tensor:
         """Rotation [3, 3] from the box's axes to the world's."""
         c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
         yaw = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -141,7 +141,7 @@ class Box:
         return yaw @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]], dtype=torch.float64)
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
-        turn = self._turn()
+        turn = self.rotation()
         offset, rays = (origins - _row(self.center)) @ turn, directions @ turn
         first = torch.full_like(offset[:, 0], -math.inf)
         last = torch.full_like(offset[:, 0], math.inf)
@@ -154,14 +154,14 @@ class Box:
         return torch.where((first <= last) & (first > 0), first, torch.full_like(first, math.inf))
 
     def normals(self, points: Tensor) -> Tensor:
-        turn = self._turn()
+        turn = self.rotation()
         local = (points - _row(self.center)) @ turn / (0.5 * _row(self.size))
         face = local.abs().argmax(1, keepdim=True)
         normal = torch.zeros_like(local).scatter(1, face, local.gather(1, face).sign())
         return normal @ turn.T
 
     def nearest(self, points: Tensor) -> Tensor:
-        turn, half = self._turn(), 0.5 * _row(self.size)
+        turn, half = self.rotation(), 0.5 * _row(self.size)
         local = (points - _row(self.center)) @ turn
         clamped = torch.minimum(torch.maximum(local, -half), half)
         inside = (local.abs() < half).all(1)
@@ -171,7 +171,7 @@ class Box:
         return torch.where(inside[:, None], pushed, clamped) @ turn.T + _row(self.center)
 
     def local(self, points: Tensor) -> Tensor:
-        return (points - _row(self.center)) @ self._turn()
+        return (points - _row(self.center)) @ self.rotation()
 
     def bounds(self) -> tuple[Point, float]:
         return self.center, 0.5 * math.hypot(*self.size)

@@ -10,12 +10,8 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.flaws import CameraFlaws
-from heatsplat.datamodules.synthetic_scene.outdoor import (
-    OutdoorPreset,
-    OutdoorScene,
-    OutdoorSurface,
-    outdoor_weather,
-)
+from heatsplat.datamodules.synthetic_scene.outdoor import OutdoorPreset, OutdoorScene, OutdoorSurface
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import outdoor_weather
 from heatsplat.datamodules.synthetic_scene.presets import Preset
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin

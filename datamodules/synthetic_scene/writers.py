@@ -20,7 +20,7 @@ from PIL import Image
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.synthetic_scene.film import Recording
 from heatsplat.datamodules.synthetic_scene.outdoor import training_frames
-from heatsplat.datamodules.weather import utc_text, write_weather
+from heatsplat.datamodules.weather_table import utc_text, write_weather
 from heatsplat.geometry.transforms import OPENGL_AXES
 from heatsplat.physics.units import KELVIN_AT_0_C
 

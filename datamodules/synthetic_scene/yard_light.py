@@ -86,7 +86,7 @@ def faces_of(shapes: Sequence[Box | Plane], patch_m: float, ground_m: float) -> 
             normal = torch.tensor(shape.normal, dtype=torch.float64)
             add(number, corner, sides, normal, torch.full((2,), 2 * REACH_M), ground_m)
             continue
-        turn, size = shape._turn(), torch.tensor(shape.size, dtype=torch.float64)
+        turn, size = shape.rotation(), torch.tensor(shape.size, dtype=torch.float64)
         centre = torch.tensor(shape.center, dtype=torch.float64)
         for axis in range(3):
             for sign in (1.0, -1.0):

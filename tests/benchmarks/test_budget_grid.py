@@ -208,7 +208,7 @@ def test_settings_of_all_runs_choose_what_a_cap_turns_off(tmp_path, monkeypatch)
     settings = {"train": None, "steps": 250, "caps": 8000, "decays": 1.0, "seeds": 0, "budgets": [], "curves": None}
     budget_grid.run(tmp_path, scenes="etgs/heated", overrides="density=mcmc", **settings)
     (overrides,) = asked
-    density = running.compose_run(tmp_path, *overrides).density  # refused where a key is none of this density control's
+    density = running.compose_run(*overrides).density  # refused where a key is none of this density control's
     assert "MCMC" in density._target_ and density.cap_max == 8000
     assert not [text for text in overrides if text.startswith(("density.multiple", "density.reset_every"))]
 
@@ -232,14 +232,14 @@ def test_what_is_wrong_is_said_before_anything_is_trained(wrong, message, tmp_pa
         budget_grid.run(tmp_path, None, **options | {"overrides": [], "curves": None} | wrong)
 
 
-def test_threads_of_the_study_are_those_of_its_runs(tmp_path):
+def test_threads_of_the_study_are_those_of_its_runs():
     for given, expected in (((), None), (("threads=1",), 1), (("threads=1", "study.threads=3"), 3)):
-        config = running.compose_run(tmp_path, "study=budget", *given, config_name="study")
+        config = running.compose_run("study=budget", *given, config_name="study")
         assert config.study.threads == expected
 
 
-def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
-    study = running.compose_run(tmp_path, "study=budget", config_name="study").study
+def test_the_study_as_it_stands_measures_what_the_repository_holds():
+    study = running.compose_run("study=budget", config_name="study").study
     points = read_points(CURVES_FILE)
     assert {f"{point.method}/{point.scene}" for point in points} <= set(study.scenes)
     assert {point.steps for point in points} <= set(study.steps)
@@ -250,9 +250,9 @@ def test_the_study_as_it_stands_measures_what_the_repository_holds(tmp_path):
     assert {point.decay for point in points} <= set(study.decays)
 
 
-def test_the_study_sets_options_that_every_growing_method_has(tmp_path):
+def test_the_study_sets_options_that_every_growing_method_has():
     for method in sorted(path.stem for path in (Path(CONF) / "method").glob("*.yaml")):
-        density = running.compose_run(tmp_path, f"method={method}").density
+        density = running.compose_run(f"method={method}").density
         if method in ("scaffold_gs", "instant_ngp", "thermonerf"):  # anchors, and fields that do not grow
             continue
         assert {"cap_max", "multiple"} <= set(density) or {"cap_max", "reset_every"} <= set(density), method

@@ -98,7 +98,7 @@ def test_the_study_of_steps_refuses_what_times_nothing(wrong, message, tmp_path)
 @pytest.mark.slow
 def test_the_study_of_steps_tells_ratios(tmp_path):
     overrides = ["study=steps", "study.cases=[[500,64,48]]", "study.steps=8", "study.rounds=1", "study.threads=[1]"]
-    config = compose_run(tmp_path, *overrides, config_name="study")
+    config = compose_run(*overrides, config_name="study")
     tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
     found = [(row["method"], row["views"]) for row in tables["training"]]
     assert found == [("3dgs", 1), ("etgs", 1), ("3dgs", 8), ("etgs", 8)]
@@ -109,7 +109,7 @@ def test_the_study_of_steps_tells_ratios(tmp_path):
 
 @pytest.mark.slow
 def test_the_quick_study_writes_complete_and_plausible_tables(tmp_path):
-    config = compose_run(tmp_path, "study=renderer_quick", config_name="study")
+    config = compose_run("study=renderer_quick", config_name="study")
     tables = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
     assert [len(tables[name]) for name in ("renderer", "modalities", "loss", "memory")] == [7, 1, 4, 1]
     for row in tables["renderer"]:

@@ -133,7 +133,7 @@ def test_the_study_runs_from_its_configuration(tmp_path):
     small = ["gaussians=16", "frames=2", "sample=2", "frequencies=2", "rounds=1", "only=[cooling]", "solvers=[RK4]"]
     document = tmp_path / "page.md"
     overrides = [f"study.{x}" for x in (*small, f"document={document}", f"pictures={tmp_path}")]
-    config = compose_run(tmp_path, "study=work_precision", *overrides, config_name="study")
+    config = compose_run("study=work_precision", *overrides, config_name="study")
     rows = cli.build(OmegaConf.to_container(config.study, resolve=True), output_dir=tmp_path)
     with open(tmp_path / "work_precision.csv", newline="") as file:
         assert len(list(csv.DictReader(file))) == len(rows)

@@ -145,18 +145,6 @@ def test_options_that_are_metadata(tmp_path):
         loaded(tmp_path)
 
 
-def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):
-    files = names(12)
-    write_colmap(tmp_path, files)
-    (tmp_path / "images" / files[3]).unlink()
-    write_image(tmp_path / "images" / "extra.png", grey(0))
-    scene = loaded(tmp_path)
-    assert len(scene.train) + len(scene.test) == 11
-    assert scene.notes["registered"] == 12
-    assert scene.notes["images_missing"].startswith("1 registered images have no file in images/, dropped: frame_003")
-    assert scene.notes["images_unregistered"].startswith("1 files are not in the model, unused: extra.png")
-
-
 def test_other_extensions_and_cases_are_found(tmp_path):
     write_colmap(tmp_path, names(9, "frame_{}.jpg"), images=None)
     for i in range(9):
@@ -265,21 +253,6 @@ def test_an_unsupported_camera_model_names_the_remedy(tmp_path):
     write_colmap(tmp_path, names(9), camera=("FOV", (40.0, 40.0, 20.0, 16.0, 0.1), WIDTH, HEIGHT))
     with pytest.raises(SceneError, match="camera 1: camera model FOV is not supported.*image_undistorter"):
         Colmap(root=str(tmp_path)).setup()
-
-
-def test_a_model_without_any_of_the_images_shows_both_names(tmp_path):
-    write_colmap(tmp_path, names(9), images=None)
-    write_image(tmp_path / "images" / "other.png", grey(0))
-    with pytest.raises(SceneError, match="none of the 9 images of the sparse model .*'frame_000.png'.*'other.png'"):
-        Colmap(root=str(tmp_path)).setup()
-
-
-def test_a_missing_image_folder_names_the_option(tmp_path):
-    write_colmap(tmp_path, names(9))
-    with pytest.raises(SceneError, match="data.images=thermal: .*does not exist"):
-        Colmap(root=str(tmp_path), images="thermal").setup()
-    with pytest.raises(SceneError, match="data.raw=raw16: .*does not exist"):
-        Colmap(root=str(tmp_path), raw="raw16").setup()
 
 
 def test_damaged_images_are_named(tmp_path):

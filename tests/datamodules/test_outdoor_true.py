@@ -9,7 +9,7 @@ import torch
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.datamodules.synthetic_scene.outdoor import SKIES, _series, cloud_cover
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import SKIES, cloud_cover, series
 from heatsplat.datamodules.synthetic_scene.outdoor_true import TRUE, OutdoorTrueScene, sky_of, true_weather
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
@@ -85,7 +85,7 @@ def test_clouds_and_rain_warm_the_sky_and_darken_the_day():
 
 def test_by_night_the_sky_is_as_cloudy_as_the_clouds_that_take_light_by_day():
     hours = np.array([-2.0, 0.5, 12.0, 22.0, 26.0])
-    cover, passing = cloud_cover("fair", hours * 3600.0), _series(SKIES["fair"], hours * 3600.0)[3]
+    cover, passing = cloud_cover("fair", hours * 3600.0), series(SKIES["fair"], hours * 3600.0)[3]
     assert np.allclose(1.0 - 0.75 * cover**3.4, passing) and np.ptp(cover) > 0.3
     sky = sky_of("fair", true_weather("fair", 2 * DAY_S))
     share = sky.long_waves_w_m2 / (STEFAN_BOLTZMANN * sky.air_k**4)

@@ -17,7 +17,8 @@ from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film
-from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, START_UTC_S, OutdoorScene
+from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import START_UTC_S
 from heatsplat.datamodules.synthetic_scene.writers import write_thermo
 from heatsplat.datamodules.thermo import Thermo
 

@@ -11,7 +11,8 @@ import torch
 
 from heatsplat.contracts import SceneData, SceneError, Weather
 from heatsplat.datamodules.sun import Site, clear_sky, clouds, split_irradiance, sun_directions
-from heatsplat.datamodules.weather import make_weather, read_weather, utc_seconds, with_weather, write_weather
+from heatsplat.datamodules.weather import make_weather, read_weather, with_weather
+from heatsplat.datamodules.weather_table import utc_seconds
 
 SITE = Site(47.0, 9.0, 500.0)
 # 11 July 2024, midnight UTC.
@@ -28,89 +29,6 @@ def table(tmp_path):
         return path
 
     return write
-
-
-def test_columns_are_known_by_name_and_unit(table):
-    path = table(
-        "# from the station on the roof",
-        "Time;Air temperature [K];Wind (km/h);RH %;GHI (W/m²);Pressure Pa;Remark",
-        "2024-07-11T06:00:00Z;290,15;36,0;55;120;95500;fine",
-        "2024-07-11T09:00:00+02:00;291,15;18,0;50;200;95400;",
-    )
-    weather = read_weather(path)
-    assert weather.times_s.tolist() == [MIDNIGHT_S + 6 * 3600, MIDNIGHT_S + 7 * 3600]
-    assert weather.air_c.tolist() == pytest.approx([17.0, 18.0])
-    assert weather.wind_m_s.tolist() == pytest.approx([10.0, 5.0])
-    assert weather.humidity_percent.tolist() == [55.0, 50.0]
-    assert weather.irradiance_w_m2.tolist() == [120.0, 200.0]
-    assert weather.pressure_hpa.tolist() == pytest.approx([955.0, 954.0])
-    assert weather.notes["unused_columns"] == "Remark"
-    assert "latitude and longitude are not known" in weather.notes["sun"] and weather.sun is None
-
-
-@pytest.mark.parametrize(
-    ("header", "value", "name", "expected"),
-    [
-        ("air_f", "50", "air_c", 10.0),
-        ("temperature_2m (°C)", "12.5", "air_c", 12.5),
-        ("wind_speed_kn", "10", "wind_m_s", 5.14444),
-        ("wind_mph", "10", "wind_m_s", 4.4704),
-        ("relative_humidity_fraction", "0.4", "humidity_percent", 40.0),
-        ("shortwave_radiation (W m-2)", "7", "irradiance_w_m2", 7.0),
-        ("solar_kw_m2", "0.5", "irradiance_w_m2", 500.0),
-        ("pressure_kpa", "101.3", "pressure_hpa", 1013.0),
-        ("wind m s-1", "3", "wind_m_s", 3.0),
-        ("Air temperature [degC]", "12.5", "air_c", 12.5),
-        ("air_temperature_celsius", "12.5", "air_c", 12.5),
-        ("T_air (deg F)", "50", "air_c", 10.0),
-        ("Wind speed [kt]", "10", "wind_m_s", 5.14444),
-        ("GHI (W/m^2)", "7", "irradiance_w_m2", 7.0),
-        ("ghi_Wm-2", "7", "irradiance_w_m2", 7.0),
-        ("Pressure (mb)", "1013", "pressure_hpa", 1013.0),
-    ],
-)
-def test_units_become_ours(table, header, value, name, expected):
-    path = table(f"time_s,{header}", f"0,{value}", f"60,{value}")
-    assert getattr(read_weather(path), name).tolist() == pytest.approx([expected] * 2)
-
-
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
-def test_columns_are_separated_in_four_ways(table, delimiter):
-    rows = (["utc", "air_c"], ["2024-07-11 00:00:00", "10.5"], ["2024-07-11 01:00:00", "11.5"])
-    weather = read_weather(table(*(delimiter.join(row) for row in rows)))
-    assert weather.times_s[0] == MIDNIGHT_S  # a column called utc needs no zone
-    assert weather.air_c.tolist() == [10.5, 11.5]
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])
-def test_tables_that_excel_saves_are_read(tmp_path, encoding):
-    path = tmp_path / "weather.csv"
-    lines = ("sep=;", "Time_s;Air temperature (°C);GHI (W/m²)", "0,5;-3,25;120", '60,5;"4,75";130,5')
-    path.write_text("\r\n".join(lines), encoding=encoding)
-    weather = read_weather(path)
-    assert weather.times_s.tolist() == [0.5, 60.5]
-    assert weather.air_c.tolist() == [-3.25, 4.75] and weather.irradiance_w_m2.tolist() == [120.0, 130.5]
-
-
-@pytest.mark.parametrize(
-    ("text", "zone", "hour"),
-    [
-        ("2024-07-11T02:00:00+02:00", None, 0.0),
-        ("2024-07-11T02:00", "Europe/Zurich", 0.0),
-        ("2024-07-11T02:00", "+02:00", 0.0),
-        ("2024-07-11 02:00:00", "UTC", 2.0),
-        ("2024-07-10T21:30-04:00", "Europe/Zurich", 1.5),
-        (str(MIDNIGHT_S), None, 0.0),
-    ],
-)
-def test_time_zones(text, zone, hour):
-    assert utc_seconds(text, zone, "here") == MIDNIGHT_S + 3600 * hour
-
-
-def test_a_change_to_winter_time_does_not_move_the_record():
-    """An hour apart by the clock of Zurich, two hours apart on the sun's."""
-    first, last = (utc_seconds(f"2024-10-27T0{h}:30", "Europe/Zurich", "here") for h in (1, 3))
-    assert last - first == 3 * 3600.0
 
 
 def test_samples_are_sorted_merged_and_gaps_are_bridged_and_told(table):
@@ -318,15 +236,6 @@ def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
         read_weather(table("utc,rain_mm_h", *day("-1")))
 
 
-def test_a_column_that_may_be_one_in_another_unit_is_told(table, caplog):
-    """Wind has a direction, too; but a GHI in units that are not known must not become a cloudless sky without a word."""
-    rows = ["time_s,air_c,wind_m_s,wind_direction,ghi_mj_m2", "0,1,2,3,4", "60,1,2,3,4"]
-    weather = read_weather(table(*rows))
-    assert weather.irradiance_w_m2 is None and weather.notes["unused_columns"] == "wind_direction, ghi_mj_m2"
-    assert "column 'ghi_mj_m2' is not used; if it is irradiance_w_m2 in another unit, call it that" in caplog.text
-    assert "wind_direction" not in caplog.text
-
-
 def day(cells: str) -> list[str]:
     """A line for every hour of daylight."""
     return [f"2024-07-11T{hour:02d}:00:00Z,{cells}" for hour in range(6, 18)]
@@ -376,17 +285,6 @@ def test_sunlight_at_midnight_means_a_wrong_zone():
 def test_seconds_without_a_date_have_no_sun():
     weather = make_weather(np.array([0.0, 3600.0]), {"air_c": np.array([1.0, 2.0])}, site=SITE)
     assert weather.sun is None and "UTC of its times is not known" in weather.notes["sun"]
-
-
-def test_a_written_record_is_read_back(tmp_path):
-    times, columns = hourly(air_c=15.0, wind_m_s=2.0, irradiance_w_m2=0.0, rain_mm_h=0.5)
-    columns["irradiance_w_m2"] = 0.8 * clear_sky(SITE, times)
-    weather = make_weather(times, columns, site=SITE)
-    write_weather(tmp_path / "weather.csv", weather)
-    again = read_weather(tmp_path / "weather.csv", site=SITE)
-    assert torch.equal(again.times_s, weather.times_s)
-    for name in ("air_c", "wind_m_s", "irradiance_w_m2", "rain_mm_h", "direct_w_m2", "diffuse_w_m2", "sun"):
-        assert torch.allclose(getattr(again, name), getattr(weather, name), atol=1e-6)
 
 
 def test_the_weather_at_a_moment_is_linear_between_samples_and_nothing_is_extrapolated():

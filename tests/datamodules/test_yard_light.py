@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from heatsplat.datamodules.sun import sun_directions
-from heatsplat.datamodules.synthetic_scene.outdoor import SITE, START_UTC_S, YARD
+from heatsplat.datamodules.synthetic_scene.outdoor import YARD
+from heatsplat.datamodules.synthetic_scene.outdoor_sky import SITE, START_UTC_S
 from heatsplat.datamodules.synthetic_scene.outdoor_true import true_weather
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from heatsplat.datamodules.synthetic_scene.yard_light import ALBEDO, SOLAR_CONSTANT, Lighting

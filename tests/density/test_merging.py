@@ -153,6 +153,6 @@ def test_images_without_degrees_are_refused(module):
         FlatMerging().check(SimpleNamespace(thermal=module.thermal, modality="thermal", scene=scene))
 
 
-def test_off_is_absent(tmp_path):
-    config = compose_run(tmp_path, "method=etgs")
+def test_off_is_absent():
+    config = compose_run("method=etgs")
     assert config.merge._target_ == "heatsplat.density.base.Merging" and len(config.merge) == 1

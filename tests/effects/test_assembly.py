@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import pytest
 from hydra.errors import HydraException
@@ -28,7 +27,7 @@ ON_THE_WAY, SENSOR = simulated_by("path"), simulated_by("camera")
 
 @cache
 def config(*overrides):
-    return OmegaConf.to_container(compose_run(Path("unused"), "data.size=tiny", *overrides), resolve=True)
+    return OmegaConf.to_container(compose_run("data.size=tiny", *overrides), resolve=True)
 
 
 def verdicts(*on, **settings):

@@ -10,7 +10,6 @@ import zlib
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from pathlib import Path
 
 import pytest
 import torch
@@ -390,7 +389,7 @@ EFFECTS = tuple(CASES)
 
 @cache
 def templates():
-    plain = compose_run(Path("unused"), "method=auto", "data.size=tiny")
+    plain = compose_run("method=auto", "data.size=tiny")
     return OmegaConf.to_container(plain, resolve=True)["effects"]
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -17,7 +16,7 @@ from heatsplat.effects.physical.pixel_area import EFFECT, fineness, missing
 
 @cache
 def config(*overrides):
-    return OmegaConf.to_container(compose_run(Path("unused"), "data.size=tiny", *overrides), resolve=True)
+    return OmegaConf.to_container(compose_run("data.size=tiny", *overrides), resolve=True)
 
 
 @cache

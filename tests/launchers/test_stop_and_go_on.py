@@ -13,12 +13,12 @@ from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
 
 
 @pytest.mark.parametrize(("jobs", "expected"), [(1, 6), (2, 3), (4, 1), (9, 1), (-1, 1)])
-def test_jobs_side_by_side_get_fair_shares_of_the_cores(jobs, expected, tmp_path, monkeypatch):
+def test_jobs_side_by_side_get_fair_shares_of_the_cores(jobs, expected, monkeypatch):
     monkeypatch.setattr(composition, "cores", lambda: 6)
     sweep = ("method=3dgs", "launcher=joblib", f"hydra.launcher.n_jobs={jobs}")
-    assert compose_run(tmp_path, *sweep).threads is None, "a single run has all cores"
-    assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN").threads == expected
-    assert compose_run(tmp_path, *sweep, "hydra.mode=MULTIRUN", "threads=5").threads == 5
+    assert compose_run(*sweep).threads is None, "a single run has all cores"
+    assert compose_run(*sweep, "hydra.mode=MULTIRUN").threads == expected
+    assert compose_run(*sweep, "hydra.mode=MULTIRUN", "threads=5").threads == 5
 
 
 def configured(*overrides):

@@ -123,8 +123,8 @@ def test_loss_and_gradient_are_finite_whatever_the_images(level, contrast, weigh
     assert loss.isfinite() and loss >= 0 and prediction.grad.isfinite().all()
 
 
-def test_the_recipe_is_the_published_sum_and_its_ramp_ends_after_a_sixth_of_the_run(tmp_path):
-    plain = OmegaConf.to_container(compose_run(tmp_path, "method=thermal3dgs").loss, resolve=True)
+def test_the_recipe_is_the_published_sum_and_its_ramp_ends_after_a_sixth_of_the_run():
+    plain = OmegaConf.to_container(compose_run("method=thermal3dgs").loss, resolve=True)
     loss, target, prediction = build(plain), noise(), noise(seed=1)
     full = Photometric(1.0)(inputs(prediction, target))["dssim"].item()
     for step, share in ((0, 1.0), (2500, 0.5), (4999, 0.0002), (5002, None)):

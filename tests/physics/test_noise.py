@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, View, ViewSet
-from heatsplat.physics.noise import noise_of, noise_of_repeats, noise_of_views, quantum_of
+from heatsplat.physics.noise import noise_of, noise_of_repeats, noise_of_views, quantum_of, robust_spread
 
 
 def scene_images(frames: int, noise: float, seed: int = 0) -> torch.Tensor:
@@ -46,3 +46,10 @@ def test_noise_of_views_of_several_sizes_leaves_masked_pixels_out():
         return View(frames[i], image[..., None], mask=mask)
 
     assert noise_of_views(ViewSet(frames, view), "thermal") == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_robust_spread_is_the_standard_deviation_without_what_lies_far_out_and_what_is_unknown():
+    values = 0.3 * torch.randn(20_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    values[:1000], values[1000:2000] = 50.0, torch.nan
+    assert robust_spread(values) == pytest.approx(0.3, rel=0.12)
+    assert robust_spread(-values) == robust_spread(values)

@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 from camera_files import camera_record, fff, flir_jpeg, gps_record, raw_for, temperatures
 
+from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frames import Reading, read_recording
+
 START = datetime(2024, 7, 1, 12, 0, tzinfo=UTC)
 STATED = {"emissivity": 0.95, "distance_m": 20.0, "reflected_k": 283.15, "air_k": 288.15, "humidity": 0.5}
 
@@ -42,3 +45,8 @@ def write_images(folder: Path, images: dict[str, np.ndarray]) -> Path:
     for name, pixels in images.items():
         assert cv2.imwrite(str(folder / name), pixels)
     return folder
+
+
+def read_frames(folder: Path, reading: Reading | None = None) -> list[ThermalFrame]:
+    """The thermal frames of all files in a folder, without the notes on them."""
+    return read_recording(folder, reading).frames

@@ -6,21 +6,21 @@ import pytest
 
 from heatsplat.contracts import SceneError
 from heatsplat.physics.radiometry import Conditions
-from heatsplat.preparation.conditions import Given, Uncertainty
-from heatsplat.preparation.frame import Frame
+from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
+from heatsplat.preparation.frame import ThermalFrame
 
 FROM_FILE = Conditions(emissivity=0.95, reflected_k=280.0, distance_m=5.0)
-FRAME = Frame(
+FRAME = ThermalFrame(
     "a", Path("a.tiff"), 0, lambda: np.zeros((1, 1), np.float32), conditions=FROM_FILE, sources={"emissivity": "file"}
 )
 
 
 def test_what_is_given_goes_before_what_the_file_says():
-    settled = Given(distance_m=75.0, air_c=10.0, humidity_percent=80.0).settled(FRAME)
+    settled = GivenConditions(distance_m=75.0, air_c=10.0, humidity_percent=80.0).settled(FRAME)
     c = settled.conditions
     assert (c.distance_m, c.air_k, c.humidity, c.emissivity, c.reflected_k) == (75.0, 283.15, 0.8, 0.95, 280.0)
     assert settled.sources == {"emissivity": "file", "distance_m": "given", "air_k": "given", "humidity": "given"}
-    assert Given().settled(FRAME).conditions == FROM_FILE
+    assert GivenConditions().settled(FRAME).conditions == FROM_FILE
 
 
 @pytest.mark.parametrize(
@@ -36,22 +36,22 @@ def test_what_is_given_goes_before_what_the_file_says():
 )
 def test_what_cannot_be_is_refused(wrong, said):
     with pytest.raises(SceneError, match=said):
-        Given(**wrong)
+        GivenConditions(**wrong)
 
 
 def test_air_for_which_the_formula_has_no_answer_is_refused():
     with pytest.raises(SceneError, match="a.tiff: at 90000 m of air with 90 % humidity .*conditions.distance_m"):
-        Given(distance_m=90_000, humidity_percent=90, air_c=30).settled(FRAME)
+        GivenConditions(distance_m=90_000, humidity_percent=90, air_c=30).settled(FRAME)
 
 
 def test_uncertainties_come_in_the_units_of_the_conditions():
-    found = Uncertainty(distance_percent=20.0, humidity_percent=5.0).standard(FROM_FILE)
+    found = InputUncertainty(distance_percent=20.0, humidity_percent=5.0).standard(FROM_FILE)
     assert found["distance_m"] == 1.0 and found["humidity"] == 0.05 and found["camera"] == 1.0
     assert found["window_transmission"] == found["window_k"] == 0  # there is none
-    assert Uncertainty().standard(Conditions(window_transmission=0.9))["window_k"] == 3.0
+    assert InputUncertainty().standard(Conditions(window_transmission=0.9))["window_k"] == 3.0
     for wrong in (-1.0, "little", float("nan")):
         with pytest.raises(SceneError, match="uncertainty.air_c"):
-            Uncertainty(air_c=wrong)
+            InputUncertainty(air_c=wrong)
 
 
 @pytest.mark.parametrize(
@@ -69,14 +69,14 @@ def test_uncertainties_come_in_the_units_of_the_conditions():
 def test_conditions_that_change_nothing_are_refused_with_what_they_need(idle, needed):
     plain = replace(FRAME, conditions=Conditions(), sources={})
     with pytest.raises(SceneError, match=needed):
-        Given(**idle).check_use([Given(**idle).settled(plain)])
-    useful = Given(**idle | {"emissivity": 0.9, "distance_m": 9.0, "window_transmission": 0.9})
+        GivenConditions(**idle).check_use([GivenConditions(**idle).settled(plain)])
+    useful = GivenConditions(**idle | {"emissivity": 0.9, "distance_m": 9.0, "window_transmission": 0.9})
     useful.check_use([useful.settled(plain)])
-    some = Given(reflected_c=5.0)
+    some = GivenConditions(reflected_c=5.0)
     some.check_use([some.settled(plain), some.settled(FRAME)])  # it counts for one of them
-    neutral = Given(emissivity=1.0, distance_m=0.0, window_transmission=1.0)
+    neutral = GivenConditions(emissivity=1.0, distance_m=0.0, window_transmission=1.0)
     neutral.check_use([neutral.settled(plain)])  # goes before what files say
     with pytest.raises(
         SceneError, match=r"conditions.emissivity changes nothing for greys, .* give bounds_c=\[min,max\]"
     ):
-        Given(emissivity=0.9).check_use([replace(plain, calibration=None)])
+        GivenConditions(emissivity=0.9).check_use([replace(plain, calibration=None)])

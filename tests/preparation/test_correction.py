@@ -24,7 +24,8 @@ from heatsplat.physics.radiometry import (
     measured_signal,
     surface_temperature,
 )
-from heatsplat.preparation.conditions import Given
+from heatsplat.preparation import correction
+from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.correction import PERCENT, Spread, _unsettled, correct_scene, corrected, preparation_of
 from heatsplat.preparation.prepare import prepare
 
@@ -81,7 +82,7 @@ def scene():
 
 
 def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
-    given = Given(
+    given = GivenConditions(
         emissivity=0.94, reflected_c=265.0 - 273.15, distance_m=60.0, air_c=285.0 - 273.15, humidity_percent=80
     )
     page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path / "new", given, BandResponse(), 1.5, METRES)
@@ -110,7 +111,7 @@ def test_images_are_held_one_at_a_time(tmp_path):
 
     frames = [Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i) for i in (4, 0, 3, 1, 2)]
     floor.train, floor.test = ViewSet(frames, decode), ViewSet([], decode)
-    correct_scene(floor, lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), 1.5, METRES)
+    correct_scene(floor, lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), 1.5, METRES)
     assert len(held) == 5 and max(held) <= 1
     rows = list(csv.DictReader((tmp_path / "frames.csv").open()))
     assert [row["file"] for row in rows] == sorted(row["file"] for row in rows)
@@ -143,7 +144,7 @@ def test_places_of_the_preparation_stay(tmp_path):
         lambda frame: DEPTH,
         [tmp_path / "none", tmp_path],
         tmp_path / "new",
-        Given(),
+        GivenConditions(),
         BandResponse(),
         None,
         METRES,
@@ -154,12 +155,23 @@ def test_places_of_the_preparation_stay(tmp_path):
 
 
 def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
-    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
+    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
     far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())
     text = page.read_text()
     assert (
         f"against one distance of {far:.1f} m" in text and "| angle of each pixel |" not in text
     )  # nobody asked for angles
+
+
+def test_air_that_nothing_tells_of_is_said_of_any_image(tmp_path, monkeypatch):
+    last = max(frame.name for part in (scene().train, scene().test) for frame in part.frames)
+
+    def prepared(name, folders):
+        return None, AIR if name == last else Conditions()
+
+    monkeypatch.setattr(correction, "preparation_of", prepared)
+    page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
+    assert correction.ASSUMED in page.read_text()
 
 
 @pytest.mark.parametrize("share", [1.0, 0.8])
@@ -171,7 +183,7 @@ def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
     )
     shown = scene()
     shown.points = (points * share).float()
-    page = correct_scene(shown, lambda frame: DEPTH, [], tmp_path, Given(), BandResponse(), None, METRES)
+    page = correct_scene(shown, lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
     assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
 
 
@@ -203,7 +215,7 @@ def test_normals_on_which_views_disagree_are_doubted(tmp_path, tilt):
     def depth_of(frame):  # of the middle view every wall is turned about the upright
         return DEPTH / (1.0 + tilt * columns) if frame.name == "1.tiff" else DEPTH
 
-    page = correct_scene(shown, depth_of, [], tmp_path, Given(emissivity=0.9), BandResponse(), 1.5, METRES)
+    page = correct_scene(shown, depth_of, [], tmp_path, GivenConditions(emissivity=0.9), BandResponse(), 1.5, METRES)
     assert ("angles are not settled" in page.read_text()) == (tilt > 0)
     assert "% of the pixels have no known angle" in page.read_text()
 
@@ -225,7 +237,7 @@ def test_what_cannot_be_corrected_is_refused_with_the_remedy(tmp_path, change, s
     depth = change.get("depth", DEPTH)
     with pytest.raises(SceneError, match=said):
         correct_scene(
-            floor, lambda frame: depth, [], tmp_path, Given(), BandResponse(), change.get("index"),
+            floor, lambda frame: depth, [], tmp_path, GivenConditions(), BandResponse(), change.get("index"),
             change.get("metres", METRES),
         )  # fmt: skip
 
@@ -234,7 +246,8 @@ def test_the_scene_itself_is_no_target(tmp_path):
     (tmp_path / "a").mkdir()
     with pytest.raises(SceneError, match="is the folder of the scene that is to be corrected.*give another one"):
         correct_scene(
-            scene(), lambda frame: DEPTH, [tmp_path, tmp_path / "a"], tmp_path / "a" / ".." / "a", Given(), BandResponse(), None,
+            scene(), lambda frame: DEPTH, [tmp_path, tmp_path / "a"], tmp_path / "a" / ".." / "a",
+            GivenConditions(), BandResponse(), None,
             METRES,
         )  # fmt: skip
     assert not list((tmp_path / "a").iterdir())

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import write_images
+from recordings import read_frames, write_images
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
@@ -18,8 +18,8 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.doctor import check
 from heatsplat.preparation.features import Sift
-from heatsplat.preparation.frame import CameraInfo, Frame
-from heatsplat.preparation.frames import read_frames, read_recording
+from heatsplat.preparation.frame import CameraInfo, ThermalFrame
+from heatsplat.preparation.frames import read_recording
 from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 
@@ -44,8 +44,8 @@ def write_two(folder: Path, frames: int = 8, cut: bool = False) -> tuple[float, 
     return one.lens.fx, other.lens.fx
 
 
-def frame(name: str, size: tuple[int, int] | None = (8, 6), **camera) -> Frame:
-    return Frame(
+def frame(name: str, size: tuple[int, int] | None = (8, 6), **camera) -> ThermalFrame:
+    return ThermalFrame(
         name, Path(f"{name}.tiff"), 0, lambda: np.zeros((6, 8), np.float32), camera=CameraInfo(**camera), size=size
     )
 

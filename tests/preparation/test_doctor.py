@@ -2,12 +2,12 @@
 
 import json
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 
 import numpy as np
 import pytest
-from camera_files import with_segment
 from PIL import Image
+from recordings import read_frames
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
@@ -16,8 +16,8 @@ from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
 from heatsplat.preparation.doctor import _photo_times, check, section
-from heatsplat.preparation.frame import Frame
-from heatsplat.preparation.frames import Reading, read_frames, taken_at
+from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frames import Reading
 from heatsplat.preparation.meaning import Meaning
 
 
@@ -66,7 +66,7 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
     write_camera(recording, tmp_path / "camera", Field(rgb=True))
     frames = read_frames(tmp_path / "camera")
 
-    def photos(hours: float, minutes: float = 0.0, zone: str = "") -> list[Frame]:
+    def photos(hours: float, minutes: float = 0.0, zone: str = "") -> list[ThermalFrame]:
         """The frames with photos of their moments, by a clock that shows the time of another zone."""
         found = []
         for number, frame in enumerate(frames):
@@ -80,7 +80,7 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
             found.append(replace(frame, rgb=tmp_path / f"{number}.jpg"))
         return found
 
-    def apart(photos: list[Frame], zone: str | None = None) -> float:
+    def apart(photos: list[ThermalFrame], zone: str | None = None) -> float:
         times = _photo_times(photos, zone)
         return float(np.median(np.array(times) - [frame.time.timestamp() for frame in photos]))
 
@@ -90,12 +90,6 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
     assert apart(photos(2.0), "+01:00") == pytest.approx(3600.0, abs=1e-3)  # it is told, so an hour is an hour
     assert apart(photos(2.0, zone="+02:00")) == pytest.approx(0.0, abs=1e-3)
     assert apart(photos(2.0, zone="+00:00")) == pytest.approx(7200.0, abs=1e-3)
-
-
-def test_photos_of_dji_have_the_clock_of_their_thermal_pictures(tmp_path):
-    xmp = b'http://ns.adobe.com/xap/1.0/\0<x drone-dji:UTCAtExposure="2024-08-06T15:35:05.376048"/>'
-    picture = with_segment(b"\xff\xd8\xff\xd9", 0xE1, xmp)
-    assert taken_at(picture) == datetime(2024, 8, 6, 15, 35, 5, 376048, tzinfo=UTC)
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):

@@ -6,12 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
-from camera_files import dji_jpeg, fff, raw_for, temperatures, with_segment
-from recordings import START, STATED, flir_frame, write_flir, write_images, write_sequence
+from camera_files import dji_jpeg, raw_for, temperatures, with_segment
+from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
-from heatsplat.preparation.frames import Reading, read_frames, read_recording
+from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -40,13 +39,6 @@ def test_sequences_have_a_frame_each(tmp_path):
     frames = read_frames(write_sequence(tmp_path / "flight.seq").parent)
     assert [frame.name for frame in frames] == [f"flight_{i:06d}" for i in range(4)]
     np.testing.assert_array_equal(frames[2].load(), raw_for(temperatures(2)))
-
-
-def test_a_recording_that_was_cut_short_says_so(tmp_path):
-    path = write_sequence(tmp_path / "flight.seq")
-    path.write_bytes(path.read_bytes()[:-10])
-    found = read_recording(tmp_path)
-    assert len(found.frames) == 3 and any("after its last whole frame" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -110,14 +102,6 @@ def test_photos_of_other_sides_are_left_to_them(tmp_path):
     assert all(frame.rgb.stem == frame.path.stem for frame in read_frames(tmp_path))
 
 
-def test_constants_of_a_camera_that_are_given_go_before_those_of_its_files(tmp_path):
-    own, path = read_frames(write_flir(tmp_path, 1))[0], tmp_path
-    p = own.calibration.response
-    (other,) = read_frames(path, Reading(Meaning(planck=[p.r1, p.b, p.f, p.o + 300, p.r2])))
-    lower = other.calibration.response.kelvin(torch.tensor([15000.0])) - p.kelvin(torch.tensor([15000.0]))
-    assert float(lower) > 0.5 and np.nanmedian(other.temperature() - own.temperature()) > 0.5
-
-
 def test_what_is_said_of_numbers_and_changes_nothing_is_refused(tmp_path):
     write_flir(tmp_path / "flir", 1)
     with pytest.raises(
@@ -137,41 +121,6 @@ def test_a_zone_is_given_to_times_that_have_none(tmp_path):
     assert frame.time.astimezone(UTC) == datetime(2024, 7, 1, 10, tzinfo=UTC)
     with pytest.raises(SceneError, match="zone=Mars is no time zone"):
         read_frames(tmp_path, Reading(zone="Mars"))
-
-
-def test_a_table_goes_before_the_files(tmp_path):
-    write_images(tmp_path / "frames", {"a.tiff": FLOATS, "b.tiff": FLOATS})
-    table = tmp_path / "table.csv"
-    table.write_text("file;when;lat;lon\na;2024-07-01T10:00:05Z;50,5;7,5\nb.tiff;2024-07-01T10:00:00Z;50,6;7,5\n")
-    columns = {"name": "file", "time": "when", "latitude_deg": "lat", "longitude_deg": "lon"}
-    frames = read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
-    assert [frame.name for frame in frames] == ["b", "a"]
-    assert frames[1].position.latitude_deg == 50.5
-    with pytest.raises(SceneError, match="has no column 'image'"):
-        read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"name": "image"}))
-    table.write_text("file;when;lat;lon\na;yesterday;50,5;7,5\n")
-    with pytest.raises(SceneError, match="line 2: 'yesterday' in column when is no date-time"):
-        read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
-
-
-def test_a_table_that_tells_nothing_is_refused_and_what_it_tells_is_said(tmp_path):
-    write_images(tmp_path / "frames", {"a.tiff": FLOATS, "b.tiff": FLOATS})
-    table = tmp_path / "table.csv"
-    table.write_text("file,when\na,2024-07-01T10:00:05Z\n")
-    with pytest.raises(
-        SceneError, match="has none of the columns time; it has file, when: say .* table_columns.time=when"
-    ):
-        read_frames(tmp_path / "frames", Reading(table=table, columns={"name": "file", "time": "time"}))
-    columns = {"name": "file", "time": "when"}
-    assert (
-        "table.csv tells time of 1 of 2 frames"
-        in read_recording(tmp_path / "frames", Reading(table=table, columns=columns)).notes
-    )
-    table.write_text("file,when\nother,2024-07-01T10:00:05Z\n")
-    with pytest.raises(
-        SceneError, match="no row for any of the 2 frames, such as a.tiff; its column file begins with other"
-    ):
-        read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
 
 
 def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
@@ -225,14 +174,6 @@ def test_greys_that_were_stored_as_colours_are_greys(tmp_path):
     write_images(tmp_path, {"a.png": cv2.merge([grey, grey, grey])})
     (frame,) = read_frames(tmp_path, Reading(Meaning(bounds_c=[0.0, 51.0])))
     np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.21)
-
-
-def test_the_photo_inside_a_file_is_offered(tmp_path):
-    photo = cv2.imencode(".jpg", np.full((8, 8, 3), 90, np.uint8))[1].tobytes()
-    (tmp_path / "a.jpg").write_bytes(flir_frame(0, picture=photo))
-    (tmp_path / "b.fff").write_bytes(fff(raw_for(temperatures())))
-    frames = {frame.name: frame for frame in read_frames(tmp_path)}
-    assert frames["a"].picture() == photo and frames["b"].picture is None
 
 
 @needs_data
@@ -298,47 +239,3 @@ def test_every_image_of_a_tiff_is_a_frame(tmp_path, kind):
     table.write_text("file,when\nrec.tiff,2024-07-01T10:00:00Z\n")
     with pytest.raises(SceneError, match="line 2: rec.tiff holds 4 frames, .* give each a row, as rec_000000"):
         read_frames(tmp_path, timed)
-
-
-PLACED = {
-    "name": "file",
-    "latitude_deg": "lat",
-    "longitude_deg": "lon",
-    "altitude_m": "alt",
-    "above_takeoff_m": "height",
-    "yaw_deg": "yaw",
-    "pitch_deg": "pitch",
-    "roll_deg": "roll",
-}
-
-
-def test_a_column_of_a_table_replaces_its_own_value_and_no_other(tmp_path):
-    source = write_flir(tmp_path / "files", 2)
-    table = tmp_path / "table.csv"
-    reading = Reading(table=table, columns=PLACED)
-    table.write_text("file,lat,lon\nIR_0000,50,8\nIR_0001,50.1,8\n")
-    first = read_frames(source, reading)[0].position
-    assert (first.latitude_deg, first.longitude_deg, first.altitude_m) == (50.0, 8.0, 100.0)
-    table.write_text("file,alt,height\nIR_0000,250,\nIR_0001,,30\n")
-    found = read_recording(source, reading)
-    places = [frame.position for frame in found.frames]
-    assert [(p.latitude_deg, p.altitude_m, p.above_takeoff_m) for p in places] == [
-        (51.0, 250.0, None),
-        (pytest.approx(51.00001), 100.0, 30.0),
-    ]
-    assert "table.csv tells above_takeoff_m, altitude_m of 2 of 2 frames" in found.notes
-
-
-@pytest.mark.parametrize(
-    ("head", "said"),
-    [
-        ("alt,height", "column alt changes nothing, as neither the table nor the files say lat, lon of the same frame"),
-        ("lat,alt", "column lat changes nothing, .* say lon of the same frame; add that, or take the column away"),
-        ("yaw,roll", "column yaw changes nothing, .* say pitch, roll"),
-    ],
-)
-def test_a_column_that_completes_nothing_is_refused(tmp_path, head, said):
-    write_images(tmp_path / "files", {"a.tiff": FLOATS})
-    (tmp_path / "table.csv").write_text(f"file,{head}\na,1,2\n")
-    with pytest.raises(SceneError, match=said):
-        read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))

@@ -1,24 +1,24 @@
 import cv2
 import numpy as np
 import pytest
-from recordings import write_flir, write_images
+from recordings import read_frames, write_flir, write_images
 
 from heatsplat.preparation import report
-from heatsplat.preparation.conditions import Given, Uncertainty
-from heatsplat.preparation.frames import Reading, read_frames
+from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
+from heatsplat.preparation.frames import Reading
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.writer import Writer
 
 
 def prepared(frames, target):
-    writer = Writer(target, Uncertainty(), keep_counts=False)
+    writer = Writer(target, InputUncertainty(), keep_counts=False)
     return [writer.write(frame)[0] for frame in frames]
 
 
 def test_conditions_stand_with_what_they_change_and_what_they_leave_unsure(tmp_path):
     frames = read_frames(write_flir(tmp_path / "files"))
     records = prepared(frames, tmp_path / "scene")
-    section = report.radiometry(frames, records, Uncertainty())
+    section = report.radiometry(frames, records, InputUncertainty())
     text = "\n".join(section.lines)
     assert "| emissivity | 0.95 | file |" in text and "| distance | 20 m | file |" in text
     assert "**all, expanded (k = 2, 95 %)**" in text
@@ -30,18 +30,18 @@ def test_without_conditions_temperatures_are_said_to_be_apparent(tmp_path):
     frames = read_frames(
         write_images(tmp_path / "files", {"a.tiff": np.linspace(10, 30, 64, dtype=np.float32).reshape(8, 8)})
     )
-    text = "\n".join(report.radiometry(frames, prepared(frames, tmp_path / "scene"), Uncertainty()).lines)
+    text = "\n".join(report.radiometry(frames, prepared(frames, tmp_path / "scene"), InputUncertainty()).lines)
     assert "Apparent temperatures" in text and "| distance |" not in text and "| emissivity | 0.02 |" in text
 
 
 def test_doubtful_statements_of_files_are_asked_about(tmp_path):
     frames = read_frames(write_flir(tmp_path / "files"))
     records = prepared(frames, tmp_path / "scene")
-    window = [Given(window_transmission=0.8).settled(f) for f in frames]
+    window = [GivenConditions(window_transmission=0.8).settled(f) for f in frames]
     of_file = [type(f)(**{**vars(f), "sources": {**f.sources, "window_transmission": "file"}}) for f in window]
     asked = "If there was none, set conditions.window_transmission=1"
-    assert asked in "\n".join(report.radiometry(of_file, records, Uncertainty()).lines)
-    assert asked not in "\n".join(report.radiometry(window, records, Uncertainty()).lines)
+    assert asked in "\n".join(report.radiometry(of_file, records, InputUncertainty()).lines)
+    assert asked not in "\n".join(report.radiometry(window, records, InputUncertainty()).lines)
 
 
 def test_pictures_show_steps_that_all_pixels_share(tmp_path):
@@ -59,7 +59,7 @@ def test_pictures_show_steps_that_all_pixels_share(tmp_path):
 def test_greys_have_no_radiometry(tmp_path):
     frames = read_frames(write_images(tmp_path / "files", {"a.png": np.arange(64, dtype=np.uint8).reshape(8, 8)}))
     records = prepared(frames, tmp_path / "scene")
-    assert report.radiometry(frames, records, Uncertainty()) is None
+    assert report.radiometry(frames, records, InputUncertainty()) is None
     assert "greys" not in "\n".join(report.recording(frames, records, []).lines)
     assert report.pictures(tmp_path / "scene", frames, records).lines[:3:2] == [
         "![1 frame, one scale for all](report/frames.png)",
@@ -91,7 +91,10 @@ def test_the_page_has_its_sections_in_order(tmp_path):
 def test_conditions_that_change_nothing_make_no_surface_temperatures(tmp_path):
     image = np.linspace(10, 30, 64, dtype=np.float32).reshape(8, 8)
     frames = read_frames(write_images(tmp_path / "files", {"a.tiff": image}))
-    for given, apparent in ((Given(emissivity=1.0, distance_m=0.0), True), (Given(distance_m=10.0), False)):
+    for given, apparent in (
+        (GivenConditions(emissivity=1.0, distance_m=0.0), True),
+        (GivenConditions(distance_m=10.0), False),
+    ):
         settled = [given.settled(frame) for frame in frames]
-        text = "\n".join(report.radiometry(settled, prepared(settled, tmp_path / "scene"), Uncertainty()).lines)
+        text = "\n".join(report.radiometry(settled, prepared(settled, tmp_path / "scene"), InputUncertainty()).lines)
         assert ("Apparent temperatures" in text) == apparent and ("Temperatures of surfaces" in text) != apparent

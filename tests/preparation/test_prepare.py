@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import succeeds
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from recordings import write_flir, write_images, write_sequence
+from recordings import read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
@@ -19,7 +19,6 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.io.tiff import read_temperature
 from heatsplat.preparation.doctor import check, section
 from heatsplat.preparation.features import Sift
-from heatsplat.preparation.frames import read_frames
 from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 from heatsplat.preparation.report import Section

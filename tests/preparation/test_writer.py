@@ -6,17 +6,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from recordings import write_flir, write_images
+from recordings import read_frames, write_flir, write_images
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.tiff import read_temperature
-from heatsplat.preparation.conditions import Given, Uncertainty
-from heatsplat.preparation.frames import read_frames
+from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
 from heatsplat.preparation.writer import Writer
 
 
 def written(frames, target, **options):
-    writer = Writer(target, Uncertainty(), **{"keep_counts": False, **options})
+    writer = Writer(target, InputUncertainty(), **{"keep_counts": False, **options})
     writer.check(frames)
     done = [writer.write(frame) for frame in frames]
     writer.finish(frames, [record for record, _ in done])
@@ -57,7 +56,7 @@ def test_what_was_written_before_is_kept_and_what_changed_is_made_anew(tmp_path)
     assert written(frames, tmp_path / "scene")[1] == [False, True, False, False]
     os.utime(frames[2].path, ns=(1, 1))
     assert written(frames, tmp_path / "scene")[1] == [False, False, True, False]
-    assert written([Given(emissivity=0.8).settled(f) for f in frames], tmp_path / "scene")[1] == [True] * 4
+    assert written([GivenConditions(emissivity=0.8).settled(f) for f in frames], tmp_path / "scene")[1] == [True] * 4
 
 
 def test_a_failure_leaves_no_half_written_image(tmp_path, monkeypatch):
@@ -108,7 +107,7 @@ def test_dead_pixels_are_masked_in_every_image_and_sound_ones_are_not(tmp_path):
     scene = np.random.default_rng(0).normal(20.0, 0.05, (4, 24, 32)).astype(np.float32)
     scene[:, 5, 7], scene[:, 20, 30] = 30.0, 10.0
     frames = read_frames(write_images(tmp_path / "files", {f"{i}.tiff": image for i, image in enumerate(scene)}))
-    writer = Writer(tmp_path / "scene", Uncertainty(), False)
+    writer = Writer(tmp_path / "scene", InputUncertainty(), False)
     assert writer.find_dead_pixels(frames) == 2
     records = [writer.write(frame)[0] for frame in frames]
     writer.write_masks(frames)
@@ -118,7 +117,7 @@ def test_dead_pixels_are_masked_in_every_image_and_sound_ones_are_not(tmp_path):
         assert np.argwhere(mask != 255).tolist() == [[5, 7], [20, 30]] and mask.shape == (24, 32)
     bounds = json.loads((tmp_path / "scene" / "temperature_bounds.json").read_text())
     assert 19.0 < bounds["absolute_min_temperature"] < bounds["absolute_max_temperature"] < 21.0  # without what is dead
-    few = Writer(tmp_path / "few", Uncertainty(), False)
+    few = Writer(tmp_path / "few", InputUncertainty(), False)
     assert few.find_dead_pixels(frames[:3]) == 0  # too few to tell
     assert few.write(frames[0])[0]["quantiles"][-1] == 30.0
 

@@ -80,10 +80,10 @@ def test_the_readme_names_its_main_commands():
 
 
 @pytest.mark.parametrize("command", [command for command in PYTHON if "train.py" in command])
-def test_training_commands_compose(command, tmp_path):
+def test_training_commands_compose(command):
     """Names and values of the command line are those of conf/; of a sweep, the first job."""
     words = [re.sub(r",.*", "", word) for word in command.split()[2:] if word != "-m"]
-    config = compose_run(tmp_path, *words)
+    config = compose_run(*words)
     method = re.search(r"method=(\w+)", command)
     assert method is None or config.name == method[1]
 
@@ -131,10 +131,10 @@ def test_python_commands_run(command, trained, data, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_make_demo_trains_etgs(tmp_path):
+def test_make_demo_trains_etgs():
     shown = shell(["make", "-n", "demo", "ARGS=seed=7"], ROOT)
     words = re.search(r"src/train\.py (.*)", shown)[1].split()
-    config = compose_run(tmp_path, *words)
+    config = compose_run(*words)
     assert (config.name, config.max_steps, config.seed) == ("etgs", 5000, 7)
 
 

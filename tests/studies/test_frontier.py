@@ -295,20 +295,20 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
     assert {recipe.count for recipe in recipes} == {2} and len(recipes) == 2 * 6  # the stand-in says cooling of all
 
 
-def test_the_commands_in_the_configuration_make_runs_that_compose(tmp_path):
+def test_the_commands_in_the_configuration_make_runs_that_compose():
     text = CONFIG.read_text()
     of_all = [shlex.split(typed)[0] for typed in re.findall(r'"study.overrides=[^"]+"', text)]
-    lists = [compose_run(tmp_path, "study=frontier", typed, config_name="study").study.overrides for typed in of_all]
+    lists = [compose_run("study=frontier", typed, config_name="study").study.overrides for typed in of_all]
     assert lists == [["data=rhd", "data.root=/data/RHD"], ["data.size=tiny", "threads=1"]]
     (trains,) = re.findall(r"^# +python src/study.py (study=frontier study.methods.+)$", text, re.MULTILINE)
     (own,) = re.findall(r'^# +\.\.\. ("study.methods=.+")$', text, re.MULTILINE)
     same, other = shlex.split(trains), shlex.split(own)
     own = [other[0] if text.startswith("study.methods=") else text for text in same]
     for command, runs in ((same, 2 * 2 * 2 * 4), (own, 2 * 2 * 4 * 3)):
-        study = compose_run(tmp_path, *command, config_name="study").study
+        study = compose_run(*command, config_name="study").study
         plain = OmegaConf.to_container(study)
         jobs = asked_for(plain["methods"], plain["scenes"], plain["seeds"], plain["knobs"])
         assert len(jobs) == len(dict(jobs)) == runs
         for _, overrides in (jobs[0], jobs[-1]):
-            config = compose_run(tmp_path, *overrides)
+            config = compose_run(*overrides)
             assert config.density.cap_max in (5000, 20000) and config.max_steps in (1000, 3000)

@@ -54,7 +54,7 @@ def test_what_the_board_decides_is_not_given_for_all_runs(tmp_path):
 
 
 def test_the_command_is_refused_before_anything_runs(tmp_path, monkeypatch, caplog):
-    compose_run(tmp_path, "method=3dgs")
+    compose_run("method=3dgs")
     # Imported here: composing loads plugins, and with them the classes that sweep, anew.
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 

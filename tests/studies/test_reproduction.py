@@ -81,7 +81,7 @@ def test_every_table_is_filled_and_composes(path, tmp_path):
     if config_of(name)["ablation"] or not reproduction.source:
         return  # composed by the slow test
     run = next(run for run in reproduction.runs if run.method == reproduction.paper)
-    composed = compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
+    composed = compose_run(f"experiment={path.stem}", *run.overrides, f"row='{run.row}'")
     assert composed.table.paper == reproduction.paper and composed.data.scene == run.folder
     assert composed.data._target_.split(".")[2] == {"ti3dgs_own": "ti_nsd"}.get(
         reproduction.source.key, reproduction.source.key
@@ -96,11 +96,11 @@ def test_every_row_of_every_table_composes_as_a_stored_config_its_own(path, tmp_
     name = path.stem.removeprefix("table_")
     reproduction = reproduced(name, everything(tmp_path, name), have=ALL_METHODS)
     first = {run.row: run for run in reversed(reproduction.runs)}
-    assert compose_run(tmp_path, f"experiment={path.stem}").table.paper == reproduction.paper
+    assert compose_run(f"experiment={path.stem}").table.paper == reproduction.paper
     made = [
         {
             key: value
-            for key, value in compose_run(tmp_path, f"experiment={path.stem}", *run.overrides, *after(run)).items()
+            for key, value in compose_run(f"experiment={path.stem}", *run.overrides, *after(run)).items()
             if key != "data"
         }
         for run in first.values()
@@ -129,7 +129,7 @@ def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
 def test_folders_are_told_on_the_command_line_by_the_scenes_of_the_table(tmp_path):
     root = put(tmp_path / "RHD", "sparse", "my_bench")
     typed = "table.folders={cooling_bench: my_bench}"
-    table = OmegaConf.to_container(compose_run(tmp_path, "experiment=table_etgs_1", typed).table)
+    table = OmegaConf.to_container(compose_run("experiment=table_etgs_1", typed).table)
     assert {(run.scene, run.folder) for run in reproduction_of(table, str(root), METHODS).runs} == {
         ("cooling_bench", "my_bench")
     }
@@ -275,7 +275,7 @@ def test_every_job_of_a_table_has_a_folder_of_its_own(knob, tmp_path):
     for run in reproduction.runs:
         for value in values.split(","):
             given = ["max_steps=3000", f"{key}={value}", f"data.root={root}", "callbacks.images=null"]
-            compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
+            compose_run("experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
             folders.append(HydraConfig.get().sweep.subdir)
     assert len(folders) == 4 == len(set(folders))
     assert all(
@@ -283,7 +283,7 @@ def test_every_job_of_a_table_has_a_folder_of_its_own(knob, tmp_path):
         for folder, run in zip(folders[::2], reproduction.runs, strict=True)
     )
     assert max(len(folder.encode()) for folder in folders) < 200
-    compose_run(tmp_path, "experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
+    compose_run("experiment=table_ravigs_4", *given, *run.overrides, f"row='{run.row}'")
     assert HydraConfig.get().sweep.subdir == folders[-1]  # so that a stopped sweep goes on
 
 

@@ -240,7 +240,7 @@ class Remembering:
 
 
 def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the_end(tmp_path, monkeypatch):
-    config = compose_run(tmp_path, "method=3dgs")
+    config = compose_run("method=3dgs")
     # Imported here: composing loads plugins, and with them the classes that sweep, anew.
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 
@@ -264,8 +264,8 @@ def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the
     ("size", "expected"),
     [(None, ["seed=0 a", "b c d"]), (2, ["seed=0 a", "b c", "d"]), (1, ["seed=0", "a", "b", "c", "d"])],
 )
-def test_no_job_starts_before_those_that_come_first_have_ended(size, expected, tmp_path):
-    compose_run(tmp_path, "method=3dgs")
+def test_no_job_starts_before_those_that_come_first_have_ended(size, expected):
+    compose_run("method=3dgs")
     from hydra_plugins.heatsplat_sweeper.rows import Batches
 
     launcher = Remembering()
@@ -277,11 +277,11 @@ def test_no_job_starts_before_those_that_come_first_have_ended(size, expected, t
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
-def test_rows_of_an_ablation_are_different_recipes_that_compose(path, tmp_path):
+def test_rows_of_an_ablation_are_different_recipes_that_compose(path):
     rows = yaml.safe_load(path.read_text())["hydra"]["sweeper"]["rows"]
     method, recipes = path.stem.partition("_")[0], []
     for name, row in rows.items():
-        config = compose_run(tmp_path, f"method={method}", *row.get("set", []), f"row='{name}'")
+        config = compose_run(f"method={method}", *row.get("set", []), f"row='{name}'")
         recipes.append({key: value for key, value in config.items() if key != "row"})
     texts = [str(recipe) for recipe in recipes]
     assert len(set(texts)) == len(rows) > 1
@@ -320,8 +320,8 @@ def test_an_ablation_refuses_another_method_before_any_job(tmp_path):
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
-def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
-    own = compose_run(tmp_path, f"ablation={path.stem}").name
+def test_an_ablation_brings_the_method_that_it_is_of(path):
+    own = compose_run(f"ablation={path.stem}").name
     of = HydraConfig.get().sweeper.of
     assert own == path.stem.partition("_")[0] == (of if isinstance(of, str) else of[0])
     from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
@@ -338,13 +338,13 @@ def test_an_ablation_brings_the_method_that_it_is_of(path, tmp_path):
             jobs(others)
 
 
-def test_an_ablation_may_be_of_several_methods(tmp_path):
+def test_an_ablation_may_be_of_several_methods():
     """The authors' code of ETGS has numbers of frequencies too."""
-    compose_run(tmp_path, "ablation=etgs_frequencies", "method=etgs_released")
+    compose_run("ablation=etgs_frequencies", "method=etgs_released")
     sweeper = HydraConfig.get().sweeper
     assert "etgs_released" in sweeper.of
     for row in sweeper.rows.values():
-        assert compose_run(tmp_path, "method=etgs_released", *row.set).name == "etgs_released"
+        assert compose_run("method=etgs_released", *row.set).name == "etgs_released"
 
 
 def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(tmp_path):

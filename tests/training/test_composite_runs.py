@@ -98,6 +98,6 @@ def test_a_run_blends_what_it_is_told(tmp_path):
     assert found.isfinite().all() and change.min() > -1e-4 and 1e-4 < change.max() < 0.5
 
 
-def test_the_default_is_that_of_a_module_without_one(tmp_path):
-    config = compose_run(tmp_path, "method=etgs")
+def test_the_default_is_that_of_a_module_without_one():
+    config = compose_run("method=etgs")
     assert type(build(config.composite)) is Composite

@@ -120,17 +120,17 @@ def test_a_scene_without_weather_is_refused_before_training(tmp_path, monkeypatc
         run(tmp_path, *SHORT, "test=false")
 
 
-def test_the_ablations_have_the_rows_of_the_tables(tmp_path):
+def test_the_ablations_have_the_rows_of_the_tables():
     rows = OmegaConf.load(f"{CONF}/ablation/thermogs_losses.yaml").hydra.sweeper.rows
     whole = {"data": 0.8, "edge": 0.2, "smooth": 1.0, "physical": 0.01, "ode": 0.01, "pinn": 1.0}
     left_out = []
     for row in rows.values():
-        config = OmegaConf.to_container(compose_run(tmp_path, *SHORT, *row["set"]), resolve=True)
+        config = OmegaConf.to_container(compose_run(*SHORT, *row["set"]), resolve=True)
         weights = config["thermal"]["weights"] | {name: t["weight"] for name, t in config["loss"]["terms"].items()}
         off = [name for name in whole if weights[name] == 0]
         assert weights == whole | dict.fromkeys(off, 0)
         left_out.append(off)
     assert left_out == [["edge"], ["smooth"], ["physical"], ["ode"], ["pinn"], []]
     rows = OmegaConf.load(f"{CONF}/ablation/thermogs_attributes.yaml").hydra.sweeper.rows
-    chosen = [compose_run(tmp_path, *SHORT, *row["set"]).thermal.attributes for row in rows.values()]
+    chosen = [compose_run(*SHORT, *row["set"]).thermal.attributes for row in rows.values()]
     assert chosen == ["table", "inferred"]

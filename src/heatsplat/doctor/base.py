@@ -23,6 +23,8 @@ NAMED = 3  # frames that a finding names
 SAME = 0.95
 MAX_PIXELS = 1500  # of a camera that stands still
 COARSE = 64  # pixels of the shorter side of images whose edges are compared
+# Points and frames from which it can be told what all points do from frame to frame.
+MIN_POINTS, MIN_FRAMES = 40, 5
 FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
 
 
@@ -83,6 +85,11 @@ class Material:
     clipped: float | None = None
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
+
+    @cached_property
+    def chosen_times_s(self) -> Tensor | None:
+        """Times [F] float64 of the frames of ``images``, None where there are none."""
+        return None if self.times_s is None else torch.tensor(self.times_s, dtype=torch.float64)[list(self.chosen)]
 
     @cached_property
     def noise(self) -> float:
@@ -212,8 +219,17 @@ def coarse(image: Tensor) -> Tensor:
     """An image [h, w] float64 with COARSE pixels along its shorter side, by means over areas of [H, W]; as it is where it has
     no more, and 0 where nothing is known."""
     scale = max(1.0, min(image.shape) / COARSE)
-    size = (round(image.shape[0] / scale), round(image.shape[1] / scale))
+    return shrunk(image, (round(image.shape[0] / scale), round(image.shape[1] / scale)))
+
+
+def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """An image [H, W] on a grid (height, width), float64, by means over areas; 0 where nothing is known."""
     return functional.interpolate(image[None, None].double().nan_to_num(), size, mode="area")[0, 0]
+
+
+def unit(patterns: Tensor) -> Tensor:
+    """Patterns [..., n] without their means and of length 1, whose products are correlations."""
+    return functional.normalize(patterns - patterns.mean(-1, keepdim=True), dim=-1)
 
 
 def _lenses(frames: Sequence[Frame]) -> list[int]:

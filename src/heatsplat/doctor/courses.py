@@ -21,8 +21,8 @@ def beside_courses(values: Tensor, weights: Tensor, material: Material) -> tuple
     level only.
     """
     columns = [torch.ones(values.shape[1], dtype=values.dtype)]
-    if material.times_s is not None:
-        times = torch.tensor(material.times_s, dtype=values.dtype)[list(material.chosen)]
+    if material.chosen_times_s is not None:
+        times = material.chosen_times_s.to(values.dtype)
         share = (times - times.min()) / (times.max() - times.min()).clamp_min(1e-9)
         columns += [torch.exp(-rate * share) for rate in RATES]
     if material.answers is not None:

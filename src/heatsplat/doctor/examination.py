@@ -39,9 +39,14 @@ def examine(material: Material) -> list[Finding]:
 def warn_of(scene: SceneData) -> list[Finding]:
     """Warns of what is wrong with a scene that is about to be trained; says nothing where nothing is."""
     found = examine(material_of(scene))
+    warn(found)
+    return found
+
+
+def warn(found: Sequence[Finding]) -> None:
+    """Warns of findings, one line each."""
     for finding in found:
         log.warning("doctor, %s: %s %s", finding.check, finding.what, finding.remedy)
-    return found
 
 
 def show(found: Sequence[Finding], title: str) -> None:

@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.physics.noise import MAD_TO_SIGMA
+
 # A pixel is dead where it differs from the median about it by this many deviations of its frame, in this share of frames.
 DEVIATIONS, NEARLY_ALL = 6.0, 0.9
 MIN_FRAMES = 4
 # Correlation between images of what differs from its surroundings, dead pixels aside, from which the image stands still: 0.63
 # in noisy repeats of one view, up to 0.04 in recordings by a camera that moves.
 STILL = 0.12
-_MAD_TO_SIGMA = 1.4826
 
 
 def dead_pixels(images: Tensor) -> Tensor:
@@ -33,7 +34,7 @@ def dead_pixels(images: Tensor) -> Tensor:
         around = functional.unfold(wide, 3, dilation=2)[0]  # every other pixel: a dead neighbour does not count
         away = known - around.median(dim=0).values.reshape(image.shape)
         other = away[away != 0]  # on a slope many a pixel is itself the median about it, and says nothing of the noise
-        limit = DEVIATIONS * (_MAD_TO_SIGMA * other.abs().median()).nan_to_num().clamp_min(1e-9)
+        limit = DEVIATIONS * (MAD_TO_SIGMA * other.abs().median()).nan_to_num().clamp_min(1e-9)
         far = away.abs() > limit
         votes += far
         signs += far * away.sign().long()

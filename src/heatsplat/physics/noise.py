@@ -13,7 +13,7 @@ from heatsplat.contracts import ViewSet, evenly_spread
 # A Laplacian of Laplacians: blind to anything that varies linearly along rows or columns (Immerkaer, CVIU 64, 1996).
 # It is the second difference along rows of that along columns: [[1, -2, 1], [-2, 4, -2], [1, -2, 1]].
 _MASK_GAIN = 6.0  # root of the sum of the squares of these
-_MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826  # standard deviation of normal values over the median of their sizes
 # Of the pixels of an image, this share with the least gradient counts: edges pass the mask, flat parts do not.
 _FLATTEST = 0.25
 MIN_NOISE = 1e-6  # image units; what an image without any shows
@@ -64,8 +64,13 @@ def noise_of_repeats(images: Tensor, masks: Tensor | None = None) -> float:
         if masks is not None:
             step = torch.where(masks[f] & masks[f - 1], step, torch.nan)
         away[f - 1] = (step - step.nanmedian()).abs()
-    spread = float(_MAD_TO_SIGMA * away.nanmedian() / math.sqrt(2.0))
+    spread = float(MAD_TO_SIGMA * away.nanmedian() / math.sqrt(2.0))
     return spread if math.isfinite(spread) else 0.0
+
+
+def robust_spread(values: Tensor) -> float:
+    """Standard deviation of values about 0, of any shape, from the median of their sizes; NaN does not count."""
+    return MAD_TO_SIGMA * float(values.abs().nanmedian())
 
 
 def quantum_of(image: Tensor) -> float:
@@ -90,4 +95,4 @@ def _of_one(image: Tensor, used: Tensor) -> float:
         functional.pad(smooth, (0, 0, 1, 1), mode="replicate").diff(n=1, dim=2)[..., 1:, :],
     )[0, 0]
     flat = used & (gradient <= gradient[used].kthvalue(max(1, int(_FLATTEST * int(used.sum())))).values)
-    return _MAD_TO_SIGMA * float(response[flat].median()) / _MASK_GAIN
+    return MAD_TO_SIGMA * float(response[flat].median()) / _MASK_GAIN

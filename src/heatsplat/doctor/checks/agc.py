@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.doctor.base import MIN_FRAMES, MIN_POINTS, Check, Finding, Material
 from heatsplat.doctor.checks.drift import frame_levels
 from heatsplat.physics.noise import quantum_of
 
-MIN_POINTS, MIN_FRAMES = 40, 5
 GAIN = 0.06  # spread of gains from frame to frame from which contrast is not fixed
 ROUGH = 0.4  # leaps in spreads of the gains: 1.2 where they have no order in time, 0.13 to 0.16 where mist drifts
 EXPLAINED = 0.5  # share of what levels leave that gains have to explain
@@ -56,9 +55,7 @@ def _gains(material: Material) -> float | None:
     own = known - known.nanmean(dim=0)
     kept = used.sum(0) >= MIN_POINTS // 2
     own, points = own[:, kept], points[:, kept]
-    times = material.times_s
-    if times is not None:
-        times = torch.tensor(times, dtype=own.dtype)[list(material.chosen)][kept]
+    times = None if material.chosen_times_s is None else material.chosen_times_s[kept]
     gain = _gain(own, points)
     left, after = (own - points).abs().nanmedian(), (own - gain * points).abs().nanmedian()
     if len(gain) < MIN_FRAMES or float(after) > (1.0 - EXPLAINED) * float(left):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.doctor.base import MIN_FRAMES, MIN_POINTS, Check, Finding, Material, some
 from heatsplat.doctor.courses import beside_courses
+from heatsplat.physics.noise import robust_spread
 
-MIN_POINTS, MIN_FRAMES = 40, 5
 LEAST, LEAST_BESIDE = 3.0, 2.0  # times the noise of a pixel: of levels as they are, and beside each point's own course
 # Share of what points differ by between frames that is left without the levels: 0.17 to 0.31 where a sensor drifts (m3t_heath:
 # 0.31), 0.59 and more where surfaces mirror, which half of the points show; beside their courses 0.19 to 0.52, and 0.65.
@@ -116,7 +116,7 @@ def _spread(values: Tensor, weights: Tensor, levels: Tensor) -> float:
     """How much a point differs from itself in other frames: standard deviation, from the median of all."""
     left = torch.where(weights > 0, values - levels, torch.nan)
     left = left - left.nanmedian(dim=1, keepdim=True).values
-    return 1.4826 * float(left.abs().nanmedian())
+    return robust_spread(left)
 
 
 def _shutters(levels: Tensor) -> list[int]:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.doctor.base import MIN_FRAMES, MIN_POINTS, Check, Finding, Material, shrunk
 from heatsplat.doctor.courses import beside_courses
 from heatsplat.effects.observations import between, slopes
+from heatsplat.physics.noise import MAD_TO_SIGMA, robust_spread
 
 WIDTHS = (24, 48, 96, 192)  # pixels across of the images in which it is looked for, one after the other
 STEPS, ROUNDS = 3, 5
-MIN_POINTS, MIN_FRAMES = 40, 5
 LEAST = 0.02  # share of the focal length; structure from motion is often off by a hundredth
 SURE = 5.0  # standard errors
 # The spread of a point over frames has to fall to this share. Where nothing is wrong it falls to 0.93 at the least.
@@ -57,8 +54,8 @@ def fitting_factor(material: Material) -> tuple[float, float]:
     factor, error = 1.0, 0.0
     widths = (*(w for w in WIDTHS if w < width), min(width, WIDTHS[-1]))
     grids = [(max(8, round(wide * height / width)), wide) for wide in widths]
-    shrunk = [_shrunk(material.image(f), grids) for f in range(len(material.images))]
-    for (high, wide), images in zip(grids, zip(*shrunk, strict=True), strict=True):
+    for high, wide in grids:
+        images = [shrunk(material.image(f), (high, wide)) for f in range(len(material.images))]
         half = tracks.positions.new_tensor([0.5 * wide, 0.5 * high])
         for _ in range(STEPS):
             places = middle + factor * away
@@ -69,12 +66,6 @@ def fitting_factor(material: Material) -> tuple[float, float]:
             share, error = _share(material, values, pulled, seen)
             factor = min(max(factor * (1.0 - share), 1.0 / WIDEST), WIDEST)
     return factor, error
-
-
-def _shrunk(image: Tensor, grids: Sequence[tuple[int, int]]) -> list[Tensor]:
-    """An image [H, W] on each of these grids (height, width), by means over areas; 0 where nothing is known."""
-    known = image[None, None].nan_to_num()
-    return [functional.interpolate(known, size=size, mode="area")[0, 0] for size in grids]
 
 
 def _from_the_middle(material: Material) -> tuple[Tensor, Tensor]:
@@ -93,7 +84,7 @@ def _share(material: Material, values: Tensor, pulled: Tensor, seen: Tensor) -> 
         inner = (counts * pull * pull).sum().clamp_min(1e-30)
         share = (counts * pull * value).sum() / inner
         left = value - share * pull
-        own = 1.4826 * torch.where(seen, left.abs(), torch.nan).nanmedian(1, keepdim=True).values
+        own = MAD_TO_SIGMA * torch.where(seen, left.abs(), torch.nan).nanmedian(1, keepdim=True).values
         own = own.nan_to_num(torch.inf).clamp_min(float(own[own.isfinite()].median().clamp_min(1e-9)))
         weights = (1.0 - (left / (5.0 * own)) ** 2).clamp_min(0.0) ** 2 * seen / own**2
     pulls = counts * left * pull
@@ -109,7 +100,7 @@ def _spread(material: Material, factor: float, other: float) -> float:
     images = (material.image(f).nan_to_num() for f in range(len(material.images)))
     values = torch.stack([between(image[..., None], places[:, f])[:, 0] for f, image in enumerate(images)], 1)
     left, counts = beside_courses(values, seen.double(), material)
-    return 1.4826 * float(torch.where(counts > 0, left.abs(), torch.nan).nanmedian())
+    return robust_spread(torch.where(counts > 0, left, torch.nan))
 
 
 CHECK = Check("focal", "whether images fit poses and points best with the focal length that they have", find)

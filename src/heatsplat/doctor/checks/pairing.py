@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.doctor.base import Check, Finding, Material, coarse
+from heatsplat.doctor.base import MIN_FRAMES, Check, Finding, Material, coarse, unit
 
-MIN_FRAMES = 5
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
 MATCH = 0.3  # correlation of the photo that fits best from which it is one of the same moment
@@ -33,7 +32,7 @@ def find(material: Material) -> list[Finding]:
     heat, light = heat[shows], light[shows]
     if len(heat) < MIN_FRAMES:
         return found
-    fits = torch.einsum("fp,gp->fg", _unit(heat.flatten(1)), _unit(light.flatten(1)))
+    fits = torch.einsum("fp,gp->fg", unit(heat.flatten(1)), unit(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
     best = float(fits.max(1).values.median())
@@ -117,10 +116,6 @@ def _edges(image: Tensor) -> Tensor:
     strength = torch.hypot(x, y)
     strength = strength / (strength + strength.mean()).clamp_min(1e-30)
     return functional.avg_pool2d(strength[None, None], 3, stride=1, padding=1)[0, 0]
-
-
-def _unit(rows: Tensor) -> Tensor:
-    return functional.normalize(rows - rows.mean(1, keepdim=True), dim=1)
 
 
 def _shift(heat: Tensor, light: Tensor) -> Tensor | None:

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, evenly_spread
-from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.doctor.base import Check, Finding, Material, some, unit
 
 PAIRS, POINTS, CANDIDATES = 10, 100, 1500
 HALF, REACH = 4, 5  # pixels: half a patch, and how far a point is looked for about where it should be
@@ -64,9 +64,9 @@ def find(material: Material) -> list[Finding]:
 
 def _near_in_time(material: Material, one: int) -> Tensor:
     """Frames [F] bool that were taken so close to one that heat has not changed what they show."""
-    if material.times_s is None:
+    times = material.chosen_times_s
+    if times is None:
         return torch.ones(len(material.images), dtype=torch.bool)
-    times = torch.tensor(material.times_s, dtype=torch.float64)[list(material.chosen)]
     return (times - times[one]).abs() <= LATER_S
 
 
@@ -110,7 +110,7 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
     steps = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     moves = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
     seen = _sampled(material.image(other), base[:, None] + moves[:, None])
-    alike = (_unit(first)[:, None] * _unit(seen)).sum(2)
+    alike = (unit(first)[:, None] * unit(seen)).sum(2)
     best, where = alike.max(1)
     found = best > ALIKE
     shift = torch.where(found, moves[where].norm(dim=1), float(REACH + 1))
@@ -137,10 +137,6 @@ def _sampled(image: Tensor, pixels: Tensor) -> Tensor:
     grid = (2.0 * pixels / extent - 1.0).reshape(1, 1, -1, 2)
     values = functional.grid_sample(image[None, None].nan_to_num(), grid, align_corners=False, padding_mode="border")
     return values.reshape(pixels.shape[:-1])
-
-
-def _unit(patches: Tensor) -> Tensor:
-    return functional.normalize(patches - patches.mean(-1, keepdim=True), dim=-1)
 
 
 def _slope(material: Material) -> float:

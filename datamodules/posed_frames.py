@@ -1,0 +1,147 @@
+"""Frames of the layouts that several data sets share: images that a COLMAP model has registered, and NTR's pair of JSON files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.formats.colmap import SparseModel
+from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.points import obj_vertices, random_points, told_random
+
+FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
+
+
+def image_index(folder: Path, images: str, key: str) -> ImageIndex:
+    """Files of an image folder of a scene. Raises SceneError naming the option ``key`` when the folder has none."""
+    index = ImageIndex(folder / images)
+    if not index.names:
+        what = "holds no image" if index.folder.is_dir() else "does not exist"
+        raise SceneError(f"{key}={images}: {index.folder} {what}")
+    return index
+
+
+def match_model(
+    model: SparseModel, files: dict[str, str | None], index: ImageIndex, folder: str
+) -> tuple[list[str], dict[str, Any]]:
+    """Names of the model that have a file, and notes about those that do not and about files that are not registered.
+
+    Raises:
+        SceneError: no name of the model has a file.
+    """
+    kept = [name for name in model.names if files[name] is not None]
+    if not kept:
+        raise SceneError(
+            f"none of the {len(model.names)} images of the sparse model {model.folder} is in {index.folder}: the model "
+            f"has names like {model.names[0]!r}, the folder like {index.names[0]!r}"
+        )
+    notes: dict[str, Any] = {"registered": len(model.names)}
+    if missing := [name for name in model.names if files[name] is None]:
+        notes["images_missing"] = (
+            f"{len(missing)} registered images have no file in {folder}/, dropped: {_some(missing)}"
+        )
+    if unregistered := index.unused(f for f in files.values() if f):
+        notes["images_unregistered"] = f"{len(unregistered)} files are not in the model, unused: {_some(unregistered)}"
+    return kept, notes
+
+
+def model_frames(
+    module: SceneDataModule,
+    scene: Path,
+    model: SparseModel,
+    files: Mapping[str, str | None],
+    images: Path,
+    read: Callable[[Path], np.ndarray] | None = read_image,
+    describe: Callable[[str], dict[str, Any]] | None = None,
+) -> list[RawFrame]:
+    """The frames of a sparse model that have a file, in the order of the model, with their masks.
+
+    Args:
+        module: whose masks are looked up.
+        scene: folder of the scene, which may hold masks.
+        model: their poses and lenses.
+        files: stored image of each name in the model, relative to ``images``, or None.
+        images: folder of the images.
+        read: function from a path to the stored thermal pixels; None for photos alone.
+        describe: function from a name in the model to further fields of ``RawFrame``, such as time_s; a ``name`` among them
+            replaces that of the model.
+    """
+    masks = ImageIndex(scene / module.masks)
+    frames = []
+    for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
+        file = files[name]
+        if file is None:
+            continue
+        fields = {"name": name, **(describe(name) if describe else {})}
+        frames.append(
+            RawFrame(
+                viewmat=viewmat,
+                lens=lens,
+                read=partial(read, images / file) if read else None,
+                read_mask=module.mask_reader(masks, fields["name"]),
+                **fields,
+            )
+        )
+    return frames
+
+
+def listed_frames(
+    module: SceneDataModule, folder: Path, describe: Callable[[dict[str, Any], str], dict[str, Any]]
+) -> tuple[list[RawFrame], list[str]]:
+    """The frames of transforms_train.json and transforms_test.json that have an image, and the names of those without.
+
+    Args:
+        module: whose masks are looked up.
+        folder: of the scene.
+        describe: function from the entry of a frame and its file to further fields of ``RawFrame``, such as time_s.
+
+    Raises:
+        SceneError: no frame has an image.
+    """
+    index, masks = ImageIndex(folder), ImageIndex(folder / module.masks)
+    frames: list[RawFrame] = []
+    missing: list[str] = []
+    for subset, file_name in FILES.items():
+        transforms = read_transforms(folder / file_name)
+        for frame in transforms.frames:
+            path = PurePosixPath(str(frame["file_path"]))
+            file = index.find(str(path)) or index.find(f"{path}.png")
+            if file is None:
+                missing.append(str(path))
+                continue
+            read = partial(read_image, folder / file)
+            # Some frames carry their own field of view; the file's holds for the others.
+            own = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
+            frames.append(
+                RawFrame(
+                    name=file,
+                    viewmat=viewmat_of(transforms, frame, opengl=False),
+                    lens=lens_in(transforms, {**frame, **own}, lambda read=read: read().shape[1::-1]),
+                    read=read,
+                    read_mask=module.mask_reader(masks, file),
+                    **{"subset": subset, **describe(frame, file)},
+                )
+            )
+    if not frames:
+        raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
+    return frames, missing
+
+
+def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """Points [P, 3] of a scene and notes on their origin: vertices of mesh.obj, or ``count`` random ones without it."""
+    mesh = folder / "mesh.obj"
+    if mesh.is_file():
+        return obj_vertices(mesh), {"points_source": "vertices of mesh.obj"}
+    points = random_points([f.viewmat for f in frames], count, seed)
+    return points, told_random(len(points), ": no mesh.obj")
+
+
+def _some(names: Sequence[str], most: int = 5) -> str:
+    return ", ".join(names[:most]) + (" ..." if len(names) > most else "")

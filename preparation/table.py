@@ -1,0 +1,181 @@
+"""What a table says of the frames of a recording: a row for each, or for the file that holds it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, replace
+from datetime import datetime
+from pathlib import Path
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.file_names import same_files
+from heatsplat.datamodules.side_files import Table, read_table
+from heatsplat.preparation.frame import Attitude, Position, ThermalFrame
+
+Row = tuple[int, list[str]]  # number of its line, and its cells
+
+# Columns of a table that make up a position and an attitude.
+NUMBERS = {
+    Position: ("latitude_deg", "longitude_deg", "altitude_m", "above_takeoff_m"),
+    Attitude: ("yaw_deg", "pitch_deg", "roll_deg"),
+}
+
+
+def with_table(
+    frames: Sequence[ThermalFrame], path: Path, columns: Mapping[str, str], notes: list[str]
+) -> list[ThermalFrame]:
+    """Frames with what a table says of them, which goes before what their files say.
+
+    Args:
+        frames: of the recording.
+        path: of the table.
+        columns: its columns by what they hold: name, time, latitude_deg, ...
+        notes: gets a sentence.
+
+    Raises:
+        SceneError: the table has no row for any frame or several for one, or no column that is known, or a cell cannot be read.
+    """
+    table = FrameTable.read(path, columns)
+    rows = table.rows_of(frames)
+    used: set[str] = set()
+    changed = []
+    for frame in frames:
+        if frame.name in rows:
+            changes, told = table.changes(frame, rows[frame.name])
+            frame = replace(frame, **changes)
+            used |= told
+        changed.append(frame)
+    table.check_use(rows.values(), used)
+    notes.append(f"{path.name} tells {', '.join(sorted(used)) or 'nothing'} of {len(rows)} of {len(frames)} frames")
+    return changed
+
+
+@dataclass(frozen=True)
+class FrameTable:
+    """A table with a column of names of files.
+
+    Args:
+        table: as it was read.
+        columns: names of its columns by what they hold.
+        at: positions of those that it has.
+    """
+
+    table: Table
+    columns: Mapping[str, str]
+    at: Mapping[str, int]
+
+    @classmethod
+    def read(cls, path: Path, columns: Mapping[str, str]) -> FrameTable:
+        """The table in a file. Raises SceneError where it has no names of files, or nothing else that is known."""
+        table = read_table(path)
+        at = {key: table.columns.index(column) for key, column in columns.items() if column in table.columns}
+        if "name" not in at:
+            raise SceneError(
+                f"table={path} has no column {columns.get('name')!r} with the names of files; it has "
+                f"{', '.join(table.columns)}: set table_columns.name"
+            )
+        if not at.keys() - {"name"}:
+            raise SceneError(
+                f"table={path} has none of the columns {', '.join(c for k, c in columns.items() if k != 'name')}; "
+                f"it has {', '.join(table.columns)}: say which is which, as in table_columns.time={table.columns[-1]}"
+            )
+        return cls(table, columns, at)
+
+    def rows_of(self, frames: Sequence[ThermalFrame]) -> dict[str, Row]:
+        """The rows by name of the frame that they belong to; a row names a file, or one of its frames, as flight_000003.
+
+        Raises:
+            SceneError: none belongs to a frame, or it cannot be told which does.
+        """
+        by_name = self._by_name()
+        frames_in = Counter(frame.path for frame in frames)
+        frame_files = [frame.path.with_name(f"{frame.path.stem}_{frame.number:06d}.tiff") for frame in frames]
+        by_file = {}
+        wanted = [path.as_posix() for frame, own in zip(frames, frame_files, strict=True) for path in (own, frame.path)]
+        for path, names in same_files(wanted, by_name).items():
+            if len(names) > 1:
+                raise SceneError(f"table={self.table.path}: {' and '.join(names)} may both be {path}; keep one of them")
+            if names:
+                by_file[path] = by_name[names[0]]
+        rows: dict[str, Row] = {}
+        for frame, own in zip(frames, frame_files, strict=True):
+            several = frames_in[frame.path] > 1
+            if several and own.as_posix() in by_file:
+                rows[frame.name] = by_file[own.as_posix()]
+            elif frame.path.as_posix() in by_file:
+                line, cells = rows[frame.name] = by_file[frame.path.as_posix()]
+                if several and self._cell(cells, "time"):
+                    raise SceneError(
+                        f"{self.table.path}, line {line}: {frame.path.name} holds {frames_in[frame.path]} frames, which have "
+                        f"no time in common; give each a row, as {own.stem}"
+                    )
+        if not rows:
+            raise SceneError(
+                f"table={self.table.path} has no row for any of the {len(frames)} frames, such as {frames[0].path.name}; "
+                f"its column {self.columns['name']} begins with {next(iter(by_name), 'nothing')}"
+            )
+        return rows
+
+    def changes(self, frame: ThermalFrame, row: Row) -> tuple[dict[str, object], set[str]]:
+        """Fields of a frame that its row changes, and which columns did. Raises SceneError for a cell that cannot be read."""
+        line, cells = row
+        changes: dict[str, object] = {}
+        used: set[str] = set()
+        if text := self._cell(cells, "time"):
+            try:
+                changes["time"] = datetime.fromisoformat(text)
+            except ValueError as error:
+                raise SceneError(
+                    f"{self.table.path}, line {line}: {text!r} in column {self.columns['time']} is no date-time such as "
+                    "2024-08-06T15:35:05.376"
+                ) from error
+            used.add("time")
+        for field, kind in (("position", Position), ("attitude", Attitude)):
+            numbers = {key: value for key in NUMBERS[kind] if (value := self._number(row, key)) is not None}
+            known = getattr(frame, field)
+            if numbers and (known is not None or _needed(kind) <= numbers.keys()):
+                changes[field] = kind(**numbers) if known is None else replace(known, **numbers)
+                used.update(numbers)
+        return changes, used
+
+    def check_use(self, rows: Iterable[Row], used: set[str]) -> None:
+        """Raises SceneError where a column has values in these rows and none was of use."""
+        rows = list(rows)
+        for kind, keys in NUMBERS.items():
+            idle = [key for key in keys if key not in used and any(self._cell(cells, key) for _, cells in rows)]
+            if idle:
+                lacking = ", ".join(self.columns.get(key, key) for key in sorted(_needed(kind) - {idle[0]}))
+                raise SceneError(
+                    f"table={self.table.path}: column {self.columns[idle[0]]} changes nothing, as neither the table nor the "
+                    f"files say {lacking} of the same frame; add that, or take the column away"
+                )
+
+    def _by_name(self) -> dict[str, Row]:
+        rows: dict[str, Row] = {}
+        for line, cells in self.table.rows:
+            name = cells[self.at["name"]]
+            if rows.setdefault(name, (line, cells))[1] != cells:
+                raise SceneError(f"table={self.table.path}, line {line}: {name} has another row above; keep one")
+        return rows
+
+    def _cell(self, cells: Sequence[str], key: str) -> str:
+        """What a row has in the column of ``key``; empty where the table has no such column."""
+        return cells[self.at[key]] if key in self.at else ""
+
+    def _number(self, row: Row, key: str) -> float | None:
+        line, cells = row
+        cell = self._cell(cells, key)
+        if not cell:
+            return None
+        try:
+            return self.table.number(cell)
+        except ValueError as error:
+            raise SceneError(
+                f"{self.table.path}, line {line}: {cell!r} in column {self.columns[key]} is no number"
+            ) from error
+
+
+def _needed(kind: type[Position | Attitude]) -> set[str]:
+    """What cannot be left out of a position or an attitude."""
+    return {part.name for part in fields(kind) if part.default is MISSING}

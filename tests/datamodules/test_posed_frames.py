@@ -1,0 +1,59 @@
+"""Frames of the layouts that several data sets share."""
+
+import pytest
+from layouts import grey, names, write_colmap, write_image
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.colmap import read_model
+from heatsplat.datamodules.posed_frames import model_frames
+
+
+def loaded(root):
+    module = Colmap(root=str(root))
+    module.setup()
+    return module.scene
+
+
+def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):
+    files = names(12)
+    write_colmap(tmp_path, files)
+    (tmp_path / "images" / files[3]).unlink()
+    write_image(tmp_path / "images" / "extra.png", grey(0))
+    scene = loaded(tmp_path)
+    assert len(scene.train) + len(scene.test) == 11
+    assert scene.notes["registered"] == 12
+    assert scene.notes["images_missing"].startswith("1 registered images have no file in images/, dropped: frame_003")
+    assert scene.notes["images_unregistered"].startswith("1 files are not in the model, unused: extra.png")
+
+
+def test_a_model_without_any_of_the_images_shows_both_names(tmp_path):
+    write_colmap(tmp_path, names(9), images=None)
+    write_image(tmp_path / "images" / "other.png", grey(0))
+    with pytest.raises(SceneError, match="none of the 9 images of the sparse model .*'frame_000.png'.*'other.png'"):
+        Colmap(root=str(tmp_path)).setup()
+
+
+def test_a_missing_image_folder_names_the_option(tmp_path):
+    write_colmap(tmp_path, names(9))
+    with pytest.raises(SceneError, match="data.images=thermal: .*does not exist"):
+        Colmap(root=str(tmp_path), images="thermal").setup()
+    with pytest.raises(SceneError, match="data.raw=raw16: .*does not exist"):
+        Colmap(root=str(tmp_path), raw="raw16").setup()
+
+
+def test_a_data_set_may_name_its_frames_itself_and_masks_go_by_that_name(tmp_path):
+    write_colmap(tmp_path, names(9))
+    write_image(tmp_path / "masks" / "second.png", grey(0))
+    model = read_model(tmp_path)
+    files = dict.fromkeys(model.names) | {name: name for name in model.names[:2]}
+    called = dict(zip(model.names, ("first", "second"), strict=False))
+
+    def describe(name):
+        return {"name": called[name], "time_s": 7.0}
+
+    module = Colmap(root=str(tmp_path))
+    frames = model_frames(module, tmp_path, model, files, tmp_path / "images", describe=describe)
+    assert [frame.name for frame in frames] == ["first", "second"] and {frame.time_s for frame in frames} == {7.0}
+    assert [frame.read_mask is not None for frame in frames] == [False, True]
+    assert (frames[1].viewmat == model.viewmats[1]).all() and frames[1].read().shape == grey(0).shape
