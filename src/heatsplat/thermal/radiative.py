@@ -19,7 +19,7 @@ from heatsplat.thermal.band_scale import DEGREE, BandScale
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.harmonics import harmonics
+from heatsplat.thermal.view_harmonics import BASIS_COST, spherical_harmonics_of
 from heatsplat.thermal.wrapper import Wrapper
 
 DEGREES = {"emissivity": 1, "temperature": 1, "reflectance": 0}
@@ -228,10 +228,10 @@ class Radiative(Wrapper):
 
     @property
     def cost(self) -> int:
-        directions = {1: 0, 4: 12, 9: 27, 16: 48}  # by number of harmonics: normalising, and the polynomials
         formula = 6 + 4 * len(self.degrees) if self.three_parameter else 1  # the sum, and a sigmoid per attribute
         formula += 0 if self.band is None else 2 * DEGREE + 10  # the two polynomials and roots
-        return super().cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
+        sums = sum(BASIS_COST[degree] + self.bands[name] for name, degree in self.degrees.items())
+        return super().cost + formula + sums
 
     # The thermal band -----------------------------------------------------------------------------------
 
@@ -260,4 +260,5 @@ class Radiative(Wrapper):
     def _sum(self, splats: Splats, query: Query, name: str) -> Tensor:
         """The sum of harmonics of an attribute, [n, 1]."""
         degree = self.degrees[name]
-        return harmonics(splats[name], splats[f"{name}_rest"] if degree > 0 else None, splats.means, query, degree)
+        rest = splats[f"{name}_rest"] if degree > 0 else None
+        return spherical_harmonics_of(splats[name], rest, splats.means, query, degree)
