@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
-from heatsplat.physics.energy_balance import Climate, Core, Exposure, Surface, power_excess
-from heatsplat.physics.marching import Course, Kept
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import Course, Kept, stepped_temperature
 from heatsplat.physics.responses import driver_means, interval_of
+from heatsplat.physics.surfaces import Core, Exposure, Surface, power_excess
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.walls import u_value
 from heatsplat.same_bits import sigmoid, variance
@@ -370,7 +371,7 @@ class EnergyBalance(ThermalModel):
         if self.options.linear:
             return self.climate.linear_temperature(surface, query.time_s)
         if not self._kept.has(query.time_s, splats[MARCHED_AT]):
-            return self.climate.stepped_temperature(surface, query.time_s)
+            return stepped_temperature(self.climate, surface, query.time_s)
         ids = torch.arange(len(splats), device=splats.means.device) if query.ids is None else query.ids
         given = [splats[name].detach() for name in GIVEN if name in splats]
         return self._kept.temperature(surface, query.time_s, ids, given, splats[MARCHED_AT].detach())

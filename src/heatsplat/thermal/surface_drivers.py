@@ -10,9 +10,9 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneError, Weather
 from heatsplat.geometry.exposure import sun_directions
-from heatsplat.physics.energy_balance import Drivers, power_excess
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.surfaces import Drivers, power_excess
 from heatsplat.physics.units import celsius, kelvin
 from heatsplat.physics.walls import LEAST_K
 from heatsplat.physics.wetness import rained_on, wetted
