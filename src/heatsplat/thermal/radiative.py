@@ -191,8 +191,8 @@ class Radiative(Wrapper):
         if self.band is None:
             temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings)
         else:
-            others = (1.0 - emissivity) * self._of_black(self.surroundings)
-            own = (self._of_black(grey) - others) / emissivity
+            others = (1.0 - emissivity) * self.band.radiance_of(self.surroundings)
+            own = (self.band.radiance_of(grey) - others) / emissivity
             temperature = self.band.value_of(own.clamp(min=0.0).sqrt().sqrt())
         temperature = temperature.clamp(*START)
         values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
@@ -241,16 +241,12 @@ class Radiative(Wrapper):
             return (self._sum(splats, query, "radiance") + 0.5).clamp(min=0.0)
         body = self._body(splats, query)
         if self.band is not None:
-            own, others = (self._of_black(values) for values in (body["temperature"], self.surroundings))
+            own, others = (self.band.radiance_of(values) for values in (body["temperature"], self.surroundings))
             sent = torch.lerp(everywhere(others.to(own), own), own, body["emissivity"])
             return self.band.value_of(sent.sqrt().sqrt())
         gain, surroundings = (everywhere(number, body["emissivity"]) for number in (self.gain, self.surroundings))
         sent = radiance(body["emissivity"], body["temperature"], gain, body["reflectance"], surroundings)
         return clipped(sent, self.clip)
-
-    def _of_black(self, values: Tensor) -> Tensor:
-        """Radiance in the band of black bodies that look like ``values``, over that of white."""
-        return self.band.root_of(values).square().square()
 
     def _body(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """ε, T and ρ in the direction of view, each [n, 1]."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneError, Weather
 from heatsplat.geometry.exposure import sun_directions
 from heatsplat.physics.responses import driver_means
-from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.sky import law_for, sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, power_excess
 from heatsplat.physics.units import celsius, kelvin
 from heatsplat.physics.walls import LEAST_K
@@ -147,7 +147,7 @@ def _sky(weather: Weather, options: BalanceOptions, reference_k: float, up: Tens
     if options.sky is None:
         return Contribution()
     humid = weather.humidity_percent is not None
-    law = ("brutsaert" if humid else "swinbank") if options.sky == "auto" else options.sky
+    law = law_for(options.sky, humid)
     if law != "swinbank" and not humid:
         raise SceneError(
             f"sky={law} needs humidity_percent, which the weather does not have; use sky=swinbank or sky=auto"

@@ -93,7 +93,7 @@ class Initialisation:
         if count < wanted:
             log.info("init: %s of %s Gaussians, as many as density.cap_max allows", f"{count:,}", f"{wanted:,}")
         if self.source == "random":
-            low, high = torch.quantile(points, torch.tensor([0.01, 0.99]), dim=0)
+            low, high = scene.box
             return low + (high - low) * torch.rand(count, 3, generator=generator)
         if len(points) < NEIGHBOURS + 1:
             raise SceneError(
