@@ -1,4 +1,7 @@
-"""What hides the sun and the sky from Gaussians: the scene's depth, splatted from where they are, for models that ask."""
+"""What hides the sun and the sky from Gaussians: the scene's depth, splatted from where they are, for models that ask.
+
+Exposure is that to sun and sky, what shadows and the sky view factor leave; a camera's time of exposure is nowhere meant.
+"""
 
 from __future__ import annotations
 
