@@ -92,8 +92,10 @@ class Mesh(Format):
 def look(moment: Moment, frame: Frame) -> Look:
     """The moment's values as the camera of a frame sees them."""
     seen, module = moment.seen, moment.module
-    shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
-    output = module.renderer.values_seen(shapes, moment.blended[:, None], frame.camera, depth=True)
+    output = module.renderer(
+        seen.means, seen.quats, seen.scales, seen.opacities[None], moment.blended[:, None], frame.camera, None, (1,),
+        depth=True,
+    )  # fmt: skip
     alpha = output.alpha[0]
     means = (output.features[..., 0] / alpha).where(alpha >= OPEN, torch.nan)
     return Look(frame.camera, surface_depth(output.depth, alpha), moment.of_blended(means))
