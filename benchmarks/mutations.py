@@ -122,7 +122,7 @@ MUTATIONS = (
         "return warm_k**4 - cold_k**4", "tests/physics/test_heat_flow.py",
     ),
     Mutation(
-        "Excess of radiation unfactored", "physics.energy_balance",
+        "Excess of radiation unfactored", "physics.surfaces",
         "return excess_k * (1 + z * (1.5 + z * (1 + 0.25 * z)))",
         "return ((reference_k + excess_k) ** 4 - reference_k**4) / (4 * reference_k**3)",
         f"{HEAT}::test_radiation_near_the_reference_keeps_its_digits",

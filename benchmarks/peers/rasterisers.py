@@ -16,8 +16,8 @@ from torch import Tensor
 from benchmarks.peers.scenes import SharedScene
 from benchmarks.renderer.peers import Renderer, backend
 from benchmarks.renderer.scenes import Case, build
+from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.kernels.scheduling import use_threads
-from heatsplat.training.init import neighbour_distances
 
 LEAVES = ("means", "quats", "scales", "opacities", "features")
 Row = dict[str, Any]

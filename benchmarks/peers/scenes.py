@@ -12,10 +12,10 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.trajectories import orbit
 from heatsplat.io.pictures import write_png
 from heatsplat.renderers import rasterization
-from heatsplat.training.init import neighbour_distances
 
 IMAGES, HELD_OUT = "images", "test.txt"
 OFF_CENTRE = 0.01  # pixels

@@ -9,9 +9,11 @@ from torch import Tensor
 
 from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.physics.ellipsoids import THOMSEN_POWER, projected_area_ratio, radiating_area_ratio
-from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.heat_flow import fourth_powers
+from heatsplat.physics.marching import stepped_temperature
 from heatsplat.physics.responses import step_weights
+from heatsplat.physics.surfaces import Drivers, Surface, power_excess
 
 COUNT = 200
 REFERENCE_K = 288.0
@@ -81,7 +83,7 @@ def _stepped_ours(rate: Tensor, step: Tensor) -> Tensor:
         times = seconds * torch.arange(len(AIR), dtype=torch.float64)
         climate = Climate(Drivers(times, REFERENCE_K, torch.tensor(AIR, dtype=torch.float64)))
         surface = Surface(torch.full_like(r[None], START), r[None].log(), torch.zeros_like(r[None]))
-        found.append(climate.stepped_temperature(surface, float(times[-1]))[0])
+        found.append(stepped_temperature(climate, surface, float(times[-1]))[0])
     return torch.stack(found)
 
 

@@ -18,10 +18,12 @@ from torch import Tensor
 
 from benchmarks.stability.case import log_uniform, uniform
 from benchmarks.stability.closed_form import CASES
-from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.fused import visible_temperature
+from heatsplat.physics.marching import stepped_temperature
 from heatsplat.physics.relaxation import harmonic_response, temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
+from heatsplat.physics.surfaces import Drivers, Surface, power_excess
 from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
 
 DIGITS = 50
@@ -350,7 +352,7 @@ def weather_problem(gaussians: int, frames: int, name: str, title: str, span_s: 
 
     def stepped(kind: str) -> Moment:
         own, record = cast(kind), Climate(drivers)
-        return lambda t: record.stepped_temperature(own, t)
+        return lambda t: stepped_temperature(record, own, t)
 
     def tabulated(kind: str, size: int) -> Moment:
         own, record = cast(kind), Climate(drivers)

@@ -368,9 +368,15 @@ class SceneData:
     reduced_by: str | None = None
 
     @property
-    def bulk(self) -> tuple[Tensor, float]:
-        """Centre [3] and longest edge of the box that holds the points but for a hundredth at each end of every axis."""
+    def box(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest corner [3] of the box that holds the points but for a hundredth at each end of every axis."""
         low, high = torch.quantile(self.points.float(), torch.tensor([0.01, 0.99]), dim=0)
+        return low, high
+
+    @property
+    def bulk(self) -> tuple[Tensor, float]:
+        """Centre [3] and longest edge of ``box``."""
+        low, high = self.box
         return (low + high) / 2, max((high - low).max().item(), 1e-12)
 
     @property

@@ -18,8 +18,8 @@ from heatsplat.contracts import Camera, SceneError, ViewSet
 from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.io.ply import write_splats
-from heatsplat.training.init import neighbour_distances
 
 ROOT = Path(__file__).resolve().parents[2]
 TILES = "benchmarks.renderer.peers:render_torch_tiles"

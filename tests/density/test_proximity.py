@@ -7,7 +7,7 @@ import torch
 
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.ops import Cloud
-from heatsplat.density.proximity import Proximity, proximity_graph
+from heatsplat.density.proximity import Proximity
 from heatsplat.splats import Splats
 
 ROOT_PI = math.sqrt(math.pi)
@@ -48,31 +48,6 @@ def line(*positions):
 
 
 CLUSTER = line(0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 5.0)  # the last stands alone
-
-
-def test_the_graph_is_that_of_all_pairs():
-    means = torch.randn(300, 3, generator=torch.Generator().manual_seed(1))
-    lengths, ends = proximity_graph(means, 4)
-    pairs = torch.cdist(means.double(), means.double())
-    pairs.fill_diagonal_(math.inf)
-    expected, _ = pairs.topk(4, largest=False)
-    assert torch.allclose(lengths.double(), expected, atol=1e-6)
-    assert torch.allclose((means[ends] - means[:, None]).norm(dim=2), lengths, atol=1e-6)
-
-
-def test_no_centre_is_its_own_neighbour_even_where_centres_coincide():
-    means = torch.zeros(9, 3)
-    lengths, ends = proximity_graph(means, 3)
-    assert lengths.abs().max() == 0
-    assert (ends != torch.arange(9)[:, None]).all()
-
-
-def test_few_or_broken_centres():
-    assert proximity_graph(torch.zeros(1, 3), 3)[0].shape == (1, 0)
-    assert proximity_graph(torch.zeros(0, 3), 3)[0].shape == (0, 0)
-    lengths, ends = proximity_graph(torch.tensor(line(0.0, 1.0, math.nan, 3.0)), 3)
-    assert lengths[2].tolist() == [0.0, 0.0] and lengths[0].tolist() == [1.0, 3.0]
-    assert 2 not in ends[[0, 1, 3]]
 
 
 def test_company_comes_halfway_along_the_edges_of_the_one_that_stands_alone():

@@ -24,8 +24,8 @@ from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics import fused
-from heatsplat.physics.energy_balance import power_excess
 from heatsplat.physics.responses import grid_position, interpolate
+from heatsplat.physics.surfaces import power_excess
 from heatsplat.physics.units import celsius
 from heatsplat.renderers.settings import Renderer
 from heatsplat.sensors import calibration

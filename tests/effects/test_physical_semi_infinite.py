@@ -88,7 +88,7 @@ def test_a_recording_of_stone_decides_for_it_and_the_model_has_it():
     on = {name: Verdict(name, name in names, None, None, "told", settings.get(name, {})) for name in assembly.NAMES}
     templates = compose(["method=auto"])["effects"]
     state = build(assembly.assemble(on, templates)["thermal"]["state"])
-    assert state.semi_infinite and state.nodes == 1 and state.solution == "linear"
+    assert state.options.semi_infinite and state.options.nodes == 1 and state.options.linear
     without = assembly.assemble(assembly.without(on, EFFECT.name), templates)["thermal"]["state"]
     assert without["semi_infinite"] is False and without["nodes"] == 2
 

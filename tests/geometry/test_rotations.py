@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from heatsplat.geometry.rotations import matrices_to_quats, normalised, quats_to_matrices, slerp
+from heatsplat.geometry.rotations import matrices_to_quats, normalised, quats_to_matrices, reflected, slerp
 from heatsplat.training.rng import generator_for
 
 
@@ -90,3 +90,11 @@ def test_between_a_rotation_and_itself_there_is_only_itself():
         quats = random_quats(2000, dtype)
         assert (normalised(quats).square().sum(-1) > 1).any()
         torch.testing.assert_close(slerp(quats, quats, 0.3), normalised(quats), rtol=0, atol=bound)
+
+
+def test_a_mirror_turns_what_is_across_it_and_keeps_what_is_along():
+    normals = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, 1.0], [1.0, 1.0, 0.0]]), dim=1)
+    directions = torch.tensor([[1.0, 2.0, -3.0], [1.0, 0.0, 5.0]])
+    expected = torch.tensor([[1.0, 2.0, 3.0], [0.0, -1.0, 5.0]])
+    torch.testing.assert_close(reflected(directions, normals), expected)
+    torch.testing.assert_close(reflected(directions, -normals), expected)

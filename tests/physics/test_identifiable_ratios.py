@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from heatsplat.physics.energy_balance import Climate, Surface
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import stepped_temperature
+from heatsplat.physics.surfaces import Surface
 from tests.physics.weather_reference import drivers, solved
 
 MOMENTS = torch.arange(1200.0, 86401.0, 2640.0, dtype=torch.float64)
@@ -36,7 +38,7 @@ def modelled(climate: Climate, raw: torch.Tensor) -> tuple[torch.Tensor, torch.T
     values, slopes = [], []
     for moment in MOMENTS.tolist():
         leaf = raw.clone().requires_grad_()
-        x = climate.stepped_temperature(surface(leaf), moment)
+        x = stepped_temperature(climate, surface(leaf), moment)
         slopes.append(torch.autograd.grad(x.sum(), leaf)[0])
         values.append(x.detach())
     return torch.stack(values, 1), torch.stack(slopes, 1)

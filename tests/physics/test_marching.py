@@ -5,8 +5,19 @@ import torch
 
 from heatsplat.kernels import heat_balance as kernels
 from heatsplat.physics import marching
-from heatsplat.physics.energy_balance import Climate, Core, Surface
-from heatsplat.physics.marching import CHANGE, UNITS, Course, Kept, learned, march, parameters, with_parameters
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import (
+    CHANGE,
+    UNITS,
+    Course,
+    Kept,
+    learned,
+    march,
+    parameters,
+    stepped_temperature,
+    with_parameters,
+)
+from heatsplat.physics.surfaces import Core, Surface
 from tests.physics.weather_reference import drivers
 
 MOMENTS = torch.arange(1000.0, 80_000.0, 5300.0, dtype=torch.float64)
@@ -142,7 +153,7 @@ def test_derivatives_reach_the_parameters_through_what_is_kept(climate, surface)
     ours = torch.autograd.grad(
         kept.temperature(live, time, ids, (surface.normals,), marched_at).sum(), columns, retain_graph=True
     )
-    alone = torch.autograd.grad(climate.stepped_temperature(live, time).sum(), columns)
+    alone = torch.autograd.grad(stepped_temperature(climate, live, time).sum(), columns)
     for one, other in zip(ours, alone, strict=True):
         torch.testing.assert_close(one, other)
     assert not kept.has(time + 1.0, marched_at)
@@ -155,5 +166,5 @@ def test_views_in_any_order_see_what_a_march_of_their_own_finds(climate, surface
     ids = torch.arange(0, COUNT, 3)
     course = Course(climate, surface)
     for time in (0.0, 5000.0, 5000.0, 40_000.0, 9000.0, 86_400.0):
-        alone = climate.stepped_temperature(rows(surface, ids), time)
+        alone = stepped_temperature(climate, rows(surface, ids), time)
         torch.testing.assert_close(course.temperature(time, ids), alone, atol=2e-4, rtol=0)

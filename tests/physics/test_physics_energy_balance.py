@@ -9,10 +9,13 @@ import pytest
 import torch
 
 from heatsplat.physics import marching
-from heatsplat.physics.energy_balance import Climate, Core, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import stepped_temperature
+from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
 from heatsplat.physics.wetness import wet_share, wetted
 from tests.physics.weather_reference import drivers, solved
 
+linear_temperature = Climate.linear_temperature
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
 OWN = ("start", "log_rate", "sun", "share", "wind")  # the parameters of a surface with nothing behind it
 BODY = (*OWN, "normals")
@@ -35,8 +38,8 @@ def bodies(wind: bool) -> Surface:
     )
 
 
-def course(solution, surface: Surface) -> torch.Tensor:
-    return torch.stack([solution(surface, float(t)) for t in MOMENTS], dim=1)
+def course(solution, climate: Climate, surface: Surface) -> torch.Tensor:
+    return torch.stack([solution(climate, surface, float(t)) for t in MOMENTS], dim=1)
 
 
 @pytest.fixture(scope="module")
@@ -47,15 +50,15 @@ def climate() -> Climate:
 def test_linear_physics_is_exact_to_a_millikelvin(climate):
     surface = bodies(wind=True)
     truth = solved(climate.drivers, surface, MOMENTS, about=climate.mean_temperature(surface))
-    assert (course(climate.linear_temperature, surface) - truth).abs().max() < 1e-3
+    assert (course(linear_temperature, climate, surface) - truth).abs().max() < 1e-3
 
 
 def test_corrected_physics_is_exact_to_a_millikelvin_from_sheet_metal_to_wet_ground(climate):
     surface = bodies(wind=True)
     truth = solved(climate.drivers, surface, MOMENTS)
     assert truth.max() - truth.min() > 40  # the weather does heat
-    assert (course(climate.stepped_temperature, surface) - truth).abs().max() < 1e-3
-    linear = (course(climate.linear_temperature, surface) - truth).abs().amax(1)
+    assert (course(stepped_temperature, climate, surface) - truth).abs().max() < 1e-3
+    linear = (course(linear_temperature, climate, surface) - truth).abs().amax(1)
     assert linear[0] > 1.0  # what the correction is for: sheet metal in gusts
     assert linear[3] < 1.0
 
@@ -100,15 +103,15 @@ def rained_on() -> Climate:
 def test_wet_surfaces_are_those_of_a_stiff_solver_and_so_are_their_derivatives():
     climate, surface, dry = rained_on(), bodies(wind=True), Climate(drivers())
     truth = solved(climate.drivers, surface, MOMENTS)
-    found = course(climate.stepped_temperature, surface)
+    found = course(stepped_temperature, climate, surface)
     assert (found - truth).abs().max() < 1e-3
-    assert (found - course(dry.stepped_temperature, surface)).abs().max() > 3.0
+    assert (found - course(stepped_temperature, dry, surface)).abs().max() > 3.0
     at = 20_000.0  # between the shower and the sun that dries
     for name in OWN:
         leaf = getattr(surface, name).clone().requires_grad_()
-        climate.stepped_temperature(surface._replace(**{name: leaf}), at).sum().backward()
+        stepped_temperature(climate, surface._replace(**{name: leaf}), at).sum().backward()
         up, down = (
-            climate.stepped_temperature(surface._replace(**{name: leaf.detach() + step}), at) for step in (1e-4, -1e-4)
+            stepped_temperature(climate, surface._replace(**{name: leaf.detach() + step}), at) for step in (1e-4, -1e-4)
         )
         assert ((up - down) / 2e-4 - leaf.grad).abs().max() < 0.05 * leaf.grad.abs().max(), name
 
@@ -117,24 +120,27 @@ def test_both_agree_where_nothing_is_nonlinear():
     climate = Climate(replace(drivers(wind=False), sky=None, around=None))
     surface = bodies(wind=False)._replace(share=None)
     torch.testing.assert_close(
-        course(climate.stepped_temperature, surface), course(climate.linear_temperature, surface), atol=3e-3, rtol=0
+        course(stepped_temperature, climate, surface),
+        course(linear_temperature, climate, surface),
+        atol=3e-3,
+        rtol=0,
     )
 
 
-@pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
+@pytest.mark.parametrize("solution", [linear_temperature, stepped_temperature])
 def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solution):
     surface = bodies(wind=True)
-    names = BODY if solution == "linear_temperature" else OWN
+    names = BODY if solution is linear_temperature else OWN
     leaves = [getattr(surface, name).clone().requires_grad_() for name in names]
     at = 40_000.0  # the start is still remembered by some
     live = surface._replace(**dict(zip(names, leaves, strict=True)))
-    gradients = torch.autograd.grad(getattr(climate, solution)(live, at).sum(), leaves)
+    gradients = torch.autograd.grad(solution(climate, live, at).sum(), leaves)
     for name, gradient in zip(names, gradients, strict=True):
         for column in range(3) if name == "normals" else (0,):
             step = torch.zeros_like(getattr(surface, name))
             step[(..., column) if name == "normals" else ...] = 1e-4
             up, down = (
-                getattr(climate, solution)(surface._replace(**{name: getattr(surface, name) + sign * step}), at)
+                solution(climate, surface._replace(**{name: getattr(surface, name) + sign * step}), at)
                 for sign in (1, -1)
             )
             ours = gradient[:, column] if name == "normals" else gradient
@@ -168,7 +174,7 @@ def test_time_stepping_without_an_effect_is_that_with_its_parameter_at_zero_and_
     found = []
     for surface in (whole._replace(**gone), whole._replace(**zeros)):
         leaves = [None if x is None else x.clone().requires_grad_() for x in surface[: len(BODY)]]
-        x = climate.stepped_temperature(Surface(*leaves), 40_000.0)
+        x = stepped_temperature(climate, Surface(*leaves), 40_000.0)
         x.sum().backward()
         found.append((x.detach(), leaves))
     assert columns == [9 - sum(4 if key == "normals" else 1 for key in gone), 9]
@@ -192,7 +198,7 @@ def test_only_ratios_are_parameters_and_a_night_separates_convection_from_radiat
     level = tensor(0, 0, 1).expand(2, 3)
     surface = Surface(tensor(0, 0), -tensor(60, 60).log(), tensor(50, 50), tensor(0.2, 0.7), None, level)
     still = Climate(drivers(wind=False))
-    x = still.stepped_temperature(surface, 4 * 3600.0)
+    x = stepped_temperature(still, surface, 4 * 3600.0)
     air, sky = still.drivers.air[24], still.drivers.sky[24]
     rest = (1 - surface.share) * (air - x) + surface.share * (sky - power_excess(x, still.drivers.reference_k))
     assert rest.abs().max() < 0.2
@@ -227,15 +233,15 @@ def test_extreme_bodies_stay_finite_in_float32():
         sun=torch.tensor([200.0, 200.0, 0.0, 0.0]),
         wind=torch.tensor([0.95, 0.95, 0.0, 0.95]),
     )
-    for solution in (climate.linear_temperature, climate.stepped_temperature):
+    for solution in (linear_temperature, stepped_temperature):
         leaves = [x.clone().requires_grad_() for x in surface[: len(BODY)]]
-        x = solution(Surface(*leaves), 130_000.0)
+        x = solution(climate, Surface(*leaves), 130_000.0)
         assert x.isfinite().all()
         assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves[:-1]))
     for rate, coupling in product((1e-7, 0.1), (0.02, 50.0)):
         leaves = [torch.full((4,), value).requires_grad_() for value in (0.0, math.log(rate), coupling)]
-        for solution in (climate.linear_temperature, climate.stepped_temperature):
-            x = solution(surface._replace(core=Core(*leaves)), 130_000.0)
+        for solution in (linear_temperature, stepped_temperature):
+            x = solution(climate, surface._replace(core=Core(*leaves)), 130_000.0)
             assert x.isfinite().all()
             assert all(g.isfinite().all() for g in torch.autograd.grad(x.sum(), leaves))
 
@@ -263,12 +269,12 @@ def among(climate: Climate, name: str) -> Climate:
 )
 def test_what_lies_behind_surfaces_is_that_of_a_stiff_solver(climate, name):
     climate, surface = among(climate, name), bodies(wind=True)._replace(**BEHIND[name])
-    full = course(climate.stepped_temperature, surface)
+    full = course(stepped_temperature, climate, surface)
     assert (full - solved(climate.drivers, surface, MOMENTS)).abs().max() < 1e-3
-    linear = course(climate.linear_temperature, surface)
+    linear = course(linear_temperature, climate, surface)
     about = solved(climate.drivers, surface, MOMENTS, about=climate.mean_temperature(surface))
     assert (linear - about).abs().max() < 3e-3
-    plain = course(climate.stepped_temperature, bodies(wind=True))
+    plain = course(stepped_temperature, climate, bodies(wind=True))
     assert ((full - plain).abs().amax(1) > 0.3).all()  # it does something
     assert (full - linear).abs().max() > 0.5
 
@@ -277,32 +283,32 @@ def test_cores_from_those_that_follow_at_once_to_those_that_never_do_are_solved(
     """Both nodes of the stiffest body settle within seconds, those of the slowest hardly in the record."""
     core = Core(tensor(20, -20, 20, -20), tensor(0.1, 0.1, 1e-7, 1e-7).log(), tensor(50, 0.02, 50, 0.02))
     surface = bodies(wind=True)._replace(core=core, log_rate=tensor(0.1, 1e-6, 1e-2, 1e-4).log())
-    found = course(climate.stepped_temperature, surface)
+    found = course(stepped_temperature, climate, surface)
     assert (found - solved(climate.drivers, surface, MOMENTS)).abs().max() < 3e-3
     single = marching.with_parameters(surface, {k: v.float() for k, v in marching.parameters(surface).items()})
     single = single._replace(normals=surface.normals.float())
-    assert (course(climate.stepped_temperature, single) - found).abs().max() < 0.02
+    assert (course(stepped_temperature, climate, single) - found).abs().max() < 0.02
 
 
 def test_a_core_that_hardly_couples_or_follows_at_once_is_no_core(climate):
     surface = bodies(wind=True)
-    plain = course(climate.linear_temperature, surface)
+    plain = course(linear_temperature, climate, surface)
     faint = surface._replace(core=CORES._replace(coupling=torch.full_like(CORES.coupling, 1e-9)))
-    torch.testing.assert_close(course(climate.linear_temperature, faint), plain, atol=1e-3, rtol=0)
-    stepped = course(climate.stepped_temperature, surface)
-    torch.testing.assert_close(course(climate.stepped_temperature, faint), stepped, atol=1e-6, rtol=0)
+    torch.testing.assert_close(course(linear_temperature, climate, faint), plain, atol=1e-3, rtol=0)
+    stepped = course(stepped_temperature, climate, surface)
+    torch.testing.assert_close(course(stepped_temperature, climate, faint), stepped, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("solution", ["linear_temperature", "stepped_temperature"])
+@pytest.mark.parametrize("solution", [linear_temperature, stepped_temperature])
 @pytest.mark.parametrize("name", BEHIND)
 def test_derivatives_are_those_of_the_values_with_what_lies_behind(climate, name, solution):
     climate, surface, at = among(climate, name), bodies(wind=True)._replace(**BEHIND[name]), 40_000.0
     values = marching.parameters(surface)
     leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
-    getattr(climate, solution)(marching.with_parameters(surface, leaves), at).sum().backward()
+    solution(climate, marching.with_parameters(surface, leaves), at).sum().backward()
     for key, leaf in leaves.items():
         up, down = (
-            getattr(climate, solution)(marching.with_parameters(surface, values | {key: values[key] + sign * 1e-4}), at)
+            solution(climate, marching.with_parameters(surface, values | {key: values[key] + sign * 1e-4}), at)
             for sign in (1, -1)
         )
         scale = max(float(leaf.grad.abs().max()), 1e-3)  # float32 tables; sensitivities of second order
@@ -317,9 +323,9 @@ def test_the_sun_on_bodies_without_an_end_is_what_their_table_makes_of_the_same_
     beams = Climate(replace(given, beams=lit[:, None] * up, light=None, **bare), semi_infinite=True)
     level = Climate(replace(given, beams=None, light=lit, up=None, **bare), semi_infinite=True)
     surface = Surface(tensor(0, 5, -3), tensor(1e-6, 3e-5, 1e-3).log(), tensor(60, 60, 60), normals=up.expand(3, 3))
-    truth = course(level.linear_temperature, surface._replace(normals=None))
+    truth = course(linear_temperature, level, surface._replace(normals=None))
     assert truth.max() > 20
-    assert (course(beams.linear_temperature, surface) - truth).abs().max() < 0.2  # K, of 60 K in full sun
+    assert (course(linear_temperature, beams, surface) - truth).abs().max() < 0.2  # K, of 60 K in full sun
 
 
 @pytest.mark.parametrize("semi_infinite", [False, True])
@@ -347,7 +353,7 @@ def test_heat_from_within_is_a_driver_that_never_changes(climate, semi_infinite)
     assert (late[2].abs() < 1e-9) and (late[[0, 1, 3]] > 0.2).all()
     if semi_infinite:
         with pytest.raises(ValueError, match="bodies without an end are solved about a mean only"):
-            there.stepped_temperature(heated, 3600.0)
+            stepped_temperature(there, heated, 3600.0)
 
 
 def at_rest(semi_infinite: bool) -> Climate:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.physics.sky import LAWS, dew_point_c, sky_temperature_k, vapour_pressure_hpa
+from heatsplat.physics.sky import LAWS, dew_point_c, law_for, sky_temperature_k, vapour_pressure_hpa
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 AIR_K = torch.linspace(265.0, 310.0, 10, dtype=torch.float64)
@@ -50,3 +50,8 @@ def test_what_is_missing_or_unknown_is_named():
         sky_temperature_k(AIR_K, None, "brunt")
     with pytest.raises(ValueError, match="law of the sky must be one of"):
         sky_temperature_k(AIR_K, HALF, "blue")
+
+
+def test_a_law_that_is_not_named_follows_from_what_the_station_tells():
+    assert (law_for("auto", humid=True), law_for("auto", humid=False)) == ("brutsaert", "swinbank")
+    assert all(law_for(law, humid) == law for law in LAWS for humid in (True, False))

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.integrate import solve_ivp
 
-from heatsplat.physics.energy_balance import Drivers, Surface, power_excess
 from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.surfaces import Drivers, Surface, power_excess
 from heatsplat.training.rng import generator_for
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

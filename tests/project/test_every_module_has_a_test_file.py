@@ -65,7 +65,7 @@ ELSEWHERE = {
     "thermal/test_energy_network": "thermal/ellipsoid_balance thermal/land_cover thermal/residual_network thermal/weather_drive",
     "thermal/test_imaging_field": "thermal/coordinates",
     "thermal/test_radiative": "physics/grey_body",
-    "thermal/test_static": "thermal/base thermal/clipping thermal/harmonics",
+    "thermal/test_static": "thermal/base thermal/clipping thermal/view_harmonics",
     "thermal/test_time_mlp": "thermal/layers",
     "training/test_auto_verdicts": "runs/prices runs/verdicts",
     "training/test_composite_runs": "sensors/band_composite sensors/composite sensors/total_composite",

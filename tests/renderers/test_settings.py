@@ -56,6 +56,14 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
     assert given == own | {"modality_channels": (1,)} | further
 
 
+def test_values_are_seen_before_black_whatever_lies_behind_images():
+    camera = SCENE.train.frames[0].camera
+    shapes = torch.zeros(3, 3), torch.ones(3, 4), torch.ones(3, 3), torch.zeros(1, 3)
+    seen = Renderer(backend="reference", background=0.7).values_seen(shapes, torch.ones(3, 5), camera, depth=True)
+    assert seen.features.shape == (camera.height, camera.width, 5) and not seen.features.any()
+    assert seen.depth is not None and seen.alpha.shape[0] == 1
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

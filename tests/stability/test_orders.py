@@ -8,9 +8,11 @@ import torch
 
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics import energy_balance, planck, relaxation
-from heatsplat.physics.energy_balance import Climate, Drivers, Surface
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import stepped_temperature
 from heatsplat.physics.relaxation import temperature
 from heatsplat.physics.responses import ResponseTable, cubics, grid_position, interpolate, log_rate_grid
+from heatsplat.physics.surfaces import Drivers, Surface
 from heatsplat.physics.units import celsius
 from heatsplat.sensors import tone
 from heatsplat.splats import Splats
@@ -77,7 +79,7 @@ def stepped(samples: int, share: float) -> torch.Tensor:
     rate = torch.tensor([3e-5, 1e-4], dtype=DOUBLE)
     one = torch.ones_like(rate)
     surface = Surface(60 * one, rate.log(), 0 * one, share * one)
-    return climate.stepped_temperature(surface, 86400.0)
+    return stepped_temperature(climate, surface, 86400.0)
 
 
 def test_weather_between_samples():
@@ -97,7 +99,7 @@ def step_error(parts: int) -> float:
         climate = Climate(Drivers(times, 288.0, level, sky=level))
         one = torch.ones(1, dtype=DOUBLE)
         # Four intervals and more are one substep each, so that their number is that of the steps.
-        return climate.stepped_temperature(Surface(120 * one, math.log(8e-5) * one, 0 * one, one), 4000.0)
+        return stepped_temperature(climate, Surface(120 * one, math.log(8e-5) * one, 0 * one, one), 4000.0)
 
     return (solved(parts) - solved(800)).abs().item()
 

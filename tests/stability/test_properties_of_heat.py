@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 from physics.harmonic_reference import exact, joint_error, own_error
 from physics.planck_reference import band_radiance, band_slope
 
-from heatsplat.physics.energy_balance import Climate, Drivers, Surface, power_excess
+from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.frequencies import LOWEST_HZ, NARROWEST_BAND, frequency_grid
 from heatsplat.physics.fused import SMALLEST_OMEGA, visible_temperature
+from heatsplat.physics.marching import stepped_temperature
 from heatsplat.physics.planck import Band
 from heatsplat.physics.relaxation import harmonic_response, relax, response_slope, temperature
 from heatsplat.physics.responses import step_weights
+from heatsplat.physics.surfaces import Drivers, Surface, power_excess
 
 rates = logarithmic(1e-12, 1e4, 0.0, 1e-45, 1e-30, 1e-20, 1e9)
 omegas = logarithmic(1e-5, 3e2, 0.0, 1e-30, 1e-12)
@@ -161,7 +163,7 @@ def test_a_stiff_balance_neither_rings_nor_leaves_the_range_of_what_drives_it(ra
     climate = Climate(Drivers(moments, 288.0, air, sky=None if share is None else air))
     leaves = [torch.tensor([x], dtype=torch.float64).requires_grad_() for x in (start, math.log(rate), 0.0)]
     radiating = None if share is None else torch.tensor([share], dtype=torch.float64).requires_grad_()
-    found = climate.stepped_temperature(Surface(*leaves, radiating), moments[-1].item())
+    found = stepped_temperature(climate, Surface(*leaves, radiating), moments[-1].item())
     found.sum().backward()
     low, high = min(start, -20.0), max(start, 30.0)
     assert low - 2.0 <= found.item() <= high + 2.0

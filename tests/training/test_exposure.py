@@ -12,7 +12,7 @@ from heatsplat.datamodules.synthetic_scene.shapes import trace
 from heatsplat.geometry.exposure import sun_directions
 from heatsplat.renderers.settings import Renderer
 from heatsplat.training.exposure import Exposure
-from heatsplat.training.normals import Normals
+from heatsplat.training.normals import Discs, Normals
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 SPACING = 0.25
@@ -27,7 +27,7 @@ def sheet(corner, along, up, lengths, normal, spacing=SPACING):
 
 
 def looked_at(*sheets, spacing=SPACING):
-    """A scene of such Gaussians, and what shows it."""
+    """A scene of such Gaussians, and they themselves."""
     means, normals = (torch.cat(parts) for parts in zip(*sheets, strict=True))
     scales = torch.full_like(means, 0.6 * spacing)
     scales = torch.where(normals.abs() > 0.5, 0.02, scales)
@@ -36,21 +36,18 @@ def looked_at(*sheets, spacing=SPACING):
     times = torch.tensor([0.0, 60.0], dtype=torch.float64)
     scene = SceneData("sheets", views, views, views, means, weather=Weather(times, sun=UP.expand(2, 3), up=UP))
 
-    def show(frame, values, depth):
-        opaque = torch.full((1, len(means)), 0.99)
-        return Renderer("cpu")(means, quats, scales, opaque, values, frame.camera, None, (1,), depth=depth)
-
-    return scene, show, means, normals
+    return scene, Discs((means, quats, scales, torch.full((1, len(means)), 0.99)), normals)
 
 
 def test_a_wall_shades_the_ground_as_far_as_its_height_says():
     ground = sheet((-8.0, -4.0, 0.0), (1.0, 0, 0), (0, 1.0, 0), (16.0, 8.0), (0.0, 0, 1))
     wall = sheet((0.0, -4.0, 0.0), (0, 1.0, 0), (0, 0, 1.0), (8.0, 3.0), (1.0, 0, 0))
-    scene, show, means, normals = looked_at(ground, wall)
+    scene, discs = looked_at(ground, wall)
+    means, normals = discs.shapes[0], discs.normals
     for height in (30.0, 45.0, 60.0):  # of the sun, in the east (x)
         radians = math.radians(height)
         sun = torch.tensor([[math.cos(radians), 0.0, math.sin(radians)]], dtype=torch.float64)
-        lit = Exposure(allowance=1.5).open(scene, show, means, normals, sun)[:, 0]
+        lit = Exposure(allowance=1.5).open(scene, Renderer("cpu"), discs, sun)[:, 0]
         level = (normals[:, 2] > 0) & (means[:, 1].abs() < 3)
         reach = 3.0 / math.tan(radians)  # of the shadow, to the west of the wall
         margin = 0.6
@@ -73,8 +70,9 @@ def test_the_floor_of_a_street_sees_the_sky_that_geometry_leaves_it(width, heigh
     floor = sheet((-half, -0.5 * length, 0.0), (1.0, 0, 0), (0, 1.0, 0), (width, length), (0.0, 0, 1), 0.5)
     left = sheet((-half, -0.5 * length, 0.0), (0, 1.0, 0), (0, 0, 1.0), (length, height), (1.0, 0, 0), 0.5)
     right = sheet((half, -0.5 * length, 0.0), (0, 1.0, 0), (0, 0, 1.0), (length, height), (-1.0, 0, 0), 0.5)
-    scene, show, means, normals = looked_at(floor, left, right, spacing=0.5)
-    seen = Exposure(directions=100, allowance=1.5).sky(scene, show, means, normals)
+    scene, discs = looked_at(floor, left, right, spacing=0.5)
+    means, normals = discs.shapes[0], discs.normals
+    seen = Exposure(directions=100, allowance=1.5).sky(scene, Renderer("cpu"), discs)
     middle = (normals[:, 2] > 0) & (means[:, 0].abs() < 1) & (means[:, 1].abs() < 4)
     truth = math.cos(math.atan(2 * height / width))
     assert truth - 0.06 < seen[middle].mean().item() < truth + 0.02

@@ -8,7 +8,8 @@ import torch
 from running import TINY
 
 from heatsplat.composition import build, compose
-from heatsplat.training.init import Initialisation, Voxels, neighbour_distances
+from heatsplat.geometry.neighbours import neighbour_distances
+from heatsplat.training.init import Initialisation, Voxels
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneError, evenly_spread
 from heatsplat.density.base import Merging
 from heatsplat.density.moments import Merged, Shapes, merged
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.neighbours import neighbour_pairs
 from heatsplat.splats import GEOMETRY, Splats
 
 log = logging.getLogger("heatsplat")
@@ -274,14 +274,7 @@ class _Search:
 
     def _neighbours(self) -> Tensor:
         """Pairs [n, 2] of Gaussians, first below second, one of which is among the nearest of the other."""
-        means = self.cloud.splats.means.detach().double().cpu().numpy()
-        count = min(self.options.neighbours + 1, len(means))
-        _, near = cKDTree(means).query(means, k=count)
-        near = torch.from_numpy(near).reshape(len(means), count)
-        here = torch.arange(len(means))[:, None]
-        keys = torch.minimum(here, near).mul_(len(means)).add_(torch.maximum(here, near))[here != near]
-        keys = keys.unique()  # of rows it would take a hundred times as long
-        return torch.stack([keys // len(means), keys % len(means)], dim=1).to(self.cloud.splats.means.device)
+        return neighbour_pairs(self.cloud.splats.means.detach(), self.options.neighbours)
 
     def _rows(self, pairs: Tensor, one: Merged, told: Tensor, limits: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """Raw tensors of what pairs become, and which of them [n] bool agree with both at all times."""

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.base import DensityChange
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.neighbours import proximity_graph
 
 EVEN = 1e-4  # scores that differ by less than this share are equal: an even cloud has no gaps but those of rounding
 
@@ -137,35 +137,6 @@ class Proximity(Adaptive):
         fresh = _first_of_each(torch.minimum(sources, ends) * len(cloud) + torch.maximum(sources, ends))
         fresh = fresh[lengths[fresh] > 0][:most]  # coinciding Gaussians have no room between them
         return sources[fresh], lengths[fresh], ends[fresh]
-
-
-def proximity_graph(means: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
-    """Lengths [N, K] and ends [N, K] int64 of the edges from each centre to its K nearest others, nearest first.
-
-    With fewer than K + 1 centres K is what there is. A centre that is not finite has edges of length zero to itself,
-    and no other centre points to it. Coinciding centres are neighbours at distance zero; none is its own neighbour.
-
-    Args:
-        means: [N, 3].
-        neighbours: K.
-    """
-    finite = torch.isfinite(means).all(dim=1).nonzero().squeeze(1)
-    k = max(0, min(neighbours, len(finite) - 1))
-    ends = torch.arange(len(means), device=means.device)[:, None].repeat(1, k)
-    lengths = means.new_zeros(len(means), k)
-    if k == 0:
-        return lengths, ends
-    centres = means[finite].cpu().double().numpy()
-    distances, ids = cKDTree(centres).query(centres, k=k + 1, workers=torch.get_num_threads())
-    distances, ids = torch.from_numpy(distances), torch.from_numpy(ids)
-    # The centre itself is among the nearest, but not always the first where centres coincide; with more coinciding ones
-    # than neighbours it may be missing, and then the last is left out.
-    own = ids == torch.arange(len(ids))[:, None]
-    own[:, -1] |= ~own.any(dim=1)
-    others = ~own
-    lengths[finite] = distances[others].reshape(-1, k).to(means)
-    ends[finite] = finite[ids[others].reshape(-1, k).to(finite.device)]
-    return lengths, ends
 
 
 def _first_of_each(keys: Tensor) -> Tensor:

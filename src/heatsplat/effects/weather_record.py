@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, Weather
 from heatsplat.effects.observations import Observations
-
-if TYPE_CHECKING:
-    pass
 
 # What recorded weather takes the place of, and why: a heat source stands for drivers that nobody recorded.
 INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}

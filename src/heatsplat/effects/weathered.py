@@ -17,8 +17,9 @@ from heatsplat.effects.base import Evidence
 from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of
 from heatsplat.effects.observations import Tracks
 from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
+from heatsplat.geometry.rotations import reflected
 from heatsplat.physics.responses import semi_infinite_weights
-from heatsplat.physics.sky import emissivity_towards, optical_depth, sky_temperature_k
+from heatsplat.physics.sky import emissivity_towards, law_for, optical_depth, sky_temperature_k
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
 
@@ -442,8 +443,7 @@ class Weathered:
         weather, normals = self.weather, self.normals[:, None]
         air_k = kelvin(weather_record.at(weather, weather.air_c, self.times_s))
         sky_k = weather_record.at(weather, self._clouded_k if self.clouded else self._sky_k, self.times_s)
-        out = self.tracks.directions
-        sine = (2.0 * (out * normals).sum(2, keepdim=True) * normals - out) @ weather.up
+        sine = reflected(-self.tracks.directions, normals) @ weather.up
         emissivity = emissivity_towards(optical_depth((sky_k / air_k) ** 4), sine)
         return air_k * (emissivity**0.25 - 1.0)
 
@@ -491,7 +491,7 @@ class Weathered:
 
     def _sky_under(self, clouds: Tensor | float) -> Tensor:
         humidity = self.weather.humidity_percent
-        law = "swinbank" if humidity is None else "brutsaert"
+        law = law_for("auto", humid=humidity is not None)
         return sky_temperature_k(kelvin(self.weather.air_c), humidity, law, clouds)
 
     def _exchange(self, winds: float) -> Tensor:

@@ -30,6 +30,16 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
+def reflected(directions: Tensor, normals: Tensor) -> Tensor:
+    """Directions [..., 3] in which those that meet a mirror go on, d - 2 (d · n) n.
+
+    Args:
+        directions: [..., 3] towards the mirror, of any length.
+        normals: [..., 3] unit normals of the mirror, on either side.
+    """
+    return directions - 2.0 * (directions * normals).sum(-1, keepdim=True) * normals
+
+
 def matrices_to_quats(matrices: Tensor) -> Tensor:
     """Unit quaternions [..., 4] wxyz, w >= 0, of rotation matrices [..., 3, 3].
 

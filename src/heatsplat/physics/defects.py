@@ -19,7 +19,8 @@ STILL = 0.12
 def dead_pixels(images: Tensor) -> Tensor:
     """Pixels [H, W] bool that differ from their surroundings (5 x 5) in nearly all of the images [F, H, W]; NaN is unknown.
 
-    None where there are fewer than four images, or where the image stands still: edges of the scene would look like them.
+    None of them where there are fewer than four images, or where the image stands still: edges of the scene would look like
+    dead pixels.
     """
     none = torch.zeros(images.shape[1:], dtype=torch.bool)
     if len(images) < MIN_FRAMES or min(images.shape[1:]) < 5:

@@ -45,7 +45,6 @@ stays constant.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -53,7 +52,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from heatsplat.physics import marching
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,
@@ -63,160 +61,13 @@ from heatsplat.physics.responses import (
     semi_infinite_weights,
 )
 from heatsplat.physics.sunlight import Seen, SunlightTable
+from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
 
 NEWTON_STEPS = 5  # from the linear balance: the mean temperature is then exact in float32
 MIN_STIFFNESS = 0.05  # of a / r, where a trained share of 1 and a cold mean could let it vanish
 _BEAM_RATES, _FARTHEST = 20, 14.0  # of the sun on semi-infinite bodies: how many, and how far from a in log rate
 _FAR = 50.0  # of erfcx: from here on four terms of its series
 HALF_RANGE_K = 150.0  # means farther from the reference than this are no surfaces under a sky
-
-
-class _Erfcx(torch.autograd.Function):
-    """What a semi-infinite body keeps of its start, e^{x²} erfc(x) of any shape, with a slope that keeps its digits.
-
-    The slope is 2 x erfcx(x) - 2/√π, of which 1/(2 x²) is left where x is large: float64 and, from ``_FAR`` on, the asymptotic
-    series lose no more than 1e-12 of it.
-    """
-
-    @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:
-        at = x.detach().double()
-        kept = torch.special.erfcx(at)
-        ctx.save_for_backward(at, kept)
-        return kept.to(x)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, v_kept: Tensor) -> Tensor:
-        at, kept = ctx.saved_tensors
-        near = 2 * at * kept - 2 / math.pi**0.5
-        y = at**-2
-        far = -y / math.pi**0.5 * (1 - y * (1.5 - y * (3.75 - 13.125 * y)))
-        return v_kept * torch.where(at > _FAR, far, near).to(v_kept)
-
-
-class Core(NamedTuple):
-    """What lies behind the surfaces of n bodies of two nodes, each [n]; see the module.
-
-    Args:
-        start: y at the first sample of the record, in kelvin above the reference.
-        log_rate: log μ, μ in 1/s.
-        coupling: κ, positive.
-    """
-
-    start: Tensor
-    log_rate: Tensor
-    coupling: Tensor
-
-
-class _TwoRates(NamedTuple):
-    """How n bodies of two nodes relax: [n] each.
-
-    Args:
-        log_rates: of a₁ and a₂.
-        share: of the response at a₁ in the mean of both.
-        own: share of e^{-a₁ t} in what is left of the surface's own start.
-        of_core: factor of e^{-a₂ t} - e^{-a₁ t} in what is left of the core's.
-    """
-
-    log_rates: tuple[Tensor, Tensor]
-    share: Tensor
-    own: Tensor
-    of_core: Tensor
-
-
-def _two_rates(core: Core, log_rate: Tensor, stiffness: Tensor | float) -> _TwoRates:
-    """Of surfaces with log r and s: the eigenvalues in units of r (s + κ), so that no digits are lost at any rates."""
-    leaving = stiffness + core.coupling
-    coupled, free = core.coupling / leaving, stiffness / leaving  # 1 - coupled would lose s beside a large κ
-    log_scale = log_rate + leaving.log()
-    slow = torch.exp(core.log_rate - log_scale)
-    root = ((1 - slow).square() + 4 * slow * coupled).sqrt()
-    fast = 0.5 * (1 + slow + root)
-    own = 0.5 * (1 - slow + root) / root
-    log_fast = log_scale + fast.log()
-    log_slow = log_scale + free.log() + core.log_rate - log_fast  # a₁ a₂ = r s μ
-    return _TwoRates((log_fast, log_slow), own * free / fast, own, coupled / root)
-
-
-class Exposure(NamedTuple):
-    """What the scene leaves n surfaces of sun and sky.
-
-    Args:
-        sun: [n, D] share of the beam from the directions of ``Drivers.ways``, or None: nothing casts shadows.
-        sky: [n] share of the sky's light, of what surfaces turned like these get without obstacles, or None: all of it.
-    """
-
-    sun: Tensor | None = None
-    sky: Tensor | None = None
-
-
-class Surface(NamedTuple):
-    """What decides the temperature of n surfaces, each [n]; see the module for the symbols.
-
-    Args:
-        start: x at the first sample of the record, in kelvin above the reference.
-        log_rate: log r, r in 1/s.
-        sun: g in K m²/kW, at least 0, or None where nothing is lit.
-        share: p, or None where nothing radiates.
-        wind: v, or None where wind is not known.
-        normals: [n, 3] unit vectors, or None for surfaces that lie level.
-        core: what lies behind, or None for bodies of one node.
-        inner: f in kelvin (at x = 0 where there is a room), or None where nothing is heated from within.
-        exposure: what hides sun and sky from surfaces with normals.
-    """
-
-    start: Tensor
-    log_rate: Tensor
-    sun: Tensor | None
-    share: Tensor | None = None
-    wind: Tensor | None = None
-    normals: Tensor | None = None
-    core: Core | None = None
-    inner: Tensor | None = None
-    exposure: Exposure = Exposure()
-
-
-@dataclass(frozen=True)
-class Drivers:
-    """A weather record as what drives surfaces, [T] float64 each, in kelvin above the reference and kW/m².
-
-    Args:
-        times_s: increasing.
-        reference_k: R.
-        air: temperature of the air.
-        sky: s of the sky, or None where nothing radiates.
-        around: s of what a tilted surface sees instead of sky, or None where all lie level.
-        light: sunlight on a level surface without that of ``beams``, or None.
-        beams: [T, 3] direction towards the sun times its strength, or None.
-        wind_anomaly: wind / mean wind - 1, or None.
-        up: [3], or None where all surfaces lie level.
-        ground: light that comes back from level ground, or None where it is black.
-        ways: [D, 3] directions of the sun for which shadows are known, or None.
-        room: ρ of the air behind walls, not 0, or None: heat from within is constant.
-        wetted: how many times as fast wet surfaces exchange heat with the air, which ``air`` then is as they find it
-            (heatsplat.physics.wetness), or None: all is dry. Only the full balance knows it.
-    """
-
-    times_s: Tensor
-    reference_k: float
-    air: Tensor
-    sky: Tensor | None = None
-    around: Tensor | None = None
-    light: Tensor | None = None
-    beams: Tensor | None = None
-    wind_anomaly: Tensor | None = None
-    up: Tensor | None = None
-    ground: Tensor | None = None
-    ways: Tensor | None = None
-    room: float | None = None
-    wetted: Tensor | None = None
-
-
-def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:
-    """w = (T⁴ - R⁴) / (4 R³) of T = R + x: what a body radiates more than at R, in kelvin; factored, so nothing cancels."""
-    z = excess_k / reference_k
-    return excess_k * (1 + z * (1.5 + z * (1 + 0.25 * z)))
 
 
 class Climate:
@@ -402,12 +253,56 @@ class Climate:
             for weight, rate in zip(weights, rates, strict=True)
         )
 
-    def stepped_temperature(self, surface: Surface, time_s: float) -> Tensor:
-        """Temperature x at a moment of the record by the full balance, [n], marched from its beginning.
 
-        Raises:
-            ValueError: the bodies have no end, which only ``linear_temperature`` knows.
-        """
-        if self.semi_infinite:
-            raise ValueError("bodies without an end are solved about a mean only: use linear_temperature")
-        return marching.temperature(self, surface, time_s)
+class _Erfcx(torch.autograd.Function):
+    """What a semi-infinite body keeps of its start, e^{x²} erfc(x) of any shape, with a slope that keeps its digits.
+
+    The slope is 2 x erfcx(x) - 2/√π, of which 1/(2 x²) is left where x is large: float64 and, from ``_FAR`` on, the asymptotic
+    series lose no more than 1e-12 of it.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        at = x.detach().double()
+        kept = torch.special.erfcx(at)
+        ctx.save_for_backward(at, kept)
+        return kept.to(x)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_kept: Tensor) -> Tensor:
+        at, kept = ctx.saved_tensors
+        near = 2 * at * kept - 2 / math.pi**0.5
+        y = at**-2
+        far = -y / math.pi**0.5 * (1 - y * (1.5 - y * (3.75 - 13.125 * y)))
+        return v_kept * torch.where(at > _FAR, far, near).to(v_kept)
+
+
+class _TwoRates(NamedTuple):
+    """How n bodies of two nodes relax: [n] each.
+
+    Args:
+        log_rates: of a₁ and a₂.
+        share: of the response at a₁ in the mean of both.
+        own: share of e^{-a₁ t} in what is left of the surface's own start.
+        of_core: factor of e^{-a₂ t} - e^{-a₁ t} in what is left of the core's.
+    """
+
+    log_rates: tuple[Tensor, Tensor]
+    share: Tensor
+    own: Tensor
+    of_core: Tensor
+
+
+def _two_rates(core: Core, log_rate: Tensor, stiffness: Tensor | float) -> _TwoRates:
+    """Of surfaces with log r and s: the eigenvalues in units of r (s + κ), so that no digits are lost at any rates."""
+    leaving = stiffness + core.coupling
+    coupled, free = core.coupling / leaving, stiffness / leaving  # 1 - coupled would lose s beside a large κ
+    log_scale = log_rate + leaving.log()
+    slow = torch.exp(core.log_rate - log_scale)
+    root = ((1 - slow).square() + 4 * slow * coupled).sqrt()
+    fast = 0.5 * (1 + slow + root)
+    own = 0.5 * (1 - slow + root) / root
+    log_fast = log_scale + fast.log()
+    log_slow = log_scale + free.log() + core.log_rate - log_fast  # a₁ a₂ = r s μ
+    return _TwoRates((log_fast, log_slow), own * free / fast, own, coupled / root)

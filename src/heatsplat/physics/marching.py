@@ -17,15 +17,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from heatsplat.kernels import heat_balance as kernels
-
-if TYPE_CHECKING:
-    from heatsplat.physics.energy_balance import Climate, Surface
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.responses import interval_of
+from heatsplat.physics.surfaces import Surface
 
 CHANGE = 0.05  # of a parameter, in its unit below, at which a surface is marched anew
 UNITS = {
@@ -114,8 +113,16 @@ def march(
     return table
 
 
-def temperature(climate: Climate, surface: Surface, time_s: float) -> Tensor:
-    """Temperature x at a moment of the record, [n]; differentiable but by normals, which images decide."""
+def stepped_temperature(climate: Climate, surface: Surface, time_s: float) -> Tensor:
+    """Temperature x at a moment of the record by the full balance, marched from its beginning, [n].
+
+    It is differentiable but by normals, which images decide.
+
+    Raises:
+        ValueError: the bodies have no end, which only ``Climate.linear_temperature`` knows.
+    """
+    if climate.semi_infinite:
+        raise ValueError("bodies without an end are solved about a mean only: use linear_temperature")
     found = march(climate, surface, torch.tensor([time_s], dtype=torch.float64))[0]
     return _first_order(found, learned(surface), learned(surface).detach())
 
@@ -234,7 +241,7 @@ class Course:
     def temperature(self, time_s: float, ids: Tensor | None = None) -> Tensor:
         """Temperature x at a moment of the record, of all or of the surfaces ``ids``."""
         times = self.climate.drivers.times_s
-        sample = int(torch.searchsorted(times, time_s, right=True).clamp(1, len(times) - 1)) - 1
+        sample, _ = interval_of(times, time_s)
         wanted, last = sample // self._every, len(self._states) - 1
         if wanted > last:
             moments = times[last * self._every :: self._every][1 : wanted - last + 1]

@@ -21,6 +21,13 @@ LOWEST_SINE = 0.02  # of the height above the horizon; below, air is seen as far
 LAWS = ("brutsaert", "berdahl_martin", "brunt", "swinbank")
 
 
+def law_for(law: str, humid: bool) -> str:
+    """The law itself; for "auto" Brutsaert's where the humidity is known and Swinbank's where it is not."""
+    if law == "auto":
+        return "brutsaert" if humid else "swinbank"
+    return law
+
+
 def vapour_pressure_hpa(air_k: Tensor, humidity_percent: Tensor) -> Tensor:
     """Pressure of water vapour in hPa, by Magnus' formula (Alduchov and Eskridge 1996, Eq. 21)."""
     air_c = celsius(air_k)

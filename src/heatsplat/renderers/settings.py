@@ -128,3 +128,19 @@ class Renderer:
         if given == dtype:
             return seen
         return replace(seen, features=seen.features.to(given), alpha=seen.alpha.to(given))
+
+    def values_seen(
+        self,
+        shapes: tuple[Tensor, Tensor, Tensor, Tensor],
+        values: Tensor,
+        camera: Camera,
+        depth: bool = False,
+        ratio: float = 1.0,
+    ) -> RenderOutput:
+        """What ``camera`` sees of any values [N, C] of Gaussians, with black behind.
+
+        Args:
+            shapes: means [N, 3], rotations [N, 4], semi-axes [N, 3] and opacities [1, N] of one modality.
+            depth, ratio: as for the renderer itself.
+        """
+        return self(*shapes, values, camera, None, (values.shape[1],), depth=depth, ratio=ratio)

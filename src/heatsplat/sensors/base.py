@@ -111,3 +111,9 @@ class Composite(nn.Module):
     def decode(self, blended: Tensor, channels: int) -> Tensor:
         """The image values of what was blended, [..., C]."""
         return blended
+
+
+def nonnegative_tanh(raw: Tensor) -> Tensor:
+    """max(0, tanh(raw)) of any shape, with the slope of tanh below zero too: what has come to 0 can leave it again."""
+    bounded = raw.tanh()
+    return bounded + (bounded.clamp(min=0.0) - bounded).detach()

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import Frame, SceneData
 from heatsplat.same_bits import total
-from heatsplat.sensors.base import SensorPart
+from heatsplat.sensors.base import SensorPart, nonnegative_tanh
 
 REACH = 3.5  # standard deviations that the kernel reaches at its widest; beyond lie 5e-4 of its weight
 
@@ -54,8 +54,7 @@ class PointSpread(SensorPart):
 
     def variance(self) -> Tensor:
         """t in squared pixels of a training image, [] in [0, width_max²]; below zero only the gradient goes on."""
-        bounded = self.raw_spread.tanh()
-        return self.width_max**2 * (bounded + (bounded.clamp(min=0.0) - bounded).detach())
+        return self.width_max**2 * nonnegative_tanh(self.raw_spread)
 
     def penalty(self) -> Tensor:
         return self.variance() / self.width_max**2

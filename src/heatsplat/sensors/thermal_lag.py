@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Frame
+from heatsplat.sensors.base import nonnegative_tanh
 from heatsplat.sensors.moving import MovingPart, displaced
 
 REACH = 6.0  # time constants that are looked back; before lie 0.25 % of the answer
@@ -59,8 +60,7 @@ class ThermalLag(MovingPart):
 
     def tau(self) -> Tensor:
         """τ in seconds, [] in [0, tau_max]; below zero only the gradient goes on."""
-        bounded = self.raw_tau.tanh()
-        return self.tau_max * (bounded + (bounded.clamp(min=0.0) - bounded).detach())
+        return self.tau_max * nonnegative_tanh(self.raw_tau)
 
     def lead(self) -> Tensor:
         """a in seconds, []; 0 where it is left out."""

@@ -169,7 +169,7 @@ class AtmosphericField(Wrapper):
         return factor * emitted
 
     def _exponent(self, raw: Tensor) -> Tensor:
-        """(μ_a + μ_s) d of raw network outputs [n, 4], within ± exponent_max."""
+        """(μ_a + μ_s) d of raw network outputs [n, 3 + further], within ± exponent_max."""
         absorption, scattering, distance = (softplus(raw[:, :3]) if self.positive else raw[:, :3]).unbind(1)
         exponent = (absorption + scattering) * distance
         if self.exponent_max is None:

@@ -90,6 +90,10 @@ class BandScale(nn.Module):
         """r of image values, of any shape."""
         return _polynomial(self.of_values, values, self.values, self._bent_values)
 
+    def radiance_of(self, values: Tensor) -> Tensor:
+        """r⁴, the radiance in the band of black bodies that look like ``values`` over that of white, of any shape."""
+        return self.root_of(values).square().square()
+
     def value_of(self, roots: Tensor) -> Tensor:
         """The image values of roots, of any shape."""
         return _polynomial(self.of_roots, roots, self.roots, _bent_roots)

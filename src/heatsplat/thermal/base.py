@@ -183,7 +183,8 @@ class Heat(nn.Module, ABC):
             )
 
     def prepare(self, scene: SceneData) -> None:
-        """Takes constants (time grids, ranges) from the scene into buffers. Called once, before anything else."""
+        """Takes constants (time grids, ranges) from the scene into buffers. Called once, after ``check`` and
+        before anything else."""
         return
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:

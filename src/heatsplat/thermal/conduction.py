@@ -9,11 +9,11 @@ import warnings
 from dataclasses import replace
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import SceneData
+from heatsplat.geometry.neighbours import neighbour_pairs
 from heatsplat.same_bits import PIECE, total
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, ThermalModel
@@ -102,13 +102,8 @@ class Conducting(Wrapper):
         """Draws the graph of nearest neighbours where there is none, or it is out of date."""
         count = len(splats)
         if self._due or int(self.joined) != count:
-            means = splats.means.detach().cpu().double().numpy()
-            near = torch.from_numpy(cKDTree(means).query(means, k=min(self.neighbours + 1, count), workers=1)[1])
-            near = near.reshape(count, -1)
-            pairs = torch.stack([torch.arange(count)[:, None].expand_as(near), near]).flatten(1)
-            low, high = pairs[:, pairs[0] != pairs[1]].sort(dim=0).values
-            keys = (low * count + high).unique()  # of columns it would take a hundred times as long
-            self.edges = torch.stack([keys // count, keys % count]).to(self.edges.device)
+            pairs = neighbour_pairs(splats.means.detach(), self.neighbours)
+            self.edges = pairs.T.contiguous().to(self.edges.device)
             self.joined.fill_(count)
             self._due = False
         kept, dtype = self._laplacian, splats.means.dtype

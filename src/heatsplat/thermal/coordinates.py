@@ -12,6 +12,7 @@ from heatsplat.contracts import SceneData, ThermalRange
 from heatsplat.physics.units import DAY_S, kelvin
 
 BOX_EDGE = 0.9  # places end here: the code of ``octaves`` has period 2 and would repeat from 1 on
+FIELD_BOX = 1.2  # edges of the box of a field over those of the points' central 98 %
 
 
 class Clock(nn.Module):

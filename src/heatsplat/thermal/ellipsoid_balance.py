@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, Weather, check_option
+from heatsplat.contracts import SceneData, Weather, check_option
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.physics.ellipsoids import (
     PROJECTED_AREAS,
@@ -18,12 +18,10 @@ from heatsplat.physics.ellipsoids import (
     radiating_area_ratio,
 )
 from heatsplat.physics.heat_flow import heating_rate
-from heatsplat.physics.sky import LAWS, sky_temperature_k
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.weather_drive import source_of_sunlight, sunlight_at
-
-SKIES = ("none", *LAWS)
+from heatsplat.thermal.base import PerGaussian, Seeds
+from heatsplat.thermal.weather_drive import SKIES, check_weather, sky_at, source_of_sunlight, sunlight_at
 
 
 class EllipsoidBalance:
@@ -49,6 +47,10 @@ class EllipsoidBalance:
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, with the way out, where the scene's weather lacks what the balance needs."""
         check_weather(scene, self.sky)
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        """Tensors of Gaussians that the balance needs of its own: none."""
+        return {}
 
     @torch.no_grad()
     def areas(self, splats: Splats, ids: Tensor, metres_per_unit: float) -> dict[str, Tensor]:
@@ -93,26 +95,3 @@ class EllipsoidBalance:
         if weather is not None:
             effects["solar"] = {"projected_area": self.projected_area, "irradiance": source_of_sunlight(weather)}
         return effects
-
-
-def check_weather(scene: SceneData, sky: str) -> None:
-    """Raises SceneError, with the way out, where the scene's weather lacks what a balance under this sky needs."""
-    if scene.weather.air_c is None:
-        raise SceneError(
-            f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
-            "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
-        )
-    if sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
-        raise SceneError(
-            f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={sky} needs; "
-            "thermal.sky=swinbank does without"
-        )
-
-
-def sky_at(weather: Weather, time_s: float, sky: str) -> float:
-    """Temperature in kelvin of what a body sees above it at a moment; 0 under no sky."""
-    if sky == "none":
-        return 0.0
-    now = weather.at(time_s)
-    moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
-    return float(sky_temperature_k(kelvin(torch.tensor(now.air_c, dtype=torch.float64)), moist, sky))

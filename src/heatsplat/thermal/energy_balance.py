@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -13,16 +12,15 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
-from heatsplat.geometry.exposure import sun_directions
-from heatsplat.physics import sky
-from heatsplat.physics.energy_balance import Climate, Core, Drivers, Exposure, Surface, power_excess
-from heatsplat.physics.marching import Course, Kept
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import Course, Kept, stepped_temperature
 from heatsplat.physics.responses import driver_means, interval_of
+from heatsplat.physics.surfaces import Core, Exposure, Surface, power_excess
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.walls import CONVECTION, LEAST_K, u_value
-from heatsplat.physics.wetness import rained_on, wetted
+from heatsplat.physics.walls import u_value
 from heatsplat.same_bits import sigmoid, variance
 from heatsplat.splats import Splats
+from heatsplat.thermal.balance_options import BalanceOptions
 from heatsplat.thermal.base import (
     KELVIN_RANGE,
     NORMALS,
@@ -36,15 +34,8 @@ from heatsplat.thermal.base import (
 )
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.weather_drive import NO_CLOUDS
+from heatsplat.thermal.surface_drivers import drivers_of
 
-log = logging.getLogger(__name__)
-
-SOLUTIONS = ("auto", "linear", "corrected")
-EXCHANGES = ("learned", "iso_6946")
-MOST_CONVECTION = 100.0  # W/(m² K) and W s/(m³ K): ten times what outer surfaces have
-SURFACES = ("seen", "level")
-SKIES = ("auto", *sky.LAWS)
 SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
 SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
@@ -60,7 +51,7 @@ LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inn
 LEARNED += ("initial_core", "log_core_rate", "log_coupling")
 SHARES = ("raw_share", "raw_wind")
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
-COSTS = {"linear": 400, "corrected": 3000}
+LINEAR_COST, MARCHED_COST = 400, 3000
 
 
 class EnergyBalance(ThermalModel):
@@ -120,7 +111,7 @@ class EnergyBalance(ThermalModel):
             tells a U-value in ``attributes``. None: heat from within is constant, and there is no U-value.
         normals: "seen" has every Gaussian meet the sun as the surface lies that it shows (``Query.normals``); "level" has
             all surfaces lie level, under the global irradiance.
-        shadows: whether what stands in the way of the sun casts shadows (``Query.exposure``).
+        shadows: whether what stands in the way of the sun casts shadows (heatsplat.training.exposure).
         sky_view: whether it hides sky as well.
         albedo: of the ground, for sunlight that comes back from what is not sky; None: nothing comes back.
         emissivity: assumed for ``attributes``, in (0, 1].
@@ -169,65 +160,38 @@ class EnergyBalance(ThermalModel):
         lr_end: float = 0.1,
     ) -> None:
         super().__init__()
-        for name, value, known in (
-            ("solution", solution, SOLUTIONS),
-            ("normals", normals, SURFACES),
-            ("clip", clip, CLIPS),
-            ("sky", sky, (*SKIES, None)),
-        ):
-            check_option(name, value, known)
-        check_option("nodes", nodes, (1, 2))
-        if clouds and sky is None:
-            raise ValueError("clouds are of the sky: give sky=auto or another law, or clouds=false")
-        convection = _convection(exchange)
-        if solution == "auto":
-            solution = "linear" if semi_infinite else "corrected"
-        if semi_infinite and solution != "linear":
-            raise ValueError(
-                "semi_infinite works only with the linearised balance: give solution=linear or semi_infinite=false"
-            )
-        if rain is not None and not rain > 0:
-            raise ValueError(f"rain must be above 0 mm, or null for surfaces that stay dry, got {rain}")
-        if rain is not None and (solution != "corrected" or indoor_c is not None):
-            raise ValueError(
-                "rain works only with the full balance, and mean losses of walls leave it out: give solution=corrected and "
-                "indoor_c=null, or rain=null"
-            )
-        if nodes == 2 and semi_infinite:
-            raise ValueError("semi_infinite and nodes=2 exclude each other: give nodes=1 or semi_infinite=false")
-        if convection is not None:
-            if sky is None or (convection[1] > 0 and not wind):
-                raise ValueError(f"exchange={exchange} is that with sky and wind: leave it out, or both of them on")
-            wind = convection[1] > 0
-        if indoor_c is not None and not inner:
-            raise ValueError("indoor_c has no effect without heat from within: give inner=true")
-        if (shadows or sky_view or albedo is not None) and (not sun or normals != "seen"):
-            raise ValueError(
-                "shadows, sky_view and albedo are of sunlight on surfaces as they lie: give sun=true, normals=seen"
-            )
-        if albedo is not None and not 0 < albedo < 1:
-            raise ValueError(f"albedo must lie in (0, 1), or be null for none, got {albedo}")
-        if not 0 <= convection_error < 1:
-            raise ValueError(f"convection_error must lie in [0, 1), got {convection_error}")
-        if not 0 < emissivity <= 1:
-            raise ValueError(f"emissivity must lie in (0, 1], got {emissivity}")
+        check_option("clip", clip, CLIPS)
         if share_prior < 0:
             raise ValueError(f"share_prior must not be negative, got {share_prior}")
-        self.solution, self.normals, self.emissivity, self.clip = solution, normals, emissivity, clip
-        self.shadows, self.sky_view, self.albedo, self.share_prior = shadows, sky_view, albedo, share_prior
-        self._sky, self._clouds, self._wind, self._sun, self.nodes = sky, clouds, wind, sun, nodes
-        self._rain = rain
-        self.exchange, self._convection = exchange, convection
-        self.convection_error, self._convects = convection_error, 1.0
-        self.semi_infinite, self.inner, self.indoor_c, self.lr_inner = semi_infinite, inner, indoor_c, lr_inner
+        self.options = BalanceOptions(
+            solution=solution,
+            nodes=nodes,
+            sky=sky,
+            clouds=clouds,
+            rain=rain,
+            wind=wind,
+            sun=sun,
+            semi_infinite=semi_infinite,
+            inner=inner,
+            exchange=exchange,
+            convection_error=convection_error,
+            indoor_c=indoor_c,
+            normals=normals,
+            shadows=shadows,
+            sky_view=sky_view,
+            albedo=albedo,
+            emissivity=emissivity,
+        )
+        self.share_prior, self.clip = share_prior, clip
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
-        self.lr_share, self.lr_wind, self.lr_end = lr_share, lr_wind, lr_end
+        self.lr_share, self.lr_wind, self.lr_inner, self.lr_end = lr_share, lr_wind, lr_inner, lr_end
+        self._convection_factor = 1.0  # other than 1 while ``doubts`` asks what convection that is given matters
         self.climate: Climate | None = None
         self.simulated: dict[str, dict] = {}
         # What trained parameters count from; another weather leaves it as it is.
         self.range = ImageRange()
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
-        if wind:
+        if self.options.windy:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
         self._weather: Weather | None = None
         self._moments: Tensor | None = None  # of training frames
@@ -244,7 +208,7 @@ class EnergyBalance(ThermalModel):
         if self.reference_k == 0:  # otherwise this is another weather for what was trained
             self.range.prepare(scene)
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
-            if self._wind and weather.wind_m_s is not None:
+            if self.options.windy and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
         self._moments = torch.tensor(sorted(set(scene.train.times_s) - {None}), dtype=torch.float64)
         self.under(weather)
@@ -259,8 +223,9 @@ class EnergyBalance(ThermalModel):
         Raises:
             SceneError: the record lacks a series that the model was trained with.
         """
-        drivers, self.simulated = self._drivers(weather)
-        self._weather, self.climate = weather, Climate(drivers, self.semi_infinite)
+        mean_wind = self.mean_wind.item() if self.options.windy else 0.0
+        drivers, self.simulated = drivers_of(weather, self.options, self.reference_k.item(), mean_wind)
+        self._weather, self.climate = weather, Climate(drivers, self.options.semi_infinite)
         self._kept, self._course = Kept(self.climate, self._moments), None
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
@@ -270,33 +235,33 @@ class EnergyBalance(ThermalModel):
             "initial_state": tensor(grey, self.lr_initial),
             "log_rate": tensor(torch.full_like(grey, -math.log(START_TIME_CONSTANT_S)), self.lr_rate),
         }
-        if self.nodes == 2:
+        if self.options.nodes == 2:
             tensors["initial_core"] = tensor(grey.clone(), self.lr_initial)
             tensors["log_core_rate"] = tensor(torch.full_like(grey, -math.log(START_CORE_S)), self.lr_rate)
             tensors["log_coupling"] = tensor(torch.full_like(grey, math.log(START_COUPLING)), self.lr_rate)
-        if self.inner:
+        if self.options.inner:
             tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
         # Few images tell the shares apart, and at a short run's pace they would follow single ones: nothing that the trained
         # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out, and a
         # prior holds them together at any pace.
-        share = partial(tensor, paced=self.solution == "linear" or self.share_prior > 0)
+        share = partial(tensor, paced=self.options.linear or self.share_prior > 0)
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
-        if drivers.sky is not None and self._convection is None:
+        if drivers.sky is not None and self.options.convection is None:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = share(torch.full_like(grey, start).logit(), self.lr_share)
-        if drivers.wind_anomaly is not None and self._convection is None:
+        if drivers.wind_anomaly is not None and self.options.convection is None:
             tensors["raw_wind"] = share(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
-        if self.solution == "corrected":
-            given = 0 if self._convection is None else 1 + self._wind  # shares of radiation and of wind
-            numbers = len(tensors) + given
+        if not self.options.linear:
+            shares_given = 0 if self.options.convection is None else 1 + self.options.windy
+            numbers = len(tensors) + shares_given
             tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), numbers), 0.0)  # at none that there is
         if drivers.up is None:
             return tensors
-        if self.shadows:
+        if self.options.shadows:
             tensors[SUN_SEEN] = PerGaussian(grey.new_ones(len(grey), len(drivers.ways)), 0.0)
-        if self.sky_view:
+        if self.options.sky_view:
             tensors[SKY_SEEN] = PerGaussian(torch.ones_like(grey), 0.0)
         return tensors | surface_normals(seeds)
 
@@ -322,7 +287,9 @@ class EnergyBalance(ThermalModel):
         heat capacity per area (of bodies without an end their effusivity), and the heat that a wall loses with its U-value,
         which are estimates (``physics.walls``)."""
         surface = self._surface(splats, query)
-        if self.semi_infinite:  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
+        if (
+            self.options.semi_infinite
+        ):  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
             values = {"settling_time_h": torch.exp(-surface.log_rate) / 3600.0}
         else:
             values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
@@ -341,10 +308,10 @@ class EnergyBalance(ThermalModel):
             sample, _ = interval_of(self.climate.drivers.times_s, query.time_s)
             values["sunlit"] = surface.exposure.sun[:, self.climate.slots[sample]]
         if surface.share is not None:
-            exchange = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
+            exchange = 4 * self.options.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
             values["radiation_share"] = surface.share
             values["convection_w_m2_k"] = exchange * (1 - surface.share)
-            if self.semi_infinite:
+            if self.options.semi_infinite:
                 values["effusivity_j_m2_k_s05"] = exchange * torch.exp(-0.5 * surface.log_rate)
             else:
                 values["areal_heat_capacity_kj_m2_k"] = exchange * torch.exp(-surface.log_rate) / 1000.0
@@ -352,27 +319,27 @@ class EnergyBalance(ThermalModel):
                 values["absorptivity"] = exchange * surface.sun / 1000.0
             if surface.inner is not None:
                 values["heat_loss_w_m2"] = exchange * self.climate.mean_heat_from_within(surface)
-                if self.indoor_c is not None:
+                if self.options.indoor_c is not None:
                     values["mean_surface_c"] = self.climate.mean_temperature(surface) + celsius(self.reference_k).item()
         return values | self.quotients(values)
 
     def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if "mean_surface_c" not in told:
             return {}
-        return {"u_value_w_m2_k": u_value(told["heat_loss_w_m2"], self.indoor_c, told["mean_surface_c"])}
+        return {"u_value_w_m2_k": u_value(told["heat_loss_w_m2"], self.options.indoor_c, told["mean_surface_c"])}
 
     def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
         """Convection that is given, which is known to ``convection_error``."""
-        given = self._convection is not None and self.convection_error > 0
+        given = self.options.convection is not None and self.options.convection_error > 0
         return {"convection": self._more_convection} if given else {}
 
     @contextmanager
     def _more_convection(self) -> Iterator[None]:
-        self._convects = 1.0 + self.convection_error
+        self._convection_factor = 1.0 + self.options.convection_error
         try:
             yield
         finally:
-            self._convects = 1.0
+            self._convection_factor = 1.0
 
     def effects(self) -> dict[str, dict]:
         return dict(self.simulated)
@@ -381,7 +348,7 @@ class EnergyBalance(ThermalModel):
     def cost(self) -> int:
         # Counted from the kernels: linear is 100 steps of the sun's sum and 4 cubics; corrected 190 steps of some 100 for each
         # Gaussian that is marched anew, one of six (300 steps on outdoor), and a sum of five products for all.
-        return COSTS[self.solution] * self.nodes
+        return (LINEAR_COST if self.options.linear else MARCHED_COST) * self.options.nodes
 
     # The balance ----------------------------------------------------------------------------------------
 
@@ -398,13 +365,13 @@ class EnergyBalance(ThermalModel):
                 f"there is no weather for second {query.time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s "
                 "after the first training frame. Give a record that covers every moment that is asked for."
             )
-        if self.solution == "corrected" and not torch.is_grad_enabled():
+        if not self.options.linear and not torch.is_grad_enabled():
             return self._course_of(splats).temperature(query.time_s, query.ids)
         surface = self._surface(splats, query)
-        if self.solution == "linear":
+        if self.options.linear:
             return self.climate.linear_temperature(surface, query.time_s)
         if not self._kept.has(query.time_s, splats[MARCHED_AT]):
-            return self.climate.stepped_temperature(surface, query.time_s)
+            return stepped_temperature(self.climate, surface, query.time_s)
         ids = torch.arange(len(splats), device=splats.means.device) if query.ids is None else query.ids
         given = [splats[name].detach() for name in GIVEN if name in splats]
         return self._kept.temperature(surface, query.time_s, ids, given, splats[MARCHED_AT].detach())
@@ -412,7 +379,7 @@ class EnergyBalance(ThermalModel):
     def _course_of(self, splats: Splats) -> Course:
         """The course of all Gaussians as they are now: that of the last view, unless something has changed since."""
         now = {name: splats[name].detach() for name in (*LEARNED, *GIVEN) if name in splats}
-        now["convects"] = torch.tensor(self._convects)
+        now["convects"] = torch.tensor(self._convection_factor)
         if self._course is None or not all(torch.equal(now[name], was) for name, was in self._course[0].items()):
             course = Course(self.climate, self._surface(splats, Query()))
             self._course = {name: tensor.clone() for name, tensor in now.items()}, course
@@ -431,12 +398,12 @@ class EnergyBalance(ThermalModel):
 
         drivers = self.climate.drivers
         log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
-        if self._convection is None:
+        if self.options.convection is None:
             share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
             wind = bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None
         else:
             share, wind = (torch.full_like(log_rate, value) for value in self._shares())
-            wind = wind if self._wind else None
+            wind = wind if self.options.windy else None
         return Surface(
             start=state("initial_state"),
             log_rate=log_rate,
@@ -445,15 +412,16 @@ class EnergyBalance(ThermalModel):
             wind=wind,
             normals=query.normals(splats) if drivers.up is not None else None,
             exposure=Exposure(*(query.rows(splats[n].detach()) if n in splats else None for n in (SUN_SEEN, SKY_SEEN))),
-            core=core() if self.nodes == 2 else None,
-            inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.inner else None,
+            core=core() if self.options.nodes == 2 else None,
+            inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.options.inner else None,
         )
 
     def _shares(self) -> tuple[float, float]:
         """Radiation's share of the exchange at mean wind, and the wind's of convection, where convection is given."""
-        still, windy = self._convection[0], self._convection[1] * self.mean_wind.item() if self._wind else 0.0
-        convection = (still + windy) * self._convects
-        radiation = 4 * self.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
+        still, per_wind = self.options.convection
+        windy = per_wind * self.mean_wind.item() if self.options.windy else 0.0
+        convection = (still + windy) * self._convection_factor
+        radiation = 4 * self.options.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
         return radiation / (radiation + convection), windy / (still + windy)
 
     def _first_sun(self, grey: Tensor) -> Tensor:
@@ -466,145 +434,6 @@ class EnergyBalance(ThermalModel):
         if share:
             loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))
         return (loss / mean(light).clamp(min=1e-6)).clamp(*START_SUN).to(grey)
-
-    def _drivers(self, weather: Weather) -> tuple[Drivers, dict[str, dict]]:
-        """What drives surfaces in a weather, and the effects that are simulated with what was left out of them."""
-        reference = self.reference_k.item()
-        air_k = kelvin(weather.air_c)
-        effects: dict[str, dict[str, Any]] = {"convection": {"air": "recorded"}}
-        if self.nodes == 2:
-            effects["relaxation"] = {"nodes": "surface and core"}
-        if self.semi_infinite:
-            effects["semi_infinite"] = {"bodies": "without an end, about their mean"}
-        if self._convection is not None:
-            effects["convection"]["given"] = "{:g} + {:g} v W/(m² K) in wind v".format(*self._convection)
-        if self.inner:
-            warm = "constant" if self.indoor_c is None else f"of rooms at {self.indoor_c:g} °C"
-            effects["convection"]["from_within"] = f"{warm}, q/H of each Gaussian"
-        parts: dict[str, Any] = {"room": self._room()}
-        up, parts["light"], parts["beams"] = self._light(weather, effects)
-        if up is not None:
-            self._surroundings(weather, up, parts, effects)
-        elif self.shadows or self.sky_view or self.albedo is not None:
-            raise SceneError(
-                "shadows, sky_view and albedo need the direction of the sun with its direct and diffuse light, which the "
-                "weather lacks; add them, or leave these effects out"
-            )
-        if self._sky is not None:
-            humid = weather.humidity_percent is not None
-            law = ("brutsaert" if humid else "swinbank") if self._sky == "auto" else self._sky
-            if law != "swinbank" and not humid:
-                raise SceneError(
-                    f"sky={law} needs humidity_percent, which the weather does not have; use sky=swinbank or sky=auto"
-                )
-            closed = weather.clouds if self._clouds else 0.0
-            if closed is None:
-                raise SceneError(f"the weather {NO_CLOUDS}")
-            sky_k = sky.sky_temperature_k(air_k, weather.humidity_percent, law, closed)
-            parts["sky"] = power_excess(sky_k - reference, reference)
-            parts["around"] = None if up is None else power_excess(air_k - reference, reference)
-            effects["radiation"] = {"sky": law, "power": "T⁴" if self.solution == "corrected" else "about each mean"}
-            if self._clouds:
-                effects["radiation"]["clouds"] = weather.notes.get("clouds", "recorded")
-            if not humid:
-                effects["radiation"]["left_out"] = "humidity, which the weather lacks"
-        if self._wind and self._convection is not None and weather.wind_m_s is None and not self.mean_wind > 0:
-            raise SceneError(f"exchange={self.exchange} needs wind_m_s, which the weather does not have")
-        if self._wind and self.mean_wind > 0:
-            if weather.wind_m_s is None:
-                raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
-            parts["wind_anomaly"] = weather.wind_m_s / self.mean_wind - 1
-            effects["convection"]["wind"] = f"recorded, {self.mean_wind.item():.3g} m/s in the mean"
-        elif self._wind and self._convection is not None:  # the convection of still air
-            parts["wind_anomaly"] = torch.zeros_like(air_k)
-            effects["convection"]["wind"] = "recorded, 0 m/s throughout"
-        elif self._wind:
-            effects["convection"]["left_out"] = "wind, which the weather lacks"
-        if self._rain is not None:
-            air_k = self._rained_on(weather, air_k, parts, effects)
-        drivers = Drivers(weather.times_s, reference, air_k - reference, up=up, **parts)
-        return drivers, effects
-
-    def _rained_on(self, weather: Weather, air_k: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> Tensor:
-        """Temperature of the air that surfaces find; adds to the drivers how much sooner wet ones do, and tells the effect.
-
-        Another weather, such as a forecast, often has no column of rain.
-        """
-        wet = rained_on(weather, self._rain)
-        if wet is None:
-            effects["convection"]["left_out_rain"] = (
-                "rain, of which the weather has no rain_mm_h, or no humidity_percent"
-            )
-            log.warning("the weather has no rain_mm_h with humidity_percent: surfaces stay dry")
-            return air_k
-        hours = float(driver_means(weather.times_s, wet)) * float(weather.times_s[-1] - weather.times_s[0]) / 3600.0
-        effects["convection"]["rain"] = f"{hours:.1f} h wet, with up to {self._rain:g} mm of water"
-        if bool((wet > 0).any()):
-            air_k, parts["wetted"] = wetted(air_k, weather.humidity_percent, wet)
-        return air_k
-
-    def _room(self) -> float | None:
-        """Temperature behind walls above the reference."""
-        if self.indoor_c is None:
-            return None
-        air_c = celsius(self.reference_k).item()
-        if abs(self.indoor_c - air_c) < LEAST_K:
-            raise SceneError(
-                f"indoor_c={self.indoor_c:g} is the mean temperature of the air outside ({air_c:.1f} °C) within {LEAST_K:g} K: "
-                "nothing then tells what walls let through; leave indoor_c out"
-            )
-        return self.indoor_c - air_c
-
-    def _surroundings(self, weather: Weather, up: Tensor, parts: dict[str, Any], effects: dict[str, dict]) -> None:
-        """Adds what comes of the scene's own geometry to the drivers, and tells the effects of it."""
-        if self.shadows:
-            parts["ways"] = sun_directions(weather.sun, up)
-            effects["shadows"] = {"directions": len(parts["ways"])}
-        if self.sky_view:
-            effects["sky_view"] = {"sky": "as far as it is open"}
-        if self.albedo is not None:
-            level = weather.direct_w_m2 * (weather.sun @ up).clamp(min=0.0) + weather.diffuse_w_m2
-            parts["ground"] = self.albedo * level / 1000.0
-            effects["albedo"] = {"ground": self.albedo}
-
-    def _light(self, weather: Weather, effects: dict[str, dict]) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-        """Up (None where surfaces lie level), light of all but the beams, and beams; tells the effects of it."""
-        if not self._sun:
-            return None, None, None
-        directed = None not in (weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
-        if directed and self.normals == "seen":
-            effects["solar"] = {"surfaces": "as seen", "sky": "isotropic"}
-            beams = weather.direct_w_m2[:, None] * weather.sun / 1000.0
-            return weather.up.to(torch.float64), weather.diffuse_w_m2 / 1000.0, beams
-        if weather.irradiance_w_m2 is None:
-            effects["convection"]["left_out_sun"] = "sunlight, of which the weather has no irradiance"
-            log.warning("the weather has no irradiance: nothing is heated by the sun")
-            return None, None, None
-        effects["solar"] = {"surfaces": "level"}
-        if self.normals == "seen":
-            effects["solar"]["left_out"] = "the direction of the sun, which the weather lacks"
-        return None, weather.irradiance_w_m2 / 1000.0, None
-
-
-def _convection(exchange: str | Sequence[float]) -> tuple[float, float] | None:
-    """Convection of still air in W/(m² K) and of each m/s of wind in W s/(m³ K); None where it is learned.
-
-    Raises:
-        ValueError: ``exchange`` is no name that is known, nor two such numbers.
-    """
-    if isinstance(exchange, str):
-        check_option("exchange", exchange, EXCHANGES)
-        return CONVECTION if exchange == "iso_6946" else None
-    found = tuple(exchange) if isinstance(exchange, Sequence) else (exchange,)
-    sound = len(found) == 2 and all(
-        isinstance(value, (int, float)) and 0 <= value <= MOST_CONVECTION for value in found
-    )
-    if not sound or found[0] == 0:
-        raise ValueError(
-            "exchange must be learned, iso_6946, or convection of still air in W/(m² K), above 0, with what each m/s of wind "
-            f"adds in W s/(m³ K), both up to {MOST_CONVECTION:g}, such as [5.0,2.5]; got {exchange!r}"
-        )
-    return float(found[0]), float(found[1])
 
 
 def _live_on(model: EnergyBalance, _: Any) -> None:

@@ -18,7 +18,7 @@ from heatsplat.physics.units import DAY_S
 from heatsplat.same_bits import mean, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal import heat_terms
-from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel, surface_normals
+from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import (
     Box,
     Clock,
@@ -181,9 +181,10 @@ class EnergyNetwork(ThermalModel):
                 f"depth_m and past_h must be above 0 and smallest_axis_m not negative, got {depth_m}, {list(past_h)} and "
                 f"{smallest_axis_m}"
             )
-        self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
         if body == "surface":
             self.balance = SurfaceBalance(sky, depth_m)
+        else:
+            self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
         self.collocation, self.past_h = collocation, past_h
         if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
             raise ValueError(
@@ -328,8 +329,8 @@ class EnergyNetwork(ThermalModel):
             tensors["label"] = PerGaussian(self._points["label"][nearest], 0.0)
         if self.features_from == "given":
             tensors["feature"] = PerGaussian(self._points["feature"][nearest], 0.0)
-        if self._balanced and isinstance(self.balance, SurfaceBalance):
-            tensors |= surface_normals(seeds)
+        if self._balanced:
+            tensors |= self.balance.per_gaussian(seeds)
         self.network.draw(seeds.generator)
         if self.features_from == "learned":
             feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)

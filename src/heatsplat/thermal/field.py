@@ -10,8 +10,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData
 from heatsplat.splats import NOTHING, Splats
 from heatsplat.thermal.base import Query, ThermalModel
-
-BOX = 1.2  # edges of the box over those of the points' central 98 %
+from heatsplat.thermal.coordinates import FIELD_BOX
 
 
 class Field(ThermalModel):
@@ -38,7 +37,7 @@ class Field(ThermalModel):
     def prepare(self, scene: SceneData) -> None:
         center, edge = scene.bulk
         self.center.copy_(center)
-        self.reach.fill_(BOX * edge / 2)
+        self.reach.fill_(FIELD_BOX * edge / 2)
         away = torch.stack([(frame.camera.center - center).norm() for frame in scene.train.frames]).median()
         self.span_units.fill_(float(away) + float(self.reach))
 

@@ -13,7 +13,7 @@ from heatsplat.contracts import SceneData
 from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
-from heatsplat.thermal.coordinates import Clock, ImageRange
+from heatsplat.thermal.coordinates import FIELD_BOX, Clock, ImageRange
 from heatsplat.thermal.layers import Head, draw_uniform
 from heatsplat.thermal.wrapper import Wrapper
 
@@ -21,7 +21,6 @@ from heatsplat.thermal.wrapper import Wrapper
 # natural logarithms of scales, parts of a quaternion as stored, the logit of opacity, image units.
 HEADS = {"means": (3, 1.0), "scales": (3, 3.0), "rotations": (4, 1.0), "opacity": (1, 8.0), "radiance": (1, 1.0)}
 PAIRS = ((0, 1), (0, 2), (1, 2))  # axes of the planes of space
-BOX = 1.2  # edges of the box over those of the points' central 98 %
 THINNEST = 1e-3  # half edge of a flat box over its longest
 LONGEST = 50  # nodes of a time plane at most
 SPATIAL_START = (0.1, 0.5)  # range of the planes of space before training; those of time start at 1
@@ -137,8 +136,8 @@ class HexPlane(Wrapper):
         super().prepare(scene)
         self.clock.prepare(scene)
         self.range.prepare(scene)
-        low, high = torch.quantile(scene.points.float(), torch.tensor([0.01, 0.99]), dim=0)
-        half = BOX * (high - low) / 2
+        low, high = scene.box
+        half = FIELD_BOX * (high - low) / 2
         self.center.copy_((low + high) / 2)
         self.reach.copy_(half.clamp(min=max(THINNEST * half.max().item(), 1e-12)))
         if self.time_resolution is None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
 from heatsplat.geometry import spherical_harmonics
+from heatsplat.geometry.rotations import reflected
 from heatsplat.physics import sky
 from heatsplat.physics.units import kelvin
 from heatsplat.same_bits import sigmoid
@@ -79,7 +80,7 @@ class MirroredSky(HeatPart):
         means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
         normals = query.normals(splats)
         sight = spherical_harmonics.unit(means - query.camera.center.to(means))
-        mirrored = sight - 2 * (sight * normals).sum(1, keepdim=True) * normals
+        mirrored = reflected(sight, normals)
         sine = mirrored @ self._weather.up.to(mirrored)
         air_k, depth = self._air(query.time_s)
         emissivity = sky.emissivity_towards(depth, sine)
@@ -91,7 +92,7 @@ class MirroredSky(HeatPart):
         """Temperature of the air in kelvin and its optical depth to the zenith."""
         now = self._weather.at(time_s)
         humid = now.humidity_percent is not None
-        law = ("brutsaert" if humid else "swinbank") if self.law == "auto" else self.law
+        law = sky.law_for(self.law, humid)
         air_k = torch.tensor(kelvin(now.air_c), dtype=torch.float64)
         humidity = torch.tensor(now.humidity_percent, dtype=torch.float64) if humid else None
         closed = 0.0

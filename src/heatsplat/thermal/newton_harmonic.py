@@ -157,7 +157,7 @@ class NewtonHarmonic(Relaxing):
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         initial = seeds.values.mean(1)
         self.guess_ambient(initial)
-        tensors, harmonics = self._bodies(initial, self._first_rates(seeds)), self.omega.numel()
+        tensors, harmonics = self._bodies(initial, seeds), self.omega.numel()
         if harmonics > 0:
             gains = initial.new_zeros(len(initial), 2, harmonics)
             weight, unit = self.source_penalty, self._penalty_unit()
@@ -176,9 +176,9 @@ class NewtonHarmonic(Relaxing):
         spans = (seeds.looks_s - self.clock.first_s) / self.clock.span_s
         return first_rates(seeds.looks.mean(2), spans, self.ambient.detach())
 
-    def _bodies(self, initial: Tensor, rate: Tensor) -> dict[str, PerGaussian]:
-        """What Gaussians that are first seen at ``initial`` and start with ``rate``, each [N], carry beside their gains."""
-        log_rate = rate.log()
+    def _bodies(self, initial: Tensor, seeds: Seeds) -> dict[str, PerGaussian]:
+        """What Gaussians that are first seen at ``initial`` [N] carry beside their gains."""
+        log_rate = self._first_rates(seeds).log()
         tensors = {"initial_state": self._tensor(initial, self.lr_initial)}
         if self.param == "rate":
             return tensors | {"log_rate": self._tensor(log_rate, self.lr_rate)}

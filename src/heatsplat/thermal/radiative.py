@@ -19,7 +19,7 @@ from heatsplat.thermal.band_scale import DEGREE, BandScale
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.harmonics import harmonics
+from heatsplat.thermal.view_harmonics import BASIS_COST, spherical_harmonics_of
 from heatsplat.thermal.wrapper import Wrapper
 
 DEGREES = {"emissivity": 1, "temperature": 1, "reflectance": 0}
@@ -191,8 +191,8 @@ class Radiative(Wrapper):
         if self.band is None:
             temperature = temperature_of(grey, emissivity, self.gain, reflectance, self.surroundings)
         else:
-            others = (1.0 - emissivity) * self._of_black(self.surroundings)
-            own = (self._of_black(grey) - others) / emissivity
+            others = (1.0 - emissivity) * self.band.radiance_of(self.surroundings)
+            own = (self.band.radiance_of(grey) - others) / emissivity
             temperature = self.band.value_of(own.clamp(min=0.0).sqrt().sqrt())
         temperature = temperature.clamp(*START)
         values = {"emissivity": emissivity, "temperature": temperature, "reflectance": reflectance}
@@ -228,10 +228,10 @@ class Radiative(Wrapper):
 
     @property
     def cost(self) -> int:
-        directions = {1: 0, 4: 12, 9: 27, 16: 48}  # by number of harmonics: normalising, and the polynomials
         formula = 6 + 4 * len(self.degrees) if self.three_parameter else 1  # the sum, and a sigmoid per attribute
         formula += 0 if self.band is None else 2 * DEGREE + 10  # the two polynomials and roots
-        return super().cost + formula + sum(directions[bands] + bands for bands in self.bands.values())
+        sums = sum(BASIS_COST[degree] + self.bands[name] for name, degree in self.degrees.items())
+        return super().cost + formula + sums
 
     # The thermal band -----------------------------------------------------------------------------------
 
@@ -241,16 +241,12 @@ class Radiative(Wrapper):
             return (self._sum(splats, query, "radiance") + 0.5).clamp(min=0.0)
         body = self._body(splats, query)
         if self.band is not None:
-            own, others = (self._of_black(values) for values in (body["temperature"], self.surroundings))
+            own, others = (self.band.radiance_of(values) for values in (body["temperature"], self.surroundings))
             sent = torch.lerp(everywhere(others.to(own), own), own, body["emissivity"])
             return self.band.value_of(sent.sqrt().sqrt())
         gain, surroundings = (everywhere(number, body["emissivity"]) for number in (self.gain, self.surroundings))
         sent = radiance(body["emissivity"], body["temperature"], gain, body["reflectance"], surroundings)
         return clipped(sent, self.clip)
-
-    def _of_black(self, values: Tensor) -> Tensor:
-        """Radiance in the band of black bodies that look like ``values``, over that of white."""
-        return self.band.root_of(values).square().square()
 
     def _body(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """ε, T and ρ in the direction of view, each [n, 1]."""
@@ -260,4 +256,5 @@ class Radiative(Wrapper):
     def _sum(self, splats: Splats, query: Query, name: str) -> Tensor:
         """The sum of harmonics of an attribute, [n, 1]."""
         degree = self.degrees[name]
-        return harmonics(splats[name], splats[f"{name}_rest"] if degree > 0 else None, splats.means, query, degree)
+        rest = splats[f"{name}_rest"] if degree > 0 else None
+        return spherical_harmonics_of(splats[name], rest, splats.means, query, degree)

@@ -137,4 +137,4 @@ class RadiativeTransfer(Wrapper):
 
     def _radiance(self, values: Tensor) -> Tensor:
         """Of black bodies that look like ``values``, over that of white."""
-        return self.scale.root_of(self.scale.within(values)).square().square()
+        return self.scale.radiance_of(self.scale.within(values))

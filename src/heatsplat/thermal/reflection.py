@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
+from heatsplat.geometry.rotations import reflected
 from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
@@ -75,7 +76,7 @@ class Reflection(HeatPart):
         means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
         normals = query.normals(splats)
         sight = spherical_harmonics.unit(means - query.camera.center.to(means))
-        mirrored = sight - 2 * (sight * normals).sum(1, keepdim=True) * normals
+        mirrored = reflected(sight, normals)
         return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.physics.frequencies import SEPARATION
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import PerGaussian
+from heatsplat.thermal.base import PerGaussian, Seeds
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 
 SHORTEST_S, SMALLEST = 1e-3, 1e-8  # bounds of the time constant and of γ in the authors' code
@@ -94,7 +94,7 @@ class ReleasedHarmonic(NewtonHarmonic):
                 "range, or choose method=etgs, which works in image values"
             )
 
-    def _bodies(self, initial: Tensor, rate: Tensor) -> dict[str, PerGaussian]:
+    def _bodies(self, initial: Tensor, seeds: Seeds) -> dict[str, PerGaussian]:
         span_s, span_k = self.clock.span_s, self.range.bounds.span_k
         same = torch.ones_like(initial)
         tensors = {

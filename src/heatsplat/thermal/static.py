@@ -11,7 +11,7 @@ from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import ImageRange
-from heatsplat.thermal.harmonics import harmonics
+from heatsplat.thermal.view_harmonics import BASIS_COST, active_degree, spherical_harmonics_of
 
 MODALITIES = ("thermal", "rgb")
 
@@ -92,12 +92,11 @@ class Static(ThermalModel):
         return tensors
 
     def on_step(self, step: int) -> None:
-        if self.sh_degree_interval > 0:
-            self.active_degree = min(self.sh_degree, step // self.sh_degree_interval)
+        self.active_degree = active_degree(step, self.sh_degree, self.sh_degree_interval)
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         rest = splats[self.sh_rest] if self.active_degree > 0 else None
-        values = harmonics(splats[self.sh0], rest, splats.means, query, self.active_degree)
+        values = spherical_harmonics_of(splats[self.sh0], rest, splats.means, query, self.active_degree)
         return (values + 0.5).clamp(min=0.0) if self.floor else values + 0.5
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
@@ -110,6 +109,4 @@ class Static(ThermalModel):
 
     @property
     def cost(self) -> int:
-        channels = sum(self.modality_channels)
-        basis = {0: 0, 1: 12, 2: 27, 3: 48}[self.sh_degree]  # normalising the direction and the polynomials in it
-        return basis + self.bands * channels
+        return BASIS_COST[self.sh_degree] + self.bands * sum(self.modality_channels)

@@ -7,13 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, Weather
+from heatsplat.contracts import SceneData, Weather, check_option
 from heatsplat.physics.heat_flow import heating_rate
 from heatsplat.physics.units import kelvin
 from heatsplat.splats import Splats
-from heatsplat.thermal.base import NORMALS
-from heatsplat.thermal.ellipsoid_balance import check_weather, sky_at
-from heatsplat.thermal.weather_drive import source_of_sunlight, sunlight_at
+from heatsplat.thermal.base import NORMALS, PerGaussian, Seeds, surface_normals
+from heatsplat.thermal.weather_drive import SKIES, check_weather, sky_at, source_of_sunlight, sunlight_at
 
 
 class SurfaceBalance:
@@ -26,10 +25,11 @@ class SurfaceBalance:
         depth_m: their thickness.
 
     Raises:
-        ValueError: an option is out of its range.
+        ValueError: an option is unknown or out of its range.
     """
 
     def __init__(self, sky: str, depth_m: float) -> None:
+        check_option("sky", sky, SKIES)
         if depth_m <= 0:
             raise ValueError(f"depth_m must be positive, got {depth_m}")
         self.sky, self.depth_m = sky, depth_m
@@ -37,6 +37,10 @@ class SurfaceBalance:
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, with the way out, where the scene's weather lacks what the balance needs."""
         check_weather(scene, self.sky)
+
+    def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
+        """Tensors of Gaussians that the balance needs of its own: the normals of surfaces."""
+        return surface_normals(seeds)
 
     @torch.no_grad()
     def areas(self, splats: Splats, ids: Tensor, metres_per_unit: float) -> dict[str, Tensor]:

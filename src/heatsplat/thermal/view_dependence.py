@@ -9,8 +9,8 @@ from torch import Tensor
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
-from heatsplat.thermal.harmonics import harmonics
 from heatsplat.thermal.part import HeatPart
+from heatsplat.thermal.view_harmonics import BASIS_COST, active_degree, spherical_harmonics_of
 
 
 class ViewDependence(HeatPart):
@@ -39,18 +39,18 @@ class ViewDependence(HeatPart):
         return {"view_rest": PerGaussian(seeds.values.new_zeros(len(seeds.means), self.bands - 1, 1), self.lr_rest)}
 
     def on_step(self, step: int) -> None:
-        if self.sh_degree_interval > 0:
-            self.active_degree = min(self.sh_degree, step // self.sh_degree_interval)
+        self.active_degree = active_degree(step, self.sh_degree, self.sh_degree_interval)
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
         if self.active_degree == 0:
             return values
         nothing = splats.means.new_zeros(len(splats), 1, 1)
-        return values + harmonics(nothing, splats["view_rest"], splats.means, query, self.active_degree)
+        rest = splats["view_rest"]
+        return values + spherical_harmonics_of(nothing, rest, splats.means, query, self.active_degree)
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"view_dependence": {"degree": self.sh_degree}}
 
     @property
     def cost(self) -> int:
-        return {1: 12, 2: 27, 3: 48}[self.sh_degree] + self.bands - 1  # normalising, polynomials and the sum
+        return BASIS_COST[self.sh_degree] + self.bands - 1

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import WEATHER_COLUMNS, Weather
-from heatsplat.physics.units import DAY_S
+from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather
+from heatsplat.physics.sky import LAWS, sky_temperature_k
+from heatsplat.physics.units import DAY_S, kelvin
 
+SKIES = ("none", *LAWS)
 NO_CLOUDS = (
     "tells no clouds, which clouds=true needs: add cloud_cover_percent, or irradiance with latitude and longitude, or give "
     "clouds=false for a clear sky"
@@ -75,6 +77,29 @@ def source_of_sunlight(weather: Weather) -> str:
     if weather.irradiance_w_m2 is not None:
         return "horizontal, from above: the record has no direction of the sun or no direct irradiance"
     return "none: the record has no irradiance"
+
+
+def check_weather(scene: SceneData, sky: str) -> None:
+    """Raises SceneError, with the way out, where the scene's weather lacks what a balance under this sky needs."""
+    if scene.weather.air_c is None:
+        raise SceneError(
+            f"the weather of scene '{scene.name}' has no air temperature, without which nothing is known of how air "
+            "cools: add air_c, or leave the balance out with thermal.weights.ode=0 thermal.weights.pinn=0"
+        )
+    if sky not in ("none", "swinbank") and scene.weather.humidity_percent is None:
+        raise SceneError(
+            f"the weather of scene '{scene.name}' has no humidity, which thermal.sky={sky} needs; "
+            "thermal.sky=swinbank does without"
+        )
+
+
+def sky_at(weather: Weather, time_s: float, sky: str) -> float:
+    """Temperature in kelvin of what a body sees above it at a moment; 0 under no sky."""
+    if sky == "none":
+        return 0.0
+    now = weather.at(time_s)
+    moist = None if now.humidity_percent is None else torch.tensor(now.humidity_percent, dtype=torch.float64)
+    return float(sky_temperature_k(kelvin(torch.tensor(now.air_c, dtype=torch.float64)), moist, sky))
 
 
 def value_at(weather: Weather, series: Tensor, time_s: float) -> Tensor:

@@ -1,21 +1,22 @@
-"""What hides the sun and the sky from Gaussians: the scene's depth, splatted from where they are, for models that ask."""
+"""What hides the sun and the sky from Gaussians: the scene's depth, splatted from where they are, for models that ask.
+
+Exposure is that to sun and sky, what shadows and the sky view factor leave; a camera's time of exposure is nowhere meant.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData
+from heatsplat.contracts import Camera, SceneData
 from heatsplat.geometry.coverage import surface_depth
 from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
 from heatsplat.renderers.settings import Renderer
 from heatsplat.thermal.base import SKY_SEEN, SUN_SEEN
 from heatsplat.training.normals import Discs
-
-Show = Callable[..., RenderOutput]  # (frame, values [P, 1] of all that is shown, depth=bool)
 
 DISTANCE = 40.0  # of the camera that stands for sun or sky, in radii of the scene: rays converge by 3 degrees
 NEIGHBOURS = 4  # discs of which a Gaussian takes the mean, by the inverse of their distance
@@ -56,22 +57,18 @@ class Exposure:
         self._shares: dict[str, Tensor] = {}
 
     @torch.no_grad()
-    def prepare(self, scene: SceneData, renderer: Renderer, discs: Discs, names: Iterable[str]) -> None:
+    def prepare(self, scene: SceneData, renderer: Renderer, discs: Discs, names: Collection[str]) -> None:
         """Looks at the discs from sun and sky, as far as SUN_SEEN and SKY_SEEN are among ``names``.
 
         They are looked at from afar, whatever the renderer's own ``near`` and ``far``.
         """
-        self._points = discs.shapes[0]
+        self._points, self._shares = discs.shapes[0], {}
         renderer = renderer.seeing_far()
-
-        def show(frame: Frame, values: Tensor, depth: bool) -> RenderOutput:
-            return renderer(*discs.shapes, values, frame.camera, None, (values.shape[1],), depth=depth)
-
-        looks = {
-            SUN_SEEN: lambda *given: self.open(*given, sun_directions(scene.weather.sun, scene.weather.up)),
-            SKY_SEEN: self.sky,
-        }
-        self._shares = {name: looks[name](scene, show, self._points, discs.normals) for name in looks if name in names}
+        if SUN_SEEN in names:
+            directions = sun_directions(scene.weather.sun, scene.weather.up)
+            self._shares[SUN_SEEN] = self.open(scene, renderer, discs, directions)
+        if SKY_SEEN in names:
+            self._shares[SKY_SEEN] = self.sky(scene, renderer, discs)
 
     @torch.no_grad()
     def look(self, means: Tensor) -> dict[str, Tensor]:
@@ -98,20 +95,21 @@ class Exposure:
         return {name: mean(shares) for name, shares in self._shares.items()}
 
     @torch.no_grad()
-    def open(self, scene: SceneData, show: Show, means: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
-        """How much of the light from directions [D, 3] reaches them, [N, D] in [0, 1]."""
-        return torch.stack([self._lit(scene, show, means, normals, d) for d in directions], dim=1).to(means)
+    def open(self, scene: SceneData, renderer: Renderer, discs: Discs, directions: Tensor) -> Tensor:
+        """How much of the light from directions [D, 3] reaches the discs, [P, D] in [0, 1]."""
+        return torch.stack([self._lit(scene, renderer, discs, d) for d in directions], dim=1).to(discs.normals)
 
     @torch.no_grad()
-    def sky(self, scene: SceneData, show: Show, means: Tensor, normals: Tensor) -> Tensor:
-        """How much of the light of an even sky reaches them of what would without obstacles, [N] in [0, 1]."""
+    def sky(self, scene: SceneData, renderer: Renderer, discs: Discs) -> Tensor:
+        """How much of the light of an even sky reaches the discs of what would without obstacles, [P] in [0, 1]."""
         directions = sky_directions(self.directions, scene.weather.up)
-        return open_share(normals, directions, self.open(scene, show, means, normals, directions))
+        return open_share(discs.normals, directions, self.open(scene, renderer, discs, directions))
 
-    def _lit(self, scene: SceneData, show: Show, means: Tensor, normals: Tensor, direction: Tensor) -> Tensor:
-        """Share [N] of the light from a direction [3] that reaches surfaces."""
+    def _lit(self, scene: SceneData, renderer: Renderer, discs: Discs, direction: Tensor) -> Tensor:
+        """Share [P] of the light from a direction [3] that reaches the discs."""
         camera, pixel = self._camera(scene, direction)
-        seen = show(Frame("light", 0, camera), means.new_zeros(len(means), 1), depth=True)
+        means, normals = discs.shapes[0], discs.normals
+        seen = renderer.values_seen(discs.shapes, means.new_zeros(len(means), 1), camera, depth=True)
         depth = surface_depth(seen.depth, seen.alpha[0]).double().cpu()
         places, z = camera.project(means.double().cpu())
         across = (normals.double().cpu() @ direction).clamp(1e-3, 1.0)

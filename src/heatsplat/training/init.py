@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, evenly_spread
+from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
 from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
@@ -71,7 +71,7 @@ class Initialisation:
         times = len(thermal.opacity_channels) if self.separate else 1
         most = None if cap_max is None else max(cap_max / times, 1)
         means = self._means(scene, generator_for(seed, 0, "init"), most)
-        count, distances = len(means), neighbour_distances(means)
+        count, distances = len(means), neighbour_distances(means, NEIGHBOURS)
         if count == 1:
             distances = torch.full((1, 1), LONE_SIZE * scene.extent)
         squared = distances.square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
@@ -93,7 +93,7 @@ class Initialisation:
         if count < wanted:
             log.info("init: %s of %s Gaussians, as many as density.cap_max allows", f"{count:,}", f"{wanted:,}")
         if self.source == "random":
-            low, high = torch.quantile(points, torch.tensor([0.01, 0.99]), dim=0)
+            low, high = scene.box
             return low + (high - low) * torch.rand(count, 3, generator=generator)
         if len(points) < NEIGHBOURS + 1:
             raise SceneError(
@@ -241,14 +241,6 @@ def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
     except Exception as error:
         raise SceneError(f"init.path={path} is no checkpoint of heatsplat that can be read: {error!r}") from error
     return geometry, rows
-
-
-def neighbour_distances(points: Tensor) -> Tensor:
-    """Distances from each point to its three nearest others, [P, 3]; fewer columns when there are fewer points."""
-    array = points.numpy().astype(np.float64)
-    k = min(NEIGHBOURS, len(array) - 1)
-    distances, _ = cKDTree(array).query(array, k=list(range(1, k + 2)), workers=1)  # a list keeps two axes
-    return torch.from_numpy(distances[:, 1:]).float()
 
 
 def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:

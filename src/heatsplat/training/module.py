@@ -576,9 +576,7 @@ class SplatTraining(pl.LightningModule):
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
         if self.thermal.per_row > 1:
             values = values.repeat_interleave(self.thermal.per_row, dim=0)
-        return self.renderer(
-            *shape, opacities[:1], values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
-        )
+        return self.renderer.values_seen((*shape, opacities[:1]), values, frame.camera, depth, ratio)
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         return self._scored(view, view.frame)

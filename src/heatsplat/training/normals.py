@@ -87,7 +87,7 @@ class Normals:
         )
 
         def show(frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
-            return renderer(*discs, values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio)
+            return renderer.values_seen(discs, values, frame.camera, depth, ratio)
 
         towards = torch.zeros_like(points)
         for frame, ratio in self._frames:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 
-from heatsplat.contracts import RenderOutput, SceneData
+from heatsplat.contracts import SceneData
 from heatsplat.renderers.settings import Renderer
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import NORMALS, SKY_SEEN, SUN_SEEN
 from heatsplat.training.exposure import Exposure
-from heatsplat.training.normals import Normals
+from heatsplat.training.normals import Normals, Show
 
 
 class Surroundings:
@@ -28,7 +26,7 @@ class Surroundings:
         self.normals, self.exposure = normals or Normals(), exposure or Exposure()
 
     @torch.no_grad()
-    def prepare(self, scene: SceneData, renderer: Renderer, splats: Splats, show: Callable[..., RenderOutput]) -> None:
+    def prepare(self, scene: SceneData, renderer: Renderer, splats: Splats, show: Show) -> None:
         """Looks at the scene's points, then at the splats as ``show`` renders them (``SplatTraining.composited``)."""
         if NORMALS in splats:
             splats[NORMALS].copy_(self.normals.prepare(scene, renderer, splats.means.detach()))
@@ -38,14 +36,14 @@ class Surroundings:
             self._expose(splats)
 
     @torch.no_grad()
-    def after_step(self, step: int, splats: Splats, show: Callable[..., RenderOutput]) -> None:
+    def after_step(self, step: int, splats: Splats, show: Show) -> None:
         """Looks again where that is due before the step that follows ``step``."""
         if NORMALS in splats and step + 1 in self.normals.refresh:
             self._face(splats, show)
         if step + 1 in self.exposure.refresh:
             self._expose(splats)
 
-    def _face(self, splats: Splats, show: Callable[..., RenderOutput]) -> None:
+    def _face(self, splats: Splats, show: Show) -> None:
         splats[NORMALS].copy_(self.normals.look(show, splats[NORMALS].detach()))
 
     def _expose(self, splats: Splats) -> None:

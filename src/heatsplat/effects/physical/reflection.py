@@ -14,6 +14,7 @@ from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
+from heatsplat.geometry.rotations import reflected
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -23,8 +24,7 @@ def evidence(inspected: Inspection) -> Evidence:
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
     """Harmonics to degree 2 of the direction that a mirror shows."""
-    out, normals = data.tracks.directions, data.normals[:, None]
-    x, y, z = (2.0 * (out * normals).sum(2, keepdim=True) * normals - out).unbind(2)
+    x, y, z = reflected(-data.tracks.directions, data.normals[:, None]).unbind(2)
     return Columns.dense(torch.stack([x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], 2))
 
 

@@ -149,9 +149,8 @@ class Map(Format):
         columns = torch.stack([moment.blended, *told.values()], dim=1)
         values = gap_free(columns)
         with torch.no_grad():
-            output = module.renderer(
-                seen.means, seen.quats, seen.scales, seen.opacities[None], values, camera, None, (values.shape[1],), depth=True,
-            )  # fmt: skip
+            shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
+            output = module.renderer.values_seen(shapes, values, camera, depth=True)
         means = seen_means(output.features, output.alpha[0], columns.shape[1])
         means = means.where(output.alpha[0, ..., None] >= OPEN, torch.nan)
         depth = surface_depth(output.depth, output.alpha[0])

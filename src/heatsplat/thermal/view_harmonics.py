@@ -10,8 +10,16 @@ from heatsplat.geometry import spherical_harmonics
 from heatsplat.kernels import spherical_harmonics as kernel
 from heatsplat.thermal.base import Query
 
+# Operations that a Gaussian's harmonics of each degree take before the sum: normalising the direction, and the polynomials in it.
+BASIS_COST = {0: 0, 1: 12, 2: 27, 3: 48}
 
-def harmonics(constant: Tensor, rest: Tensor | None, means: Tensor, query: Query, degree: int) -> Tensor:
+
+def active_degree(step: int, degree: int, interval: int) -> int:
+    """Degree of the harmonics that are trained at a step: one more every ``interval`` steps, up to ``degree``; 0 trains all."""
+    return min(degree, step // interval) if interval > 0 else degree
+
+
+def spherical_harmonics_of(constant: Tensor, rest: Tensor | None, means: Tensor, query: Query, degree: int) -> Tensor:
     """Sums of harmonics of the direction from the camera to the Gaussians in ``query.ids``, [n, C].
 
     Args:
