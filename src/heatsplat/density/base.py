@@ -35,6 +35,7 @@ class DensityControl:
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
         moments, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
         shortest: what an interval has at least.
+        initial_count: Gaussians at the start of the run, as the run tells it.
         opacities_until: step from which on a stage holds opacities still until the run ends, as the run tells it; infinity: none.
     """
 
@@ -44,6 +45,7 @@ class DensityControl:
     moments: tuple[str, ...] = ()
     intervals: tuple[str, ...] = ()
     shortest: int = 1
+    initial_count: int = 0
     opacities_until: float = math.inf
     _times: dict[str, Any] = {}  # of those attributes, not rounded, once they were moved
 
@@ -114,6 +116,24 @@ class DensityControl:
     def settled(self, step: int) -> bool:
         """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of opacities."""
         return True
+
+
+def ndc_gradient_norms(output: RenderOutput, camera: Camera, absolute: bool = False) -> Tensor | None:
+    """Norms [n] of the gradients of the visible Gaussians' screen positions; None where none came back.
+
+    **Convention:** per unit of normalised device coordinates, two units per image side; in the order of "visible_ids".
+
+    Args:
+        output: a rendered view after the backward pass.
+        camera: that of the view.
+        absolute: of the absolute gradients of single pixels, summed (AbsGS).
+    """
+    means2d = output.meta["means2d"]
+    gradients = means2d.absgrad if absolute else means2d.grad
+    if gradients is None:
+        return None
+    half_size = gradients.new_tensor([camera.width / 2, camera.height / 2])
+    return (gradients[output.meta["visible_ids"]] * half_size).norm(dim=1)
 
 
 def _rounded(value: Any, least: int) -> Any:
