@@ -75,7 +75,7 @@ def test_grids_that_do_not_fit_are_named():
     ):
         OnTargetGrid(Photometric())(inputs(noise(48, 60), noise(12, 16)))
     assert fineness(inputs(noise(36, 48), noise(12, 16))) == 3
-    with pytest.raises(ValueError, match="unknown resampling kernel 'nearest'"):
+    with pytest.raises(ValueError, match="kernel must be one of area, .*, got 'nearest'"):
         OnTargetGrid(Photometric(), "nearest")
 
 

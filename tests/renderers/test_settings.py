@@ -59,7 +59,7 @@ def test_every_setting_reaches_the_rasteriser(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"backend": "opengl"}, "renderer.backend 'opengl' is unknown"),
+        ({"backend": "opengl"}, "renderer.backend must be one of auto, .*, got 'opengl'"),
         ({"background": "black"}, "renderer.background must be 'ambient' or a number"),
         ({"eps2d": 0.0}, "renderer.eps2d must be above 0"),
     ],

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, SceneData, View
 from heatsplat.geometry.resampling import resampled
+from heatsplat.losses.masking import cleared
 from heatsplat.splats import Splats
 
 
@@ -67,10 +68,7 @@ class LossInputs:
                 f"prediction and target must have one shape, got {list(self.prediction.shape)} and "
                 f"{list(self.target.shape)}"
             )
-        if self.mask is None:
-            return self.prediction, self.target
-        inside = self.mask[..., None]
-        return torch.where(inside, self.prediction, 0.0), torch.where(inside, self.target, 0.0)
+        return cleared(self.prediction, self.mask), cleared(self.target, self.mask)
 
 
 @torch.no_grad()

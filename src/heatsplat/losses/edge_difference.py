@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.edge import GAIN, mean_of_differences
+from heatsplat.losses.edge import mean_of_differences
+from heatsplat.losses.sobel import GAIN
 
 
 class EdgeDifference:

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, check_option
 from heatsplat.geometry.resampling import KERNELS, resampled, scale_between
 from heatsplat.losses.compose import LossInputs, LossTerm, prepare
-from heatsplat.losses.edge import whole_windows
+from heatsplat.losses.masking import eroded
 from heatsplat.losses.photometric import Photometric
 
 
@@ -29,8 +29,8 @@ class OnTargetGrid:
     """
 
     def __init__(self, term: LossTerm, kernel: str | None = None) -> None:
-        if kernel is not None and kernel not in KERNELS:
-            raise ValueError(f"unknown resampling kernel '{kernel}'; there are {', '.join(KERNELS)}")
+        if kernel is not None:
+            check_option("kernel", kernel, KERNELS)
         self.term, self.kernel = term, kernel or "area"
         self._follows = kernel is None
 
@@ -118,4 +118,4 @@ def check_fineness(inputs: LossInputs, factor: int) -> None:
 
 def counted_finely(mask: Tensor, factor: int) -> Tensor:
     """Which pixels of a fine grid [factor H, factor W] count: those in a pixel of [H, W] with no masked one about it."""
-    return whole_windows(mask).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    return eroded(mask).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
