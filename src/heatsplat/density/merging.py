@@ -20,7 +20,7 @@ from heatsplat.density.moments import Merged, Shapes, merged
 from heatsplat.density.ops import Cloud
 from heatsplat.splats import GEOMETRY, Splats
 
-log = logging.getLogger("heatsplat")
+log = logging.getLogger(__name__)
 
 UNSEEN = 0.05  # weight of a Gaussian that no view shows, in medians of those that are seen
 FEWEST = 0.005  # share of the Gaussians below which a round is not worth its renders
