@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import check_option
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared, eroded, masked_mean
 from heatsplat.losses.sobel import sobel
 
@@ -41,7 +41,7 @@ def _slopes(image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     return cleared(x, counted), cleared(y, counted)
 
 
-class Corner:
+class Corner(LossTerm):
     """The mean over pixels of w |target - prediction| with w = max(R / R_max, floor), R the target's Harris response.
 
     Thermal3D-GS, Eq. 12, where R is of a window and of the target. A target without corners counts with w = floor.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import eroded, masked_mean
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.sobel import sobel_magnitude
@@ -27,14 +27,14 @@ def mean_of_differences(inputs: LossInputs, size: Callable[[Tensor], Tensor]) ->
     return masked_mean(size(difference), None if inputs.mask is None else eroded(inputs.mask))
 
 
-class Edge:
+class Edge(LossTerm):
     """The mean over pixels of (|∇target| - |∇prediction|)² (TI-3DGS, Eq. 15); see ``mean_of_differences``."""
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         return mean_of_differences(inputs, torch.square)
 
 
-class EdgeEnhanced:
+class EdgeEnhanced(LossTerm):
     """The terms "l1", "dssim" and "edge": (1 - w - e) mean|x - y|, w (1 - mean SSIM) and e times ``Edge`` (Eq. 16).
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared, masked_mean
 
 
@@ -42,7 +42,7 @@ def guided_variation(image: Tensor, guide: Tensor, beta: float) -> Tensor:
     return sum(slope.abs() for slope in slopes(image)) * torch.exp(-beta * edges)
 
 
-class GradientConsistency:
+class GradientConsistency(LossTerm):
     """The mean of ``gradient_difference`` over pixels and channels.
 
     Pixels that, or whose right or lower neighbour, are masked do not count.
@@ -59,7 +59,7 @@ class GradientConsistency:
         return masked_mean(gradient_difference(prediction, target), _with_neighbours(inputs.mask))
 
 
-class GuidedVariation:
+class GuidedVariation(LossTerm):
     """The mean of ``guided_variation`` of the prediction over pixels and channels, guided by a companion's target.
 
     Pixels that, or whose right or lower neighbour, are masked do not count.

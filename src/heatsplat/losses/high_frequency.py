@@ -10,14 +10,14 @@ from torch.nn import functional
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry.resampling import resampled
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.low_resolution import check_fineness, counted_finely
 from heatsplat.losses.masking import masked_mean
 from heatsplat.losses.sobel import GAIN, sobel
 from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
-class HighFrequency:
+class HighFrequency(LossTerm):
     """The mean of W |H(prediction) - H(teacher)| on the fine grid of the prediction (SupIR-GS, Eq. 9-10).
 
     H is what lies between two averages and W, the confidence, falls where the teacher departs from the target. Both are

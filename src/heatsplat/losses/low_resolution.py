@@ -9,12 +9,12 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, check_option
 from heatsplat.geometry.resampling import KERNELS, resampled, scale_between
-from heatsplat.losses.compose import LossInputs, LossTerm, prepare
+from heatsplat.losses.compose import LossInputs, LossTerm, Wrapped
 from heatsplat.losses.masking import eroded
 from heatsplat.losses.photometric import Photometric
 
 
-class OnTargetGrid:
+class OnTargetGrid(Wrapped):
     """A term of the predictions reduced to the grids of their targets: consistency with what was recorded.
 
     A prediction that has its target's size already is passed on as it is.
@@ -31,14 +31,15 @@ class OnTargetGrid:
     def __init__(self, term: LossTerm, kernel: str | None = None) -> None:
         if kernel is not None:
             check_option("kernel", kernel, KERNELS)
-        self.term, self.kernel = term, kernel or "area"
+        super().__init__(term)
+        self.kernel = kernel or "area"
         self._follows = kernel is None
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Prepares the term, and finds the kernel where none is given."""
         if self._follows:
             self.kernel = scene.reduced_by or "area"
-        return prepare(self.term, scene, modality)
+        return super().prepare(scene, modality)
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
         fineness(inputs)
@@ -50,7 +51,7 @@ class OnTargetGrid:
         return resampled(prediction, *target.shape[:2], self.kernel)
 
 
-class Curriculum:
+class Curriculum(LossTerm):
     """The terms "l1" and "dssim": (1 + b(t)) mean|x - y| and s(t) (1 - mean SSIM) (SupIR-GS, Eq. 12, first two terms).
 
     Unlike in ``Photometric``, SSIM comes on top of the L1 term and not out of it.

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from heatsplat.kernels import gpu
 from heatsplat.kernels import ssim as kernel
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared
 
 WINDOW = 11  # taps of the Gaussian window
@@ -75,7 +75,7 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
     return luminance * (2 * covariance + C2) / ((x_variance + y_variance).clamp(min=0.0) + C2)
 
 
-class Photometric:
+class Photometric(LossTerm):
     """The terms "l1" and "dssim", weighted: (1 - w) mean|x - y| and w (1 - mean SSIM).
 
     Means run over the channels of the pixels that count. Masked pixels neither contribute nor receive a gradient, and

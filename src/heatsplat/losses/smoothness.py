@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared, masked_mean
 
 
@@ -33,7 +33,7 @@ def neighbour_differences(image: Tensor, mask: Tensor | None = None) -> Tensor:
     return total
 
 
-class Smoothness:
+class Smoothness(LossTerm):
     """The mean of ``neighbour_differences`` of the prediction over the pixels that count and their channels.
 
     ThermalGaussian's smoothness term; its code takes the neighbours beyond the border from the other side of the image.

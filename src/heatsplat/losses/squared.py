@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared
 
 
-class Squared:
+class Squared(LossTerm):
     """The term "squared": the mean of (x - y)² over the channels of the pixels that count; 0 where none does.
 
     Args:
