@@ -38,7 +38,7 @@ class Adaptive(DensityControl):
         ValueError: an option is out of its range.
     """
 
-    moments, intervals = ("start", "stop"), ("every", "reset_every")
+    milestones, intervals = ("start", "stop"), ("every", "reset_every")
 
     def __init__(
         self,

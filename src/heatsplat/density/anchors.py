@@ -41,7 +41,7 @@ class Anchors(DensityControl):
     """
 
     rows = frozenset({ANCHORS})
-    moments, intervals = ("start", "grow_from", "stop"), ("every",)
+    milestones, intervals = ("start", "grow_from", "stop"), ("every",)
 
     def __init__(
         self,

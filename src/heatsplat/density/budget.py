@@ -73,7 +73,7 @@ class Budget(DensityControl):
         ValueError: an option is out of its range.
     """
 
-    moments, intervals = ("start", "stop", "remove_at"), ("every",)
+    milestones, intervals = ("start", "stop", "remove_at"), ("every",)
 
     def __init__(
         self,

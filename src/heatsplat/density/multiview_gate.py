@@ -54,7 +54,7 @@ class MultiviewGate(Adaptive):
     Source: FastGS (CVPR 2026), multi-view consistent densification and pruning.
     """
 
-    moments, intervals = (*Adaptive.moments, "late_stop"), (*Adaptive.intervals, "late_every")
+    milestones, intervals = (*Adaptive.milestones, "late_stop"), (*Adaptive.intervals, "late_every")
 
     def __init__(
         self,
