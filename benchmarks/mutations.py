@@ -174,7 +174,7 @@ MUTATIONS = (
         "tests/losses/test_photometric.py -k contrast-or-constant",
     ),
     Mutation(
-        "√(x² + y²) of a flat image", "losses.edge",
+        "√(x² + y²) of a flat image", "losses.sobel",
         "return (x * x + y * y + TINY).sqrt()", "return (x * x + y * y).sqrt()", "tests/losses/test_edge.py",
     ),
     Mutation(

@@ -26,7 +26,6 @@ from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.geometry.sight_lines import cosines, distances, normals
-from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
 from heatsplat.io.tables import markdown_table, write_csv

@@ -23,7 +23,6 @@ from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.datamodules.formats.lens import MODELS
-from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.io.files import write_atomically
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed

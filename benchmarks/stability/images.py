@@ -9,8 +9,8 @@ from torch import Tensor
 
 from benchmarks.stability.case import Case, log_uniform, uniform
 from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.edge import TINY, sobel_magnitude
 from heatsplat.losses.photometric import C1, C2, SIGMA, WINDOW, Photometric, ssim_map
+from heatsplat.losses.sobel import TINY, sobel_magnitude
 from heatsplat.training.rng import generator_for
 
 COUNT = 6  # pairs of images

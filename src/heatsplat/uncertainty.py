@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -222,88 +222,40 @@ class Uncertainty:
         Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or
         not all the same.
         """
-        module = self.module
-        told = module.attributes(frame)
-        if not told:
+        module, count = self.module, len(self.module.splats)
+        names = list(module.attributes(frame))
+        if not names:
             return {}
-        trained = [name for name in module.splats.names if name not in (*GEOMETRY, *module.constants)]
-        tensors = [module.splats[name] for name in trained]
-        numbers = sum(tensor[0].numel() for tensor in tensors)
-        if numbers > MOST_NUMBERS or any(len(tensor) != len(module.splats) for tensor in tensors):
+        whole = _Block(module)
+        if whole.numbers > MOST_NUMBERS or any(len(tensor) != count for tensor in whole.tensors):
             log.warning(
                 "%s has %d numbers for each Gaussian, or not as many for all: there are no intervals of what it learned",
-                type(module.thermal).__name__, numbers,
+                type(module.thermal).__name__, whole.numbers,
             )  # fmt: skip
             return {}
-
-        def slopes(values: Tensor, tensors: Sequence[Tensor]) -> Tensor:
-            """Derivatives [n, K] of values [n] by the numbers of each."""
-            if not values.requires_grad:
-                return torch.zeros(len(values), numbers, dtype=torch.float64)
-            found = torch.autograd.grad(values.sum(), tensors, allow_unused=True)
-            rows = (torch.zeros_like(t) if g is None else g for t, g in zip(tensors, found, strict=True))
-            return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
-
-        def wrong(tell: Callable[[], Tensor], now: Tensor) -> Tensor:
-            """What becomes of values [n] that the model tells where each of its doubts comes true, [n, D]."""
-            found = []
-            for doubt in module.thermal.doubts().values():
-                with torch.no_grad(), doubt():
-                    found.append((tell() - now).cpu().double())
-            return torch.stack(found, dim=1) if found else torch.zeros(len(now), 0, dtype=torch.float64)
-
-        spread = (
-            torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in tensors], dim=1)
-            .cpu()
-            .double()
-            .var(0, correction=min(1, len(module.splats) - 1))  # one alone has no spread
-        )
-        views, count = module.scene.train, len(module.splats)
-        order = sorted(range(len(views)), key=lambda k: views.frames[k].time_s or 0.0)
-        # In float32, as the gradients that tell them: they are all that is kept of every view.
-        weights, residuals = (torch.zeros(len(order), count) for _ in range(2))
-        for i, view in enumerate(views.subset(order)):
-            weight, residuals[i] = _residual(module, view.to(module.device))
-            weights[i] = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
-        repeated = redundancy(residuals, weights)
-        del residuals
-        most = count if module.thermal.inseparable else max(1, BLOCK // numbers**2)
-        found = {name: torch.zeros(count) for name in told}
+        spread = whole.spread()
+        frames, weights, repeated = self._weighed_views()
+        most = count if module.thermal.inseparable else max(1, BLOCK // whole.numbers**2)
+        deviations = {name: torch.zeros(count) for name in names}
         for first in range(0, count, most):
             part = slice(first, first + most)
-            splats = module.splats
-            if most < count:  # of its own, for the gradient of a part would be as large as the whole
-                splats = type(splats)({name: splats[name].detach()[part] for name in splats.names})
-            tensors = [splats[name] for name in trained]
-            known = torch.zeros(len(splats), numbers, numbers, dtype=torch.float64)
-            pulled = torch.zeros(len(splats), numbers, len(module.thermal.doubts()), dtype=torch.float64)
-            for k, weight in zip(order, weights[:, part], strict=True):
+            block = _Block(module, part) if most < count else whole
+            block.learn(frames, weights[:, part], repeated, spread)
+            for name in names:
+                deviations[name][part] = block.deviation(name, frame)
+        return deviations
 
-                def sends(splats: Any = splats, seen: Frame = views.frames[k]) -> Tensor:
-                    return module.thermal.features(splats, _query(seen))[:, 0]
-
-                with torch.enable_grad():
-                    now = sends()
-                    by = slopes(now, tensors)
-                weighed = (weight[:, None] * by)[:, :, None]
-                known.addcmul_(weighed, by[:, None, :])
-                pulled.addcmul_(weighed, wrong(sends, now.detach())[:, None, :])
-            known /= repeated
-            known.diagonal(dim1=1, dim2=2).add_(1 / (4 * spread).clamp(min=LEAST))
-            factor = torch.linalg.cholesky(known)
-            moved = -torch.cholesky_solve(pulled / repeated, factor) if pulled.shape[2] else pulled
-            for name in told:
-
-                def tells(splats: Any = splats, name: str = name) -> Tensor:
-                    return module.thermal.attributes(splats, _query(frame))[name]
-
-                with torch.enable_grad():
-                    values = tells()
-                    by = slopes(values, tensors)
-                variance = torch.linalg.solve_triangular(factor, by[..., None], upper=False).square().sum((1, 2))
-                off = wrong(tells, values.detach()) + (by[:, None] @ moved)[:, 0]
-                found[name][part] = (variance + off.square().sum(1)).sqrt().float()
-        return found
+    def _weighed_views(self) -> tuple[list[Frame], Tensor, float]:
+        """Frames of the training views in the order of time, the information [V, N] float32 that each has of a Gaussian's
+        temperature (one over its variance), and how many of them tell as much as one (``redundancy``)."""
+        views = self.module.scene.train
+        order = sorted(range(len(views)), key=lambda k: views.frames[k].time_s or 0.0)
+        # In float32, as the gradients that tell them: they are all that is kept of every view.
+        weights, residuals = (torch.zeros(len(order), len(self.module.splats)) for _ in range(2))
+        for i, view in enumerate(views.subset(order)):
+            weight, residuals[i] = _residual(self.module, view.to(self.module.device))
+            weights[i] = weight / (self.stretch * self.noise**2 + weight * self.evidence.misfit)
+        return [views.frames[k] for k in order], weights, redundancy(residuals, weights)
 
     @torch.no_grad()
     def attribute_deviations(self, frame: Frame) -> dict[str, Tensor]:
@@ -407,6 +359,82 @@ class Uncertainty:
     @cached_property
     def _sightings(self) -> list[Sighting]:
         return sightings(self.module.scene, self.module.depth)
+
+
+class _Block:
+    """n Gaussians of a module with the K numbers that each has for its heat, and how well views tell these.
+
+    Args:
+        module: the module.
+        part: which of its Gaussians; None: all.
+    """
+
+    def __init__(self, module: Any, part: slice | None = None) -> None:
+        self.module, self.splats = module, module.splats
+        if part is not None:  # of its own, for the gradient of a part would be as large as the whole
+            self.splats = type(self.splats)({name: self.splats[name].detach()[part] for name in self.splats.names})
+        names = [name for name in self.splats.names if name not in (*GEOMETRY, *module.constants)]
+        self.tensors = [self.splats[name] for name in names]
+        self.numbers = sum(tensor[0].numel() for tensor in self.tensors)
+
+    def spread(self) -> Tensor:
+        """Variances [K] of the numbers over the Gaussians, float64; 0 of one alone."""
+        rows = torch.cat([tensor.detach().reshape(len(tensor), -1) for tensor in self.tensors], dim=1).cpu().double()
+        return rows.var(0, correction=min(1, len(rows) - 1))
+
+    def learn(self, frames: Sequence[Frame], weights: Tensor, repeated: float, spread: Tensor) -> None:
+        """Takes what views tell of the numbers, before ``deviation`` is asked.
+
+        Args:
+            frames: of the V views.
+            weights: [V, n] information that each view has of a Gaussian's temperature.
+            repeated: how many views tell as much as one.
+            spread: [K] variances of the prior.
+        """
+        count = len(self.splats)
+        information = torch.zeros(count, self.numbers, self.numbers, dtype=torch.float64)
+        pull = torch.zeros(count, self.numbers, len(self.module.thermal.doubts()), dtype=torch.float64)
+        for frame, weight in zip(frames, weights, strict=True):
+            slopes, off = self._linearised(partial(self._sent, frame))
+            weighed = (weight[:, None] * slopes)[:, :, None]
+            information.addcmul_(weighed, slopes[:, None, :])
+            pull.addcmul_(weighed, off[:, None, :])
+        information /= repeated
+        information.diagonal(dim1=1, dim2=2).add_(1 / (4 * spread).clamp(min=LEAST))
+        self._factor = torch.linalg.cholesky(information)
+        self._moved = -torch.cholesky_solve(pull / repeated, self._factor) if pull.shape[2] else pull
+
+    def deviation(self, name: str, frame: Frame) -> Tensor:
+        """Standard deviations [n] float32 of an attribute at the time of a frame."""
+        slopes, off = self._linearised(partial(self._attribute, name, frame))
+        variance = torch.linalg.solve_triangular(self._factor, slopes[..., None], upper=False).square().sum((1, 2))
+        doubted = off + (slopes[:, None] @ self._moved)[:, 0]
+        return (variance + doubted.square().sum(1)).sqrt().float()
+
+    def _sent(self, frame: Frame) -> Tensor:
+        return self.module.thermal.features(self.splats, _query(frame))[:, 0]
+
+    def _attribute(self, name: str, frame: Frame) -> Tensor:
+        return self.module.thermal.attributes(self.splats, _query(frame))[name]
+
+    def _linearised(self, tell: Callable[[], Tensor]) -> tuple[Tensor, Tensor]:
+        """Derivatives [n, K] of the values [n] that the model tells by the numbers of each Gaussian, and by how much the values
+        are off where each of the model's doubts comes true, [n, D]."""
+        with torch.enable_grad():
+            values = tell()
+            slopes = self._slopes(values)
+        values, off = values.detach(), []
+        for doubt in self.module.thermal.doubts().values():
+            with torch.no_grad(), doubt():
+                off.append((tell() - values).cpu().double())
+        return slopes, torch.stack(off, dim=1) if off else torch.zeros(len(values), 0, dtype=torch.float64)
+
+    def _slopes(self, values: Tensor) -> Tensor:
+        if not values.requires_grad:
+            return torch.zeros(len(values), self.numbers, dtype=torch.float64)
+        gradients = torch.autograd.grad(values.sum(), self.tensors, allow_unused=True)
+        rows = (torch.zeros_like(t) if g is None else g for t, g in zip(self.tensors, gradients, strict=True))
+        return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
 
 def _only(rows: Tensor, stretch: int) -> Tensor:

@@ -27,6 +27,7 @@ def make_cloud(policy: Adaptive, scales: list[float], opacities: list[float]) ->
     )
     optimizer = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names])
     splats["opacity_logits"].grad = torch.zeros(count, 1)  # it is trained
+    policy.initial_count = count
     return Cloud(splats, optimizer, policy.initial_state(count, torch.device("cpu")))
 
 

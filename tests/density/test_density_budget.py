@@ -26,6 +26,7 @@ def make_cloud(policy, count: int, opacities: list[float] | None = None) -> Clou
             "opacity_logits": torch.logit(torch.tensor(opacities or [0.5] * count))[:, None],
         }
     )
+    policy.initial_count = count
     return Cloud(splats, None, policy.initial_state(count, torch.device("cpu")))
 
 
@@ -103,10 +104,10 @@ def test_a_start_of_few_gaussians_does_not_decide(least, expected):
     """One for two pixels of 20x10 at most."""
     policy = budget(multiple=3, least=least)
     policy.prepare(noisy_scene(0.02, 3), "thermal")
-    policy.initial_state(7, torch.device("cpu"))
-    assert policy.wanted == expected
-    policy.initial_state(60, torch.device("cpu"))
-    assert policy.wanted == 180
+    policy.initial_count = 7
+    assert policy.budget == expected
+    policy.initial_count = 60
+    assert policy.budget == 180
 
 
 def test_a_round_that_begins_anew_fills_up_to_the_same_b():

@@ -145,6 +145,15 @@ def test_late_pruning_takes_the_blamed_first_then_the_faintest_and_no_more_than_
     assert policy.refine(cloud, 219, 1.0, torch.Generator()) is None  # after the last
 
 
+def test_late_pruning_of_all_is_refused():
+    policy = control(late_share=1.0, late_stop=200)
+    cloud = wall(policy)
+    cloud.splats["opacity_logits"].data.fill_(-5.0)
+    cloud.splats["opacity_logits"].grad = torch.zeros(64, 1)
+    with pytest.raises(SceneError, match=r"would remove all 64 Gaussians.*Lower density.late_share"):
+        policy.refine(cloud, 119, 1.0, torch.Generator())
+
+
 def scene_of(count: int):
     image = torch.full((8, 8, 1), 0.5)
     view = SimpleNamespace(image=lambda modality: image, mask=None)

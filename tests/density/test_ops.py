@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from heatsplat.contracts import SceneError
 from heatsplat.density.ops import Cloud, LongAxisSplit
 from heatsplat.splats import Splats
 
@@ -32,6 +33,17 @@ def test_keep_takes_the_same_rows_everywhere():
         assert torch.equal(cloud.splats[name], before[name][mask])
         assert torch.equal(moments(cloud, name), before_moments[name][mask])
     assert torch.equal(cloud.state["seen"], torch.tensor([0.0, 2.0, 3.0]))
+
+
+def test_prune_tells_how_many_went_and_refuses_to_remove_all():
+    cloud = make_cloud()
+    assert cloud.prune(torch.tensor([True, False, True, True, False, True]), "none is left") == 2
+    assert len(cloud) == 4 and cloud.state["seen"].tolist() == [0.0, 2.0, 3.0, 5.0]
+    kept = cloud.splats["means"]
+    assert cloud.prune(torch.ones(4, dtype=torch.bool), "none is left") == 0 and cloud.splats["means"] is kept
+    with pytest.raises(SceneError, match="none is left"):
+        cloud.prune(torch.zeros(4, dtype=torch.bool), "none is left")
+    assert len(cloud) == 4
 
 
 def test_append_starts_moments_and_statistics_at_zero():

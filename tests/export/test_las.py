@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.export.formats.base import colours_of
 from heatsplat.export.formats.las import Las, _shown
 from heatsplat.export.place import place_of
 
@@ -25,7 +24,7 @@ def test_another_library_reads_what_was_written(cooling, tmp_path, compressed):
     assert np.array_equal(found["temperature"], cooling.values[shown])
     assert np.array_equal(found["time_constant"], cooling.seen.attributes["time constant"][shown], equal_nan=True)
     assert torch.allclose(torch.tensor(np.array(found["opacity"])), cooling.seen.opacities[shown])
-    colours = colours_of(cooling, "inferno", None)[shown.numpy()]
+    colours = Las().colours(cooling)[shown.numpy()]
     assert np.abs(found.red / 65535 - colours[:, 0]).max() < 1e-4
 
 

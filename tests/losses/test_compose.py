@@ -5,7 +5,7 @@ import torch
 
 from heatsplat.composition import build, compose
 from heatsplat.losses import schedules
-from heatsplat.losses.compose import During, Loss, LossInputs, Weighted
+from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted
 from heatsplat.losses.low_resolution import OnTargetGrid
 from heatsplat.losses.modality_balance import ByOthersShare
 from heatsplat.losses.photometric import Photometric
@@ -16,16 +16,26 @@ def at(step):
     return LossInputs(image, torch.zeros(2, 2, 1), None, view=None, splats=None, step=step, progress=step / 100)
 
 
-def mean(inputs):
-    return inputs.prediction.mean()
+class Mean(LossTerm):
+    def __call__(self, inputs):
+        return inputs.prediction.mean()
 
 
-def parts(inputs):
-    return {"a": inputs.prediction.mean(), "b": 2 * inputs.prediction.mean()}
+class Parts(LossTerm):
+    def __call__(self, inputs):
+        return {"a": inputs.prediction.mean(), "b": 2 * inputs.prediction.mean()}
+
+
+class Never(LossTerm):
+    def __call__(self, inputs):
+        pytest.fail("a term of weight zero was evaluated")
+
+
+mean = Mean()
 
 
 def test_names_join_term_and_part():
-    values = Loss({"plain": mean, "photometric": parts})(at(0))
+    values = Loss({"plain": mean, "photometric": Parts()})(at(0))
     assert {name: value.item() for name, value in values.items()} == {
         "plain": 3.0,
         "photometric/a": 3.0,
@@ -43,6 +53,9 @@ def test_steps_at_which_nothing_is_compared_are_refused():
     for stop in (0, 4):
         with pytest.raises(ValueError, match=f"counts at step {stop}; .* first from 0 to {stop}, second from 5 to inf"):
             Loss({"first": During(mean, stop=stop), "second": During(mean, start=5)})
+    with pytest.raises(ValueError, match="counts at step 4; .* first from 0 to 4, second from 5 to 9"):
+        within = During(Weighted(OnTargetGrid(During(ByOthersShare(During(mean, stop=9), 0), start=5)), 0.5), start=2)
+        Loss({"first": Weighted(During(mean, stop=4), 2.0), "second": within})
     with pytest.raises(ValueError, match=r"the loss has no term: give one of loss.terms \(plain\) that is not null"):
         Loss({"plain": None})
 
@@ -52,7 +65,8 @@ def test_it_is_known_whether_some_term_compares_the_images_of_a_companion():
     assert not Loss({"own": own}).compares("rgb")
     for term in (colour, Weighted(colour, 0.5), During(Weighted(OnTargetGrid(colour)), 5), ByOthersShare(colour, 1)):
         assert Loss({"own": own, "colour": term}).compares("rgb")
-    assert not Loss({"own": own, "colour": During(Weighted(colour, 0.0))}).compares("rgb")
+    for none in (Weighted(colour, 0.0), ByOthersShare(colour, 1, 0.0)):
+        assert not Loss({"own": own, "colour": During(none)}).compares("rgb")
 
 
 @pytest.mark.parametrize("method", ["3dgs_ir", "mftg", "msmg", "ommg", "ravigs", "thermonerf"])
@@ -67,11 +81,8 @@ def test_weight_and_schedule_multiply():
 
 
 def test_weight_zero_equals_absent():
-    def never(inputs):
-        pytest.fail("a term of weight zero was evaluated")
-
-    assert Loss({"off": Weighted(never, 0.0)})(at(0)) == {}
-    late = Weighted(never, 1.0, lambda progress: schedules.linear(progress, 0.5, 0.5))
+    assert Loss({"off": Weighted(Never(), 0.0)})(at(0)) == {}
+    late = Weighted(Never(), 1.0, lambda progress: schedules.linear(progress, 0.5, 0.5))
     assert Loss({"late": late})(at(49)) == {}
     assert list(Loss({"late": Weighted(mean, 1.0, late.schedule)})(at(50))) == ["late"]
 

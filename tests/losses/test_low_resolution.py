@@ -7,8 +7,9 @@ import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.geometry.resampling import resampled
-from heatsplat.losses.compose import Loss, LossInputs, Weighted
+from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted
 from heatsplat.losses.low_resolution import Curriculum, OnTargetGrid, fineness
+from heatsplat.losses.modality_balance import ByOthersShare
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.schedules import cosine, linear
 
@@ -75,7 +76,7 @@ def test_grids_that_do_not_fit_are_named():
     ):
         OnTargetGrid(Photometric())(inputs(noise(48, 60), noise(12, 16)))
     assert fineness(inputs(noise(36, 48), noise(12, 16))) == 3
-    with pytest.raises(ValueError, match="unknown resampling kernel 'nearest'"):
+    with pytest.raises(ValueError, match="kernel must be one of area, .*, got 'nearest'"):
         OnTargetGrid(Photometric(), "nearest")
 
 
@@ -116,7 +117,7 @@ def test_the_cosine_ramp_is_equation_11():
 
 
 def test_terms_that_ask_for_it_are_prepared_once_through_everything_around_them():
-    class Asking:
+    class Asking(LossTerm):
         def __init__(self):
             self.asked = []
 
@@ -127,7 +128,8 @@ def test_terms_that_ask_for_it_are_prepared_once_through_everything_around_them(
         def __call__(self, inputs):
             return inputs.prediction.mean()
 
-    term, idle = Asking(), Asking()
-    loss = Loss({"fine": Weighted(OnTargetGrid(term, "area"), 0.1), "off": Weighted(idle, 0.0), "plain": Photometric()})
+    term, shared, idle = Asking(), Asking(), Asking()
+    around = {"fine": Weighted(OnTargetGrid(term, "area"), 0.1), "shared": During(ByOthersShare(shared, 0), stop=9)}
+    loss = Loss(around | {"off": Weighted(idle, 0.0), "plain": Photometric()})
     assert loss.prepare("scene", "thermal") == {"teacher": "a kernel"}
-    assert term.asked == [("scene", "thermal")] and idle.asked == []
+    assert term.asked == shared.asked == [("scene", "thermal")] and idle.asked == []

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from heatsplat.geometry.spherical_harmonics import C0
-from heatsplat.losses.compose import Loss, LossInputs, Weighted
+from heatsplat.losses.compose import Loss, LossInputs, LossTerm, Weighted
 from heatsplat.losses.gradients import GradientConsistency, GuidedVariation, guided_variation, slopes
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.physical_prior import PhysicalPrior, kirchhoff_excess, outside
@@ -147,7 +147,7 @@ def test_without_both_attributes_there_is_no_prior():
 
 
 def test_weight_zero_is_absent():
-    class Forbidden:
+    class Forbidden(LossTerm):
         def __call__(self, given):
             raise AssertionError("a term of weight zero was evaluated")
 

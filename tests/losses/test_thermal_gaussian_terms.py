@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.losses.compose import During, Loss, LossInputs, Weighted
+from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted
 from heatsplat.losses.modality_balance import ByOthersShare
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.smoothness import Smoothness, neighbour_differences
@@ -85,7 +85,7 @@ def test_a_share_without_opacities_of_its_own_is_refused():
 
 
 def test_a_term_counts_during_its_steps_only():
-    class Never:
+    class Never(LossTerm):
         def __call__(self, inputs):
             raise AssertionError("evaluated")
 

@@ -5,6 +5,7 @@ import torch
 
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.edge_difference import EdgeDifference
+from heatsplat.losses.sobel import sobel_magnitude
 from heatsplat.thermal import heat_terms
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, TABLE, UNKNOWN, reference
 
@@ -41,16 +42,10 @@ def test_masked_pixels_neither_count_nor_pull():
     loss.backward()
     # What counts are the columns whose window holds no masked one: those of the crop without its first column.
     crop = EdgeDifference()(inputs(prediction.detach()[:, 3:], target[:, 3:], None))
-    first = (heat_edges(prediction.detach()[:, 3:]) - heat_edges(target[:, 3:])).abs()[:, 0].sum() / 8
+    first = (sobel_magnitude(prediction.detach()[:, 3:]) - sobel_magnitude(target[:, 3:])).abs()[:, 0].sum() / 8
     assert loss.item() == pytest.approx((crop.item() * 40 - first.item()) / 32, rel=1e-4)
     assert (prediction.grad[:, :3] == 0).all() and prediction.grad[:, 4:].abs().sum() > 0
     assert EdgeDifference()(inputs(prediction, spoilt, torch.zeros(8, 8, dtype=torch.bool))).item() == 0
-
-
-def heat_edges(image):
-    from heatsplat.losses.edge import sobel_magnitude
-
-    return sobel_magnitude(image)
 
 
 def test_a_body_that_follows_its_balance_costs_nothing():

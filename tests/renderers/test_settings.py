@@ -67,7 +67,7 @@ def test_values_are_seen_before_black_whatever_lies_behind_images():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"backend": "opengl"}, "renderer.backend 'opengl' is unknown"),
+        ({"backend": "opengl"}, "renderer.backend must be one of auto, .*, got 'opengl'"),
         ({"background": "black"}, "renderer.background must be 'ambient' or a number"),
         ({"eps2d": 0.0}, "renderer.eps2d must be above 0"),
     ],

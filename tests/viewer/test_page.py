@@ -158,17 +158,17 @@ def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trai
     place = 1
     frame = scene.train.frames[evenly_spread(len(scene.train), 36)[place]]
     start, end = min(scene.train.times_s), max(scene.train.times_s)
-    page.execute_script(f"viewer.probes = []; viewer.goTo({place}); viewer.frame(performance.now())")
+    page.execute_script(f"viewer.probes.list = []; viewer.goTo({place}); viewer.frame(performance.now())")
     height, width = frame.camera.height, frame.camera.width
     points = [(int(width * x), int(height * y)) for x in (0.15, 0.35, 0.5, 0.65, 0.85) for y in (0.4, 0.7)]
     click = """const [x, y] = arguments, v = viewer.view, c = document.getElementById('canvas'), box = c.getBoundingClientRect();
     const ratio = c.width / box.width, at = {clientX: box.left + (x * v.scale + v.left) / ratio,
       clientY: box.top + (y * v.scale + v.top) / ratio, pointerId: 1, button: 0, bubbles: true};
     c.setPointerCapture = () => {};
-    viewer.probes = [];
+    viewer.probes.list = [];
     c.dispatchEvent(new PointerEvent('pointerdown', at));
     c.dispatchEvent(new PointerEvent('pointerup', at));
-    const probe = viewer.probes[0];
+    const probe = viewer.probes.list[0];
     return probe && viewer.splats.seriesAt(probe.pixel, probe.layer, arguments[2]);"""
     cursor = """const [x, y] = arguments, v = viewer.view;
     const cx = Math.floor(x * v.scale + v.left), cy = Math.floor(y * v.scale + v.top);
@@ -199,10 +199,10 @@ def test_the_slider_changes_the_picture(page):
 
 def test_the_keyboard_alone_suffices(page):
     state = lambda: page.execute_script(  # noqa: E731
-        "return [viewer.camera.centre.join(), viewer.state.time, viewer.state.other, viewer.state.map, viewer.probes.length,"
+        "return [viewer.camera.centre.join(), viewer.state.time, viewer.state.other, viewer.state.map, viewer.probes.list.length,"
         " document.documentElement.dataset.theme, viewer.state.playing, viewer.lastCamera, viewer.state.walk]"
     )
-    page.execute_script("document.getElementById('canvas').focus(); viewer.probes = []")
+    page.execute_script("document.getElementById('canvas').focus(); viewer.probes.list = []")
     seen = [state()]
     steps = [
         ("\ue012", 0), ("w", 0), (".", 1), ("b", 2), ("c", 3), ("\ue007", 4), ("t", 5), ("n", 7), ("o", 8),
@@ -283,11 +283,11 @@ def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
 
 
 def test_curves_and_the_picture_can_be_kept(page):
-    page.execute_script("viewer.probes = []; viewer.goTo(0); viewer.pin(...viewer.middle())")
-    head, *rows = page.execute_script("return viewer.curves()").strip().split("\n")
+    page.execute_script("viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle())")
+    head, *rows = page.execute_script("return viewer.probes.table()").strip().split("\n")
     assert head.startswith("time (s),probe ") and head.endswith("truth (°C)")
     told = np.array([[float(cell) for cell in row.split(",")] for row in rows])
-    series = "const p = viewer.probes[0]; return [viewer.chartTimes, p.model, p.truth]"
+    series = "const p = viewer.probes.list[0]; return [viewer.probes.times, p.model, p.truth]"
     assert np.abs(told.T - np.array(page.execute_script(series))).max() < 6e-4
     kept = page.execute_script("""viewer.frame(performance.now());
       const kept = viewer.picturePage(), shown = document.getElementById('canvas');
@@ -343,9 +343,9 @@ def test_ends_of_colours_that_make_no_sense_are_refused_and_those_that_hold_show
 
 def test_what_turns_about_a_point_pins_no_probe(page):
     """Double clicks, and two fingers at once."""
-    names = "return viewer.probes.map((one) => one.name)"
+    names = "return viewer.probes.list.map((one) => one.name)"
     before = page.execute_script(
-        f"viewer.probes = []; for (let i = 0; i < 8; i++) viewer.pin(...viewer.middle()); {names}"
+        f"viewer.probes.list = []; for (let i = 0; i < 8; i++) viewer.probes.pin(...viewer.middle()); {names}"
     )
     target = page.execute_script("return viewer.target")
     canvas = page.find_element("id", "canvas")
@@ -358,7 +358,7 @@ def test_what_turns_about_a_point_pins_no_probe(page):
         held = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
         page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": held})
 
-    page.execute_script("viewer.probes = []")
+    page.execute_script("viewer.probes.list = []")
     touch("touchStart", (200, 250))
     touch("touchStart", (200, 250), (320, 300))
     touch("touchEnd", (200, 250))
@@ -429,7 +429,7 @@ def test_a_second_run_is_itself_whatever_its_clock(page, folder, tmp_path):
     assert "clock" not in page.execute_script("return $('other').selectedOptions[0].text")
     old, none, disagreeing = page.execute_script("""const {cameras, moments} = viewer.run.told;
       const apart = moments.map(([name, time], i) => [name, time + i]);
-      return [{cameras}, {cameras: []}, {cameras: [], moments: apart}].map((told) => viewer.laterIn(told));""")
+      return [{cameras}, {cameras: []}, {cameras: [], moments: apart}].map((told) => laterIn(viewer.told, told));""")
     assert old == pytest.approx(431.0) and none is None and disagreeing is None  # older pages have cameras alone
     page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
     values = np.array(page.execute_script("return viewer.sampled()"))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneError
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.contracts import Camera, RenderOutput
+from heatsplat.density.base import DensityChange, DensityControl, ndc_gradient_norms
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 
@@ -33,14 +31,14 @@ class Adaptive(DensityControl):
             shortly before that they would not come back. None: no resets.
         reset_opacity: opacities are lowered to at most this, as rendered.
         cap_max: never more Gaussians than this, infinity for no limit; the strongest gradients grow first.
-        multiple: nor more than so many times the Gaussians of the start; None: ``cap_max`` alone.
+        multiple: nor more than so many times ``initial_count``; None: ``cap_max`` alone.
         absgrad: uses absolute per-pixel gradients (AbsGS); wants a threshold about four times larger.
 
     Raises:
         ValueError: an option is out of its range.
     """
 
-    moments, intervals = ("start", "stop"), ("every", "reset_every")
+    milestones, intervals = ("start", "stop"), ("every", "reset_every")
 
     def __init__(
         self,
@@ -75,24 +73,20 @@ class Adaptive(DensityControl):
         self.prune_opacity, self.prune_scale = prune_opacity, prune_scale
         self.reset_every, self.reset_opacity = reset_every, reset_opacity
         self.cap_max, self.absgrad = cap_max, absgrad
-        self.multiple, self.wanted = multiple, math.inf
+        self.multiple = multiple
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """ "gradient" [N], the sum of gradient norms, and "seen" [N], the number of views that saw the Gaussian."""
-        if self.multiple is not None:
-            self.wanted = round(self.multiple * count)
         return {"gradient": torch.zeros(count, device=device), "seen": torch.zeros(count, device=device)}
 
     @torch.no_grad()
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         if step >= self.stop:
             return
-        means2d, ids = output.meta["means2d"], output.meta["visible_ids"]
-        pull = means2d.absgrad if self.absgrad else means2d.grad
+        pull, ids = ndc_gradient_norms(output, camera, self.absgrad), output.meta["visible_ids"]
         if pull is None:
             return
-        pull = pull[ids] * pull.new_tensor([camera.width / 2, camera.height / 2])
-        state["gradient"].index_add_(0, ids, pull.norm(dim=1).to(state["gradient"]))
+        state["gradient"].index_add_(0, ids, pull.to(state["gradient"]))
         state["seen"].index_add_(0, ids, torch.ones_like(ids, dtype=state["seen"].dtype))
 
     @torch.no_grad()
@@ -131,7 +125,8 @@ class Adaptive(DensityControl):
 
     def _room(self, cloud: Cloud) -> int:
         """How many Gaussians may still come."""
-        return max(0, min(self.wanted, self.cap_max) - len(cloud))
+        most = self.cap_max if self.multiple is None else min(round(self.multiple * self.initial_count), self.cap_max)
+        return max(0, most - len(cloud))
 
     def _multiply(self, cloud: Cloud, pull: Tensor, grow: Tensor, large: Tensor, generator: torch.Generator) -> int:
         """Duplicates those of ``grow`` that are not ``large`` and splits the others; under the cap, strongest pull first."""
@@ -166,12 +161,8 @@ class Adaptive(DensityControl):
         if self._last_reset(step - 1) > 0:
             keep &= cloud.splats.scales.amax(dim=1) <= self.prune_scale * extent
         keep &= torch.isfinite(cloud.splats.means).all(dim=1)
-        removed = int((~keep).sum())
-        if removed == len(cloud):
-            raise SceneError(
-                f"density control would prune all {removed} Gaussians at step {step}: each has an opacity below "
-                f"{self.prune_opacity}. Lower the learning rates or density.prune_opacity, or start from more points."
-            )
-        if removed:
-            cloud.keep(keep)
-        return removed
+        return cloud.prune(
+            keep,
+            f"density control would prune all {len(cloud)} Gaussians at step {step}: each has an opacity below "
+            f"{self.prune_opacity}. Lower the learning rates or density.prune_opacity, or start from more points.",
+        )

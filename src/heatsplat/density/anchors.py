@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.density.base import DensityChange, DensityControl, ndc_gradient_norms
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.voxels import among, cells, middles, spacing
 from heatsplat.splats import ANCHORS
@@ -41,7 +41,7 @@ class Anchors(DensityControl):
     """
 
     rows = frozenset({ANCHORS})
-    moments, intervals = ("start", "grow_from", "stop"), ("every",)
+    milestones, intervals = ("start", "grow_from", "stop"), ("every",)
 
     def __init__(
         self,
@@ -96,10 +96,10 @@ class Anchors(DensityControl):
         in_view = output.meta["rows_in_view"]
         state["views"] += in_view
         state["opacity"] += in_view * output.meta["opacities"][0].view(count, -1).sum(1)
-        if means2d.grad is None:
+        pull = ndc_gradient_norms(output, camera)
+        if pull is None:
             return
-        pull = means2d.grad[ids] * means2d.new_tensor([camera.width / 2, camera.height / 2])
-        state["gradient"].view(-1).index_add_(0, ids, pull.norm(dim=1).to(state["gradient"]))
+        state["gradient"].view(-1).index_add_(0, ids, pull.to(state["gradient"]))
         state["shown"].view(-1).index_add_(0, ids, torch.ones_like(ids, dtype=state["shown"].dtype))
 
     @torch.no_grad()
@@ -116,14 +116,11 @@ class Anchors(DensityControl):
         gone = known & (state["opacity"] < self.prune_opacity * state["views"])
         for name in ("opacity", "views"):
             state[name][known] = 0
-        removed = int(gone.sum())
-        if removed == len(cloud):
-            raise SceneError(
-                f"density control would prune all {removed} anchors at step {step}: the opacities of the Gaussians of each "
-                f"sum up to less than {self.prune_opacity}. Lower the learning rates or density.prune_opacity."
-            )
-        if removed:
-            cloud.keep(~gone)
+        removed = cloud.prune(
+            ~gone,
+            f"density control would prune all {len(cloud)} anchors at step {step}: the opacities of the Gaussians of each "
+            f"sum up to less than {self.prune_opacity}. Lower the learning rates or density.prune_opacity.",
+        )
         return DensityChange(added, removed)
 
     def _grow(self, cloud: Cloud, pull: Tensor, generator: torch.Generator) -> None:

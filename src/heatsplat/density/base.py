@@ -33,17 +33,19 @@ class DensityControl:
         absgrad: whether ``observe`` wants absolute per-pixel gradients.
         rows: what rows of the splats may be that it counts on (``heatsplat.splats``).
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
-        moments, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
+        milestones, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
         shortest: what an interval has at least.
+        initial_count: Gaussians at the start of the run, as the run tells it.
         opacities_until: step from which on a stage holds opacities still until the run ends, as the run tells it; infinity: none.
     """
 
     absgrad: bool = False
     rows: frozenset[str] = frozenset({GAUSSIANS})
     cap_max: float | None = None
-    moments: tuple[str, ...] = ()
+    milestones: tuple[str, ...] = ()
     intervals: tuple[str, ...] = ()
     shortest: int = 1
+    initial_count: int = 0
     opacities_until: float = math.inf
     _times: dict[str, Any] = {}  # of those attributes, not rounded, once they were moved
 
@@ -88,16 +90,16 @@ class DensityControl:
     def retime(self, step: int, factor: float) -> None:
         """Moves the rest of its plan: what was to come n steps after ``step`` comes ``factor`` times n after it."""
 
-        def moved(moment: Any) -> Any:
-            if moment is None:
+        def moved(milestone: Any) -> Any:
+            if milestone is None:
                 return None
-            if isinstance(moment, list | tuple):
-                return [moved(one) for one in moment]
-            return moment if moment <= step else step + factor * (moment - step)
+            if isinstance(milestone, list | tuple):
+                return [moved(one) for one in milestone]
+            return milestone if milestone <= step else step + factor * (milestone - step)
 
-        now = {name: self._times.get(name, getattr(self, name)) for name in (*self.moments, *self.intervals)}
+        now = {name: self._times.get(name, getattr(self, name)) for name in (*self.milestones, *self.intervals)}
         known = {name: now[name] for name in self.intervals if now[name] is not None}
-        times = {name: moved(now[name]) for name in self.moments}
+        times = {name: moved(now[name]) for name in self.milestones}
         self.load_times(times | {name: factor * interval for name, interval in known.items()})
 
     def times(self) -> dict[str, Any]:
@@ -114,6 +116,24 @@ class DensityControl:
     def settled(self, step: int) -> bool:
         """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of opacities."""
         return True
+
+
+def ndc_gradient_norms(output: RenderOutput, camera: Camera, absolute: bool = False) -> Tensor | None:
+    """Norms [n] of the gradients of the visible Gaussians' screen positions; None where none came back.
+
+    **Convention:** per unit of normalised device coordinates, two units per image side; in the order of "visible_ids".
+
+    Args:
+        output: a rendered view after the backward pass.
+        camera: that of the view.
+        absolute: of the absolute gradients of single pixels, summed (AbsGS).
+    """
+    means2d = output.meta["means2d"]
+    gradients = means2d.absgrad if absolute else means2d.grad
+    if gradients is None:
+        return None
+    half_size = gradients.new_tensor([camera.width / 2, camera.height / 2])
+    return (gradients[output.meta["visible_ids"]] * half_size).norm(dim=1)
 
 
 def _rounded(value: Any, least: int) -> Any:

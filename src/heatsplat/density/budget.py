@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -11,8 +10,8 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_laplace
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError, check_option
-from heatsplat.density.base import DensityChange, DensityControl
+from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
+from heatsplat.density.base import DensityChange, DensityControl, ndc_gradient_norms
 from heatsplat.density.ops import Cloud, LongAxisSplit
 from heatsplat.physics.noise import MIN_NOISE, noise_of_views
 
@@ -74,7 +73,7 @@ class Budget(DensityControl):
         ValueError: an option is out of its range.
     """
 
-    moments, intervals = ("start", "stop", "remove_at"), ("every",)
+    milestones, intervals = ("start", "stop", "remove_at"), ("every",)
 
     def __init__(
         self,
@@ -114,7 +113,7 @@ class Budget(DensityControl):
                 f"got {start}, {stop}, {prune_opacity} and {list(remove_at)}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
-        self.multiple, self.least, self.wanted = multiple, least, math.inf
+        self.multiple, self.least = multiple, least
         self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
         self.absgrad = score == "absgrad"
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
@@ -139,9 +138,14 @@ class Budget(DensityControl):
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
         "shown" (pixels) and "seen" (views) for removal."""
-        if self.multiple is not None:
-            self.wanted = max(round(self.multiple * count), self.least)
         return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
+
+    @property
+    def budget(self) -> float:
+        """B, the number of Gaussians after the last event."""
+        if self.multiple is None:
+            return self.cap_max
+        return min(max(round(self.multiple * self.initial_count), self.least), self.cap_max)
 
     # When ------------------------------------------------------------------------------------------------------------
 
@@ -185,10 +189,7 @@ class Budget(DensityControl):
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         ids = output.meta["visible_ids"]
         if self._scores(step) and self.absgrad:
-            size = state["score"].new_tensor([camera.width / 2, camera.height / 2])
-            state["score"].index_add_(
-                0, ids, (output.meta["means2d"].absgrad[ids] * size).norm(dim=1).to(state["score"])
-            )
+            state["score"].index_add_(0, ids, ndc_gradient_norms(output, camera, absolute=True).to(state["score"]))
         if output.weighted is None or output.weighted.sums is None:
             return
         sums = output.weighted.sums.to(state["score"])
@@ -207,9 +208,9 @@ class Budget(DensityControl):
         removed = added = 0
         growth, removal = self._growth_in(step) == 0, self._removal_in(step) == 0
         if removal:
-            removed += self._keep(cloud, self._worth(cloud), step)
+            removed += self._prune(cloud, self._worth(cloud), step)
         if growth:
-            removed += self._keep(cloud, self._visible(cloud), step)
+            removed += self._prune(cloud, self._visible(cloud), step)
             added = self._grow(cloud, step, generator)
         for due, names in ((growth, ("score", "wrong", "weight")), (removal, ("shown", "seen"))):
             for name in names if due else ():
@@ -226,24 +227,20 @@ class Budget(DensityControl):
         elsewhere = (cloud.splats.opacities[1:] > self.prune_opacity).any(dim=0)
         return ~_outside(cloud.state["shown"], 1 - self.keep) & seen | elsewhere
 
-    def _keep(self, cloud: Cloud, mask: Tensor, step: int) -> int:
-        removed = int((~mask).sum())
-        if removed == len(cloud):
-            raise SceneError(
-                f"density control would remove all {removed} Gaussians at step {step}: none is more opaque than "
-                f"{self.prune_opacity} and shown by the training views. Lower the learning rates or density.prune_opacity, "
-                "or start from more points."
-            )
-        if removed:
-            cloud.keep(mask)
-        return removed
+    def _prune(self, cloud: Cloud, mask: Tensor, step: int) -> int:
+        return cloud.prune(
+            mask,
+            f"density control would remove all {len(cloud)} Gaussians at step {step}: none is more opaque than "
+            f"{self.prune_opacity} and shown by the training views. Lower the learning rates or density.prune_opacity, "
+            "or start from more points.",
+        )
 
     def _grow(self, cloud: Cloud, step: int, generator: torch.Generator) -> int:
         state = cloud.state
         score = torch.ones_like(state["score"]) if self.score == "uniform" else state["score"].clone()
         if self.score == "error":
             score[state["wrong"] <= self.least_pixels + BY_CHANCE * state["weight"]] = 0
-        wanted = round(self._share(step) * max(min(self.wanted, self.cap_max) - len(cloud), 0))
+        wanted = round(self._share(step) * max(self.budget - len(cloud), 0))
         chosen = _drawn(score, wanted, generator)
         cloud.split(chosen, self.split)
         return len(chosen)

@@ -48,7 +48,7 @@ class MCMC(DensityControl):
     Source: Kheradmand et al. 2024, 3D Gaussian Splatting as Markov Chain Monte Carlo, Eq. 8-10.
     """
 
-    moments, intervals = ("start", "stop"), ("every",)
+    milestones, intervals = ("start", "stop"), ("every",)
 
     def __init__(
         self,

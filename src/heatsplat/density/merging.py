@@ -15,12 +15,12 @@ from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneError, evenly_spread
 from heatsplat.density.base import Merging
-from heatsplat.density.moments import Merged, Shapes, merged
+from heatsplat.density.moment_matching import Merged, Shapes, merged
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.neighbours import neighbour_pairs
 from heatsplat.splats import GEOMETRY, Splats
 
-log = logging.getLogger("heatsplat")
+log = logging.getLogger(__name__)
 
 UNSEEN = 0.05  # weight of a Gaussian that no view shows, in medians of those that are seen
 FEWEST = 0.005  # share of the Gaussians below which a round is not worth its renders
@@ -157,7 +157,7 @@ class _Search:
         frames = module.scene.train.frames
         self.frames = [frames[i] for i in evenly_spread(len(frames), options.views or len(frames))]
         in_time = sorted(self.frames, key=lambda frame: (frame.time_s or 0.0, frame.frame_id))
-        self.moments = [in_time[i] for i in evenly_spread(len(in_time), options.times)]
+        self.sampled_frames = [in_time[i] for i in evenly_spread(len(in_time), options.times)]
         splats = copy.deepcopy(module.splats)
         count = len(splats)
         places = torch.arange(1, count + 1, device=splats.means.device)
@@ -243,7 +243,7 @@ class _Search:
         """Pairs [n, 2] of Gaussians that agree, each in one pair, the cheapest of all; with them what each becomes."""
         splats, module = self.cloud.splats, self.module
         shapes, pairs = Shapes.of(splats), self._neighbours()
-        told = torch.stack([module.emissions(splats, frame) for frame in self.moments])  # [F, N, C]
+        told = torch.stack([module.emissions(splats, frame) for frame in self.sampled_frames])  # [F, N, C]
         limits = self._limits(told)
         prices = torch.cat([self._prices(part, shapes, told, limits) for part in pairs.split(PAIRS)])
         chosen = pairs[_mutual(pairs, prices, len(splats))[: math.ceil(self.options.share * len(splats))]]
@@ -301,7 +301,7 @@ class _Search:
         splats = Splats(rows)
         worst = limits.new_zeros(len(pairs))
         shown = self.cloud.splats.opacities.double().amax(0)
-        for at, frame in zip(told, self.moments, strict=True):
+        for at, frame in zip(told, self.sampled_frames, strict=True):
             here = self.module.emissions(splats, frame).double()
             for place in pairs.unbind(1):
                 worst = worst.maximum(((here - at[place]).abs() / limits).amax(1) * shown[place])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError
 from heatsplat.density.adaptive import Adaptive
-from heatsplat.density.base import DensityChange
+from heatsplat.density.base import DensityChange, ndc_gradient_norms
 from heatsplat.density.ops import Cloud
 from heatsplat.physics.noise import noise_of_views
 
@@ -54,7 +54,7 @@ class MultiviewGate(Adaptive):
     Source: FastGS (CVPR 2026), multi-view consistent densification and pruning.
     """
 
-    moments, intervals = (*Adaptive.moments, "late_stop"), (*Adaptive.intervals, "late_every")
+    milestones, intervals = (*Adaptive.milestones, "late_stop"), (*Adaptive.intervals, "late_every")
 
     def __init__(
         self,
@@ -153,11 +153,10 @@ class MultiviewGate(Adaptive):
 
     @torch.no_grad()
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
-        means2d, ids = output.meta["means2d"], output.meta["visible_ids"]
-        if self._grows(step) and means2d.grad is not None:
-            per_ndc = means2d.new_tensor([camera.width / 2, camera.height / 2])
-            for name, pull in (("gradient", means2d.grad), ("absolute", means2d.absgrad)):
-                state[name].index_add_(0, ids, (pull[ids] * per_ndc).norm(dim=1).to(state[name]))
+        ids = output.meta["visible_ids"]
+        if self._grows(step) and output.meta["means2d"].grad is not None:
+            for name, absolute in (("gradient", False), ("absolute", True)):
+                state[name].index_add_(0, ids, ndc_gradient_norms(output, camera, absolute).to(state[name]))
             state["seen"].index_add_(0, ids, torch.ones_like(ids, dtype=state["seen"].dtype))
         if output.weighted is not None:
             wrong = output.weighted.sums[:, 0].to(state["wrong"])
@@ -207,6 +206,8 @@ class MultiviewGate(Adaptive):
         gone = order[(faint | blamed)[order]][: int(self.late_share * len(cloud))]
         keep = torch.ones_like(faint)
         keep[gone] = False
-        if len(gone):
-            cloud.keep(keep)
-        return len(gone)
+        return cloud.prune(
+            keep,
+            f"late pruning would remove all {len(cloud)} Gaussians: each has an opacity up to {self.late_opacity} or a blame "
+            f"above {self.late_blame}. Lower density.late_share.",
+        )

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from heatsplat.contracts import SceneError
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
@@ -108,6 +109,19 @@ class Cloud:
             self._replace(name, lambda tensor, rows=rows: tensor[rows], lambda moment, rows=rows: moment[rows])
         for name, tensor in self.state.items():
             self.state[name] = tensor[ids]
+
+    def prune(self, mask: Tensor, refusal: str) -> int:
+        """How many Gaussians were removed: those where ``mask`` [N] bool is False (``keep``).
+
+        Raises:
+            SceneError: none would be left; with the message ``refusal``.
+        """
+        removed = int((~mask).sum())
+        if removed == len(self):
+            raise SceneError(refusal)
+        if removed:
+            self.keep(mask)
+        return removed
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Adds Gaussians: name -> [n, ...] for every tensor of the splats. Their moments and statistics start at zero.

@@ -48,7 +48,7 @@ class Proximity(Adaptive):
         ValueError: an option is out of its range.
     """
 
-    moments, intervals = (*Adaptive.moments, "insert_stop"), (*Adaptive.intervals, "insert_every")
+    milestones, intervals = (*Adaptive.milestones, "insert_stop"), (*Adaptive.intervals, "insert_every")
 
     def __init__(
         self,

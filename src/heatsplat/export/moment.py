@@ -9,8 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, check_option
+from heatsplat.contracts import Frame, SceneData, SceneError, check_option
 from heatsplat.export.snapshot import Layer, Snapshot
+from heatsplat.geometry.coverage import OPEN, surface_depth
+from heatsplat.geometry.looks import Look
 from heatsplat.shots import checked_times
 
 LAYERS = ("auto", "camera", "surface", "truth")
@@ -49,6 +51,18 @@ class Moment:
         share = place - below
         found = self.seen.table[below] * (1 - share) + self.seen.table[below + 1] * share
         return found.where(blended.isfinite(), torch.nan)
+
+    @torch.no_grad()
+    def look(self, frame: Frame) -> Look:
+        """The values as the camera of a frame sees them; NaN where it sees no surface."""
+        seen = self.seen
+        output = self.module.renderer(
+            seen.means, seen.quats, seen.scales, seen.opacities[None], self.blended[:, None], frame.camera, None, (1,),
+            depth=True,
+        )  # fmt: skip
+        alpha = output.alpha[0]
+        means = (output.features[..., 0] / alpha).where(alpha >= OPEN, torch.nan)
+        return Look(frame.camera, surface_depth(output.depth, alpha), self.of_blended(means))
 
 
 def moments_in(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -109,112 +110,245 @@ def snapshot(module: Any) -> Snapshot:
             f"what {type(module.thermal).__name__} learned cannot be exported as Gaussians: {module.thermal.stays_here}. Render "
             "images of it (src/render.py), or train a method whose Gaussians stay as they are, such as method=3dgs"
         )
-    scene: SceneData = module.scene
-    span = span_of(scene)
-    middle = None if span is None else 0.5 * (min(scene.train.times_s) + max(scene.train.times_s))
-    first = scene.train.frames[0]
-    own_id = first_free_id(scene)
+    visible, thermal_range = _Visible(module), module.scene.thermal_range
+    left_out = [*visible.said_of_views, *visible.said_of_motion()]
+    layers = visible.layers()
+    background = module.background[0].item()
+    table_ends = _ends(layers, background)
+    colours, colour_opacities = visible.colours()
+    start_s, end_s = visible.span or (None, None)
+    return Snapshot(
+        means=visible.means.float().cpu(),
+        quats=torch.nn.functional.normalize(visible.quats.float(), dim=1).cpu(),
+        scales=visible.scales.float().cpu(),
+        opacities=visible.opacities[0].float().cpu(),
+        layers=layers,
+        background=background,
+        table=visible.table(table_ends),
+        table_ends=table_ends,
+        unit=visible.unit,
+        limits=(thermal_range.min_c, thermal_range.max_c) if visible.unit else (0.0, 1.0),
+        colours=colours,
+        colour_opacities=colour_opacities,
+        attributes=visible.attributes(),
+        left_out=left_out,
+        start_s=start_s,
+        end_s=end_s,
+    )
 
-    def seen_at(frame: Frame, time_s: float | None) -> Frame:
-        frame = replace(frame, frame_id=own_id)
-        return frame if time_s is None else at_time(scene, frame, time_s)
 
-    means, quats, scales, opacities = module.shapes(seen_at(first, middle))
-    kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
-    if not len(kept):
-        raise SceneError(
-            f"none of the {len(means)} Gaussians of scene '{scene.name}' can be seen (opacities are below {ALPHA_MIN:.2g}): "
-            "train it again, or take an earlier checkpoint"
-        )
-    channels = module.thermal.modality_channels[0]
+@dataclass(frozen=True)
+class _Effort:
+    """How far a basis of time may go: samples over time and curves at most, and the times at which quantities may bend."""
 
-    def emitted(frame: Frame, ids: Tensor | None = None) -> Tensor:
-        return module.emissions(module.splats, frame, kept if ids is None else kept[ids])
+    times: int
+    curves: int
+    bends: Sequence[float]
 
-    def blended(values: Tensor) -> Tensor:
-        """Blended values [N] of image values [N, C]."""
-        return module.composite.encode(values, channels)[:, :channels].mean(1).nan_to_num()
 
-    cameras = [scene.train.frames[i] for i in evenly_spread(len(scene.train), VIEWS)]
-    looks = torch.stack([emitted(seen_at(frame, middle)) for frame in cameras])
-    to_unit, unit = _scale(scene, module.modality)
-    spread = (looks[..., :channels] - looks[..., :channels].mean(0)).mean(-1) * to_unit
-    tolerance = TOLERANCE_C if unit else TOLERANCE_UNIT
-    left_out = []
-    if spread.abs().max() > tolerance / 5:
-        mean, worst = looks.mean(0), 0.0
-        for i in evenly_spread(len(scene.train), JUDGED):
-            off = (emitted(seen_at(scene.train.frames[i], middle)) - mean)[:, :channels].mean(1) * to_unit
+class _Visible:
+    """The Gaussians of a module that can be seen, as rendered in the middle of the record, and what they send over time.
+
+    Quantities over time (``camera``, ``surface``, ``truth``, ``without``) are blended values [n] of all of them, or of those
+    with some numbers among them.
+
+    Attributes:
+        span: of time that is covered; None where nothing changes.
+        kept: their numbers among all of the module.
+        means, quats, scales, opacities [M, N]: of them.
+        unit: of the scene, and ``to_unit`` what an image value of 1 is in it.
+        slope: largest change of the image, in that unit, for one of a blended value.
+        tolerance: what a basis of time may cost, in that unit.
+        cameras: training cameras over which what they send is averaged; one where it does not depend on the camera.
+        look: [N, C] image values, mean over several cameras.
+        said_of_views: what a snapshot leaves out of that, in sentences.
+    """
+
+    def __init__(self, module: Any) -> None:
+        self.module, self.scene = module, module.scene
+        train = self.scene.train
+        self.span = span_of(self.scene)
+        self.middle = None if self.span is None else 0.5 * (min(train.times_s) + max(train.times_s))
+        self._free_id = first_free_id(self.scene)
+        self.frame = self._at(train.frames[0], self.middle)
+        means, quats, scales, opacities = module.shapes(self.frame)
+        self.kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
+        if not len(self.kept):
+            raise SceneError(
+                f"none of the {len(means)} Gaussians of scene '{self.scene.name}' can be seen (opacities are below "
+                f"{ALPHA_MIN:.2g}): train it again, or take an earlier checkpoint"
+            )
+        self.means, self.quats, self.scales = means[self.kept], quats[self.kept], scales[self.kept]
+        self.opacities = opacities[:, self.kept]
+        self._points = self.means.cpu()
+        self.channels = module.thermal.modality_channels[0]
+        self.to_unit, self.unit = _scale(self.scene, module.modality)
+        self.slope = self._slope()
+        self.tolerance = TOLERANCE_C if self.unit else TOLERANCE_UNIT
+        self.cameras, self.look, self.said_of_views = self._views()
+
+    def _at(self, frame: Frame, time_s: float | None) -> Frame:
+        """What the camera of a frame would see at a moment, as a frame that is none of the scene's."""
+        frame = replace(frame, frame_id=self._free_id)
+        return frame if time_s is None else at_time(self.scene, frame, time_s)
+
+    def _emitted(self, frame: Frame, time_s: float | None, ids: Tensor | None = None) -> Tensor:
+        """Image values [n, C] that are sent to the camera of a frame at a moment."""
+        wanted = self.kept if ids is None else self.kept[ids]
+        return self.module.emissions(self.module.splats, self._at(frame, time_s), wanted)
+
+    def _blended(self, values: Tensor) -> Tensor:
+        """Blended values [n] of image values [n, C]."""
+        return self.module.composite.encode(values, self.channels)[:, : self.channels].mean(1).nan_to_num()
+
+    def _slope(self) -> float:
+        values = torch.linspace(0, 1, TABLE, dtype=torch.float64)
+        steps = self._blended(values[:, None].expand(-1, self.channels)).diff()
+        return self.to_unit / (TABLE - 1) / steps.min().item()
+
+    def _views(self) -> tuple[list[Frame], Tensor, list[str]]:
+        """``cameras``, ``look`` and ``said_of_views``."""
+        train = self.scene.train
+        cameras = [train.frames[i] for i in evenly_spread(len(train), VIEWS)]
+        looks = torch.stack([self._emitted(frame, self.middle) for frame in cameras])
+        mean = looks.mean(0)
+        spread = (looks[..., : self.channels] - mean[:, : self.channels]).mean(-1) * self.to_unit
+        if not spread.abs().max() > self.tolerance / 5:
+            return cameras[:1], mean, []
+        worst = 0.0
+        for i in evenly_spread(len(train), JUDGED):
+            off = (self._emitted(train.frames[i], self.middle) - mean)[:, : self.channels].mean(1) * self.to_unit
             worst = max(worst, float(off.abs().max()))
-        left_out.append(
+        said = (
             f"What a Gaussian sends depends on the view: baked, whichever way it is looked at, is the mean of what it sends to "
             f"{len(cameras)} training cameras ({', '.join(frame.name for frame in cameras)}). Single ones differ from it by "
-            f"{spread.square().mean().sqrt():.2g} {unit} (root mean square), any training camera by {worst:.2g} {unit} at worst; "
-            "from where none looked it may be more. src/render.py shows what each direction gets."
+            f"{spread.square().mean().sqrt():.2g} {self.unit} (root mean square), any training camera by {worst:.2g} {self.unit} "
+            "at worst; from where none looked it may be more. src/render.py shows what each direction gets."
         )
-    else:
-        cameras = cameras[:1]
-    moved = _displacement(module, seen_at, first, span, kept)
-    if moved > 0:
-        left_out.append(
+        return cameras, mean, [said]
+
+    def said_of_motion(self) -> list[str]:
+        """What a snapshot leaves out of the motion of Gaussians, in sentences."""
+        if self.span is None:
+            return []
+        first = self.scene.train.frames[0]
+        start, end = (self.module.shapes(self._at(first, time_s))[0][self.kept] for time_s in self.span)
+        moved = float((end - start).norm(dim=1).max()) / self.scene.extent
+        if not moved > 0:
+            return []
+        return [
             f"The model moves its Gaussians over time, by up to {moved:.2g} of the scene's extent: shown are their places in "
             "the middle of the record."
-        )
+        ]
 
-    def camera(time_s: float | None, ids: Tensor | None = None) -> Tensor:
-        return blended(torch.stack([emitted(seen_at(frame, time_s), ids) for frame in cameras]).mean(0))
+    # Quantities over time ------------------------------------------------------------------------------------------------
 
-    slope = _slope(blended, to_unit, channels)
-    surface = _surface(module, blended, kept) if span is not None else None
-    clipped = surface is not None and _alike(_inside(surface), camera, span, tolerance / slope)
-    sent = surface if clipped else camera
-    record = () if scene.weather is None else tuple(scene.weather.times_s.tolist())
-    bends = record if "weather" in module.thermal.needs else ()
-    work = WORK * (RECALLED if bends else 1) / (max(module.thermal.cost, 1) * len(cameras))
-    most = int(min(BENDS if bends else TIMES, max(FEW_TIMES, work / min(len(kept), EXAMINED))))
-    curves = int(min(CURVES, max(FEW_CURVES, work / (MOMENTS * max(len(kept), 1)))))
+    def camera(self, time_s: float | None, ids: Tensor | None = None) -> Tensor:
+        """What they send to a camera."""
+        return self._blended(torch.stack([self._emitted(frame, time_s, ids) for frame in self.cameras]).mean(0))
 
-    def layer(name: str, label: str, values_at: ValuesAt, clipped: bool = False) -> Layer:
-        return _layer(name, label, values_at, len(kept), span, tolerance / slope, slope, most, curves, bends, clipped)
+    def without(self, part: str, time_s: float | None, ids: Tensor | None = None) -> Tensor:
+        """What they would send to a camera without a part of the model."""
+        with self.module.thermal.without(part):
+            return self.camera(time_s, ids)
 
-    layers = [layer("camera", "as seen", sent, clipped)]
-    if surface is not None and not clipped and not _alike(*map(_inside, (surface, camera)), span, tolerance / slope):
-        layers.append(layer("surface", "of the surface", surface))
-    for part in module.thermal.removable:
+    def surface(self, time_s: float, ids: Tensor | None = None) -> Tensor:
+        """The temperature of the surface, of models that tell one (``_tells_surface``)."""
+        wanted = self.kept if ids is None else self.kept[ids]
+        temperature_k = self.module.thermal.temperature(self.module.splats, time_s, wanted)
+        lowest_k, span_k = kelvin(self.scene.thermal_range.min_c), self.scene.thermal_range.span_k
+        return self._blended(((temperature_k - lowest_k) / span_k)[:, None])
 
-        def without(time_s: float | None, ids: Tensor | None = None, part: str = part) -> Tensor:
-            with module.thermal.without(part):
-                return camera(time_s, ids)
+    def _tells_surface(self) -> bool:
+        if self.span is None or not self.unit:
+            return False
+        return self.module.thermal.temperature(self.module.splats, self.scene.record[0]) is not None
 
-        if not _alike(without, camera, span, tolerance / slope):
-            label = f"without {part.replace('_', ' ')}"
-            layers.append(layer(f"without {part}", label, without))
-    if scene.truth is not None and span is not None and scene.thermal_range is not None:
-        truth = _truth(scene, means[kept].cpu(), blended)
-        most, aim = BENDS if record else TIMES, tolerance / slope * (COARSER if len(kept) > MANY else 1)
-        layers.append(_layer("truth", "truth", truth, len(kept), span, aim, slope, most, CURVES, record, False))
-    ends = _ends(layers, module.background[0].item())
-    table = _table(module, scene, ends, channels)
-    colours, colour_opacities = _colours(module, looks.mean(0), opacities[:, kept])
-    attributes = module.attributes(seen_at(first, middle))
-    return Snapshot(
-        means[kept].float().cpu(),
-        torch.nn.functional.normalize(quats[kept].float(), dim=1).cpu(),
-        scales[kept].float().cpu(),
-        opacities[0, kept].float().cpu(),
-        layers,
-        module.background[0].item(),
-        table,
-        ends,
-        unit,
-        (scene.thermal_range.min_c, scene.thermal_range.max_c) if unit else (0.0, 1.0),
-        colours,
-        colour_opacities,
-        {name: values[kept].float().cpu() for name, values in attributes.items()},
-        left_out,
-        None if span is None else span[0],
-        None if span is None else span[1],
-    )
+    def truth(self, time_s: float, ids: Tensor | None = None) -> Tensor:
+        """The true temperature at their places, of scenes that know it."""
+        wanted = self._points if ids is None else self._points[ids]
+        celsius = self.scene.truth(wanted, torch.tensor([time_s], dtype=torch.float64))[:, :1]
+        return self._blended(self.scene.thermal_range.to_unit(celsius).float())
+
+    def _alike(self, one: ValuesAt, other: ValuesAt) -> bool:
+        """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
+        least = 0.1 * (self.tolerance / self.slope)
+        if self.span is None:
+            return bool((one(None) - other(None)).abs().max() <= least)
+        start, end = self.span
+        moments = (start + share * (end - start) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
+        return all((one(moment) - other(moment)).abs().max() <= least for moment in moments)
+
+    # Layers --------------------------------------------------------------------------------------------------------------
+
+    def layers(self) -> list[Layer]:
+        """What they send over time, with what the model and the scene tell beside it; the camera first."""
+        thermal, effort, tells_surface = self.module.thermal, self._effort(), self._tells_surface()
+        clipped = tells_surface and self._alike(_inside(self.surface), self.camera)
+        sent = self.surface if clipped else self.camera
+        layers = [self._layer("camera", "as seen", sent, effort, clipped=clipped)]
+        if tells_surface and not clipped and not self._alike(_inside(self.surface), _inside(self.camera)):
+            layers.append(self._layer("surface", "of the surface", self.surface, effort))
+        for part in thermal.removable:
+            without = partial(self.without, part)
+            if not self._alike(without, self.camera):
+                name = f"without {part}"
+                layers.append(self._layer(name, name.replace("_", " "), without, effort))
+        if self.scene.truth is not None and self.span is not None and self.scene.thermal_range is not None:
+            record = self._record()
+            most = _Effort(BENDS if record else TIMES, CURVES, record)
+            coarser = COARSER if len(self.kept) > MANY else 1
+            layers.append(self._layer("truth", "truth", self.truth, most, coarser))
+        return layers
+
+    def _record(self) -> tuple[float, ...]:
+        """Times of the samples of the weather record; none without one."""
+        return () if self.scene.weather is None else tuple(self.scene.weather.times_s.tolist())
+
+    def _effort(self) -> _Effort:
+        """What a layer of the model may take: the more, the less it costs to ask all Gaussians at one moment."""
+        thermal, count = self.module.thermal, len(self.kept)
+        bends = self._record() if "weather" in thermal.needs else ()
+        work = WORK * (RECALLED if bends else 1) / (max(thermal.cost, 1) * len(self.cameras))
+        times = int(min(BENDS if bends else TIMES, max(FEW_TIMES, work / min(count, EXAMINED))))
+        curves = int(min(CURVES, max(FEW_CURVES, work / (MOMENTS * max(count, 1)))))
+        return _Effort(times, curves, bends)
+
+    def _layer(
+        self, name: str, label: str, values_at: ValuesAt, effort: _Effort, coarser: int = 1, clipped: bool = False
+    ) -> Layer:
+        tolerance = self.tolerance / self.slope * coarser
+        if self.span is None:
+            basis = constant_basis(values_at(None, None).cpu())
+        else:
+            basis = time_basis(
+                values_at, len(self.kept), *self.span, tolerance, effort.times, effort.curves, effort.bends, clipped
+            )
+        return Layer(name, label, basis, basis.worst * self.slope, tolerance * self.slope, clipped)
+
+    # Beside the layers ---------------------------------------------------------------------------------------------------
+
+    def table(self, ends: tuple[float, float]) -> Tensor:
+        """``Snapshot.table`` between two blended values."""
+        values = torch.linspace(*ends, TABLE, dtype=torch.float64)[:, None].expand(-1, self.channels)
+        shown = self.module.composite.decode(values, self.channels)[:, 0]
+        return (self.scene.thermal_range.to_celsius(shown) if self.unit else shown).float()
+
+    def colours(self) -> tuple[Tensor | None, Tensor | None]:
+        """Colours [N, 3] of the visible image and their opacities [N], where the model has them."""
+        thermal, start = self.module.thermal, 0
+        modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
+        for place, (name, count) in enumerate(modalities):
+            if count == 3 and (name == "rgb" or place == 0):
+                opacities = self.opacities[0 if thermal.shared_opacity else place]
+                return self.look[:, start : start + 3].clamp(0, 1).float().cpu(), opacities.float().cpu()
+            start += count
+        return None, None
+
+    def attributes(self) -> dict[str, Tensor]:
+        """What the model learned, name -> [N], in the middle of the record."""
+        learned = self.module.attributes(self.frame)
+        return {name: values[self.kept].float().cpu() for name, values in learned.items()}
 
 
 def span_of(scene: SceneData) -> tuple[float, float] | None:
@@ -232,72 +366,9 @@ def _scale(scene: SceneData, modality: str) -> tuple[float, str]:
     return scene.thermal_range.span_k, "°C"
 
 
-def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -> float:
-    """Largest change of the image, in the scene's unit, for one of a blended value."""
-    values = torch.linspace(0, 1, TABLE, dtype=torch.float64)
-    steps = blended(values[:, None].expand(-1, channels)).diff()
-    return to_unit / (TABLE - 1) / steps.min().item()
-
-
 def _inside(values_at: ValuesAt) -> ValuesAt:
     """A quantity where the image can show it."""
     return lambda time, ids=None: values_at(time, ids).clamp(0, 1)
-
-
-def _alike(one: ValuesAt, other: ValuesAt, span: tuple[float, float] | None, tolerance: float) -> bool:
-    """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
-    if span is None:
-        return bool((one(None) - other(None)).abs().max() <= 0.1 * tolerance)
-    moments = (span[0] + share * (span[1] - span[0]) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
-    return all((one(moment) - other(moment)).abs().max() <= 0.1 * tolerance for moment in moments)
-
-
-def _layer(
-    name: str,
-    label: str,
-    values_at: ValuesAt,
-    count: int,
-    span: tuple[float, float] | None,
-    tolerance: float,
-    slope: float,
-    most_times: int,
-    most_curves: int,
-    bends: Sequence[float],
-    clipped: bool,
-) -> Layer:
-    if span is None:
-        basis = constant_basis(values_at(None, None).cpu())
-    else:
-        basis = time_basis(values_at, count, *span, tolerance, most_times, most_curves, bends, clipped)
-    return Layer(name, label, basis, basis.worst * slope, tolerance * slope, clipped)
-
-
-def _surface(module: Any, blended: Callable, kept: Tensor) -> ValuesAt | None:
-    """Blended values of the temperature of the surface, where the model tells one."""
-    scene = module.scene
-    if scene.thermal_range is None or module.modality != "thermal" or "time" not in scene.metadata:
-        return None
-    if module.thermal.temperature(module.splats, scene.record[0]) is None:
-        return None
-    lowest, span = kelvin(scene.thermal_range.min_c), scene.thermal_range.span_k
-
-    def surface(time_s: float, ids: Tensor | None = None) -> Tensor:
-        wanted = kept if ids is None else kept[ids]
-        units = (module.thermal.temperature(module.splats, time_s, wanted) - lowest) / span
-        return blended(units[:, None])
-
-    return surface
-
-
-def _truth(scene: SceneData, points: Tensor, blended: Callable) -> ValuesAt:
-    """Blended values of the true temperatures at points [N, 3]."""
-
-    def truth(time_s: float, ids: Tensor | None = None) -> Tensor:
-        wanted = points if ids is None else points[ids]
-        celsius = scene.truth(wanted, torch.tensor([time_s], dtype=torch.float64))[:, :1]
-        return blended(scene.thermal_range.to_unit(celsius).float())
-
-    return truth
 
 
 def _ends(layers: list[Layer], background: float) -> tuple[float, float]:
@@ -309,34 +380,3 @@ def _ends(layers: list[Layer], background: float) -> tuple[float, float]:
         low = min(low, (basis.offsets - reach).min().item())
         high = max(high, (basis.offsets + reach).max().item())
     return low, high
-
-
-def _table(module: Any, scene: SceneData, ends: tuple[float, float], channels: int) -> Tensor:
-    values = torch.linspace(*ends, TABLE, dtype=torch.float64)[:, None].expand(-1, channels)
-    shown = module.composite.decode(values, channels)[:, 0]
-    celsius = scene.thermal_range if _scale(scene, module.modality)[1] else None
-    return (shown if celsius is None else celsius.to_celsius(shown)).float()
-
-
-def _colours(module: Any, emitted: Tensor, opacities: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Colours [N, 3] of the visible image and their opacities [N], where the model has them."""
-    thermal, start = module.thermal, 0
-    for place, (name, count) in enumerate(
-        zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
-    ):
-        if count == 3 and (name == "rgb" or place == 0):
-            own = opacities[0 if thermal.shared_opacity else place]
-            return emitted[:, start : start + 3].clamp(0, 1).float().cpu(), own.float().cpu()
-        start += count
-    return None, None
-
-
-def _displacement(
-    module: Any, seen_at: Callable, first: Frame, span: tuple[float, float] | None, kept: Tensor
-) -> float:
-    """How far a Gaussian moves over the span at most, in extents of the scene."""
-    if span is None:
-        return 0.0
-    places = [module.shapes(seen_at(first, moment))[0][kept] for moment in span]
-    moved = (places[1] - places[0]).norm(dim=1)
-    return float(moved.max()) / module.scene.extent if len(moved) else 0.0

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, SceneData, View
 from heatsplat.geometry.resampling import resampled
+from heatsplat.losses.masking import cleared
 from heatsplat.splats import Splats
 
 
@@ -67,10 +68,7 @@ class LossInputs:
                 f"prediction and target must have one shape, got {list(self.prediction.shape)} and "
                 f"{list(self.target.shape)}"
             )
-        if self.mask is None:
-            return self.prediction, self.target
-        inside = self.mask[..., None]
-        return torch.where(inside, self.prediction, 0.0), torch.where(inside, self.target, 0.0)
+        return cleared(self.prediction, self.mask), cleared(self.target, self.mask)
 
 
 @torch.no_grad()
@@ -92,19 +90,52 @@ def pixel_errors(inputs: LossInputs, camera: Camera) -> Tensor:
     return resampled(error[..., None], camera.height, camera.width, "area")[..., 0]
 
 
-class LossTerm(Protocol):
+class LossTerm(ABC):
     """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term.
 
-    A term may also have ``prepare(scene, modality) -> dict[str, str]``, called once before training, to check and to
-    compute what it needs of the scene; it returns what the report should say of it, by name. One that compares the images of a
-    companion says which in ``modality``; one that weighs another has it as ``term``.
+    Attributes:
+        modality: the companion whose images are compared, such as "rgb"; None where it is the model's own image, or none.
+        span: first step at which the term counts, and the step before which it ends.
     """
 
+    modality: str | None = None
+    span: tuple[float, float] = (0, math.inf)
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        """Checks and computes, once before training, what it needs of the scene; what the report should say of it, by name."""
+        return {}
+
+    @abstractmethod
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]: ...
 
 
-class Weighted:
-    """A term times a weight and a schedule; at weight zero the term is not even evaluated.
+class Wrapped(LossTerm):
+    """A term around another one, which it passes on what it does not change.
+
+    Args:
+        term: the other one.
+    """
+
+    def __init__(self, term: LossTerm) -> None:
+        self.term = term
+
+    @property
+    def modality(self) -> str | None:
+        return self.term.modality
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return self.term.span
+
+    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
+        return self.term.prepare(scene, modality)
+
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
+        return self.term(inputs)
+
+
+class Weighted(Wrapped):
+    """A term times a weight and a schedule; at weight zero the term is neither prepared nor evaluated.
 
     Args:
         term: what is weighted.
@@ -113,22 +144,22 @@ class Weighted:
     """
 
     def __init__(self, term: LossTerm, weight: float = 1.0, schedule: Callable[[float], float] | None = None) -> None:
-        self.term = term
-        self.weight = weight
-        self.schedule = schedule
+        super().__init__(term)
+        self.weight, self.schedule = weight, schedule
+
+    @property
+    def modality(self) -> str | None:
+        return self.term.modality if self.weight != 0.0 else None
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Prepares the term, unless its weight is zero."""
-        return prepare(self.term, scene, modality) if self.weight != 0.0 else {}
+        return self.term.prepare(scene, modality) if self.weight != 0.0 else {}
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         factor = self.weight if self.schedule is None else self.weight * self.schedule(inputs.progress)
-        if factor == 0.0:
-            return {}
-        return {name: factor * value for name, value in _named(self.term(inputs)).items()}
+        return {} if factor == 0.0 else scaled(self.term(inputs), factor)
 
 
-class During:
+class During(Wrapped):
     """A term that counts at some steps of the run only; at others it is not even evaluated.
 
     Args:
@@ -138,16 +169,16 @@ class During:
     """
 
     def __init__(self, term: LossTerm, start: int = 0, stop: int | None = None) -> None:
-        self.term, self.start, self.stop = term, start, stop
+        super().__init__(term)
+        self.start, self.stop = start, math.inf if stop is None else stop
 
-    def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
-        """Prepares the term."""
-        return prepare(self.term, scene, modality)
+    @property
+    def span(self) -> tuple[float, float]:
+        start, stop = self.term.span
+        return max(start, self.start), min(stop, self.stop)
 
-    def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
-        if inputs.step < self.start or (self.stop is not None and inputs.step >= self.stop):
-            return {}
-        return _named(self.term(inputs))
+    def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
+        return self.term(inputs) if self.start <= inputs.step < self.stop else {}
 
 
 class Loss:
@@ -164,7 +195,7 @@ class Loss:
         self.terms = {name: term for name, term in terms.items() if term is not None}
         if not self.terms:
             raise ValueError(f"the loss has no term: give one of loss.terms ({', '.join(terms)}) that is not null")
-        spans = {name: _span(term) for name, term in self.terms.items()}
+        spans = {name: term.span for name, term in self.terms.items()}
         last = max(stop for _, stop in spans.values())
         for step in sorted({0, *(stop for _, stop in spans.values() if stop < last)}):
             if not any(start <= step < stop for start, stop in spans.values()):
@@ -175,12 +206,12 @@ class Loss:
         """Lets terms check and compute what they need of a scene; what the report should say of them, by name."""
         notes: dict[str, str] = {}
         for term in self.terms.values():
-            notes |= prepare(term, scene, modality)
+            notes |= term.prepare(scene, modality)
         return notes
 
     def compares(self, companion: str) -> bool:
         """Whether some term compares the images of a companion."""
-        return any(_modality(term) == companion for term in self.terms.values())
+        return any(term.modality == companion for term in self.terms.values())
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         """Scalars by name: ``name`` of a term that returns a tensor, ``name/part`` of one that returns several."""
@@ -191,25 +222,9 @@ class Loss:
         return scalars
 
 
-def _span(term: LossTerm) -> tuple[float, float]:
-    """First step at which a term counts, and the step before which it ends."""
-    if not isinstance(term, During):
-        return 0, math.inf
-    return term.start, math.inf if term.stop is None else term.stop
-
-
-def _modality(term: LossTerm) -> str | None:
-    """The companion whose images a term compares; None for none, or for a weight of zero."""
-    while hasattr(term, "term"):
-        if getattr(term, "weight", 1.0) == 0.0:
-            return None
-        term = term.term
-    return getattr(term, "modality", None)
-
-
-def prepare(term: LossTerm, scene: SceneData, modality: str) -> dict[str, str]:
-    """Prepares a term that asks for it; most do not."""
-    return term.prepare(scene, modality) if hasattr(term, "prepare") else {}
+def scaled(values: Tensor | dict[str, Tensor], factor: Tensor | float) -> dict[str, Tensor]:
+    """A term's values by name, times a factor."""
+    return {name: factor * value for name, value in _named(values).items()}
 
 
 def _named(values: Tensor | dict[str, Tensor]) -> dict[str, Tensor]:

@@ -7,8 +7,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import check_option
-from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.edge import sobel, whole_windows
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import cleared, eroded, masked_mean
+from heatsplat.losses.sobel import sobel
 
 KAPPA = 0.04  # κ of the response (Harris and Stephens 1988)
 SIGMA = 1.0  # pixels, of the window
@@ -17,18 +18,12 @@ LEVELS = 255.0  # grey levels that the published code counts images in
 WEIGHTS = ("corners", "published")
 
 
-def harris_response(image: Tensor, mask: Tensor | None = None) -> Tensor:
-    """det M - κ (tr M)², [H, W, C], with M the products of Sobel slopes under a Gaussian window (Harris and Stephens 1988).
+def harris_response(x: Tensor, y: Tensor) -> Tensor:
+    """det M - κ (tr M)², [H, W, C], with M the products of slopes under a Gaussian window (Harris and Stephens 1988).
 
     Args:
-        image: [H, W, C].
-        mask: [H, W] bool, True where a pixel counts; slopes at other pixels are none, so that a mask is no corner.
+        x, y: [H, W, C] slopes of an image.
     """
-    return _response(*_slopes(image, mask))
-
-
-def _response(x: Tensor, y: Tensor) -> Tensor:
-    """R of slopes, [H, W, C] each."""
     products = torch.cat((x * x, y * y, x * y), 2).permute(2, 0, 1)[:, None]
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=x.dtype, device=x.device)
     window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
@@ -40,14 +35,13 @@ def _response(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _slopes(image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    x, y = sobel(image if mask is None else torch.where(mask[..., None], image, 0.0))
-    if mask is None:
-        return x, y
-    counted = whole_windows(mask)[..., None]
-    return torch.where(counted, x, 0.0), torch.where(counted, y, 0.0)
+    """Sobel slopes of an image without masked pixels, [H, W, C] each; 0 beside masked pixels, so that a mask is no corner."""
+    counted = None if mask is None else eroded(mask)
+    x, y = sobel(image)
+    return cleared(x, counted), cleared(y, counted)
 
 
-class Corner:
+class Corner(LossTerm):
     """The mean over pixels of w |target - prediction| with w = max(R / R_max, floor), R the target's Harris response.
 
     Thermal3D-GS, Eq. 12, where R is of a window and of the target. A target without corners counts with w = floor.
@@ -72,17 +66,14 @@ class Corner:
         (prediction, target), mask = inputs.unmasked(), inputs.mask
         with torch.no_grad():
             weight = self._published(prediction, mask) if self.published else self._corners(target, mask)
-        error = weight * (target - prediction).abs()
-        if mask is None:
-            return error.mean()
-        return error.sum() / (mask.sum() * error.shape[2]).clamp(min=1)
+        return masked_mean(weight * (target - prediction).abs(), mask)
 
     def _corners(self, target: Tensor, mask: Tensor | None) -> Tensor:
         # R is of fourth order in contrast; of slopes up to 1 it neither underflows nor overflows.
         x, y = _slopes(target, mask)
         tiny = torch.finfo(target.dtype).tiny
         steepest = torch.maximum(x.abs().max(), y.abs().max()).clamp(min=tiny)
-        response = _response(x / steepest, y / steepest)
+        response = harris_response(x / steepest, y / steepest)
         return (response / response.max().clamp(min=tiny)).clamp(min=self.floor)
 
     @staticmethod

@@ -6,44 +6,15 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import eroded, masked_mean
 from heatsplat.losses.photometric import Photometric
-
-TINY = 1e-12  # under the root of the magnitude, so that a flat image has a gradient of zero and not NaN
-GAIN = 8.0  # what the Sobel operator makes of a slope of 1 per pixel
-
-
-def sobel(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Sobel derivatives along x and y, [H, W, C] each.
-
-    **Convention:** the operator as it is usually written, with weights ±1, ±2: 8 times the slope per pixel. The image
-    is continued by its border, so that the border is no edge.
-
-    Args:
-        image: [H, W, C].
-    """
-    padded = functional.pad(image.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
-    down = padded[:-2] + 2.0 * padded[1:-1] + padded[2:]
-    along = padded[:, :-2] + 2.0 * padded[:, 1:-1] + padded[:, 2:]
-    return down[:, 2:] - down[:, :-2], along[2:] - along[:-2]
-
-
-def sobel_magnitude(image: Tensor) -> Tensor:
-    """Norms of the Sobel derivatives, [H, W, C]; at least 1e-6, with finite gradients everywhere."""
-    x, y = sobel(image)
-    return (x * x + y * y + TINY).sqrt()
-
-
-def whole_windows(mask: Tensor) -> Tensor:
-    """Which pixels [H, W] count together with their eight neighbours (those outside the image do not matter)."""
-    masked = functional.max_pool2d((~mask).float()[None, None], 3, stride=1, padding=1)[0, 0]
-    return masked < 0.5
+from heatsplat.losses.sobel import sobel_magnitude
 
 
 def mean_of_differences(inputs: LossInputs, size: Callable[[Tensor], Tensor]) -> Tensor:
-    """The mean over pixels of ``size`` of |∇target| - |∇prediction|, Sobel magnitudes; ``size`` of 0 is 0.
+    """The mean over pixels of ``size`` of |∇target| - |∇prediction|, Sobel magnitudes.
 
     Pixels whose Sobel window touches a masked one are left out, and masked pixels receive no gradient. Without a pixel
     that counts it is 0.
@@ -53,21 +24,17 @@ def mean_of_differences(inputs: LossInputs, size: Callable[[Tensor], Tensor]) ->
     """
     prediction, target = inputs.unmasked()
     difference = sobel_magnitude(target) - sobel_magnitude(prediction)
-    if inputs.mask is None:
-        return size(difference).mean()
-    counted = whole_windows(inputs.mask)[..., None]
-    error = size(torch.where(counted, difference, 0.0))
-    return error.sum() / (counted.sum() * error.shape[2]).clamp(min=1)
+    return masked_mean(size(difference), None if inputs.mask is None else eroded(inputs.mask))
 
 
-class Edge:
+class Edge(LossTerm):
     """The mean over pixels of (|∇target| - |∇prediction|)² (TI-3DGS, Eq. 15); see ``mean_of_differences``."""
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         return mean_of_differences(inputs, torch.square)
 
 
-class EdgeEnhanced:
+class EdgeEnhanced(LossTerm):
     """The terms "l1", "dssim" and "edge": (1 - w - e) mean|x - y|, w (1 - mean SSIM) and e times ``Edge`` (Eq. 16).
 
     Args:

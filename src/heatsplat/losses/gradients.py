@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import cleared, masked_mean
 
 
 def slopes(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,7 +42,7 @@ def guided_variation(image: Tensor, guide: Tensor, beta: float) -> Tensor:
     return sum(slope.abs() for slope in slopes(image)) * torch.exp(-beta * edges)
 
 
-class GradientConsistency:
+class GradientConsistency(LossTerm):
     """The mean of ``gradient_difference`` over pixels and channels.
 
     Pixels that, or whose right or lower neighbour, are masked do not count.
@@ -54,11 +55,11 @@ class GradientConsistency:
         self.modality = modality
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        prediction, target = (_cleared(image, inputs.mask) for image in inputs.pair(self.modality))
-        return _mean(gradient_difference(prediction, target), inputs.mask)
+        prediction, target = (cleared(image, inputs.mask) for image in inputs.pair(self.modality))
+        return masked_mean(gradient_difference(prediction, target), _with_neighbours(inputs.mask))
 
 
-class GuidedVariation:
+class GuidedVariation(LossTerm):
     """The mean of ``guided_variation`` of the prediction over pixels and channels, guided by a companion's target.
 
     Pixels that, or whose right or lower neighbour, are masked do not count.
@@ -73,22 +74,16 @@ class GuidedVariation:
         self.guide, self.beta, self.modality = guide, beta, modality
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        prediction = _cleared(inputs.pair(self.modality)[0], inputs.mask)
-        guide = _cleared(inputs.pair(self.guide)[1], inputs.mask)
-        return _mean(guided_variation(prediction, guide, self.beta), inputs.mask)
+        prediction = cleared(inputs.pair(self.modality)[0], inputs.mask)
+        guide = cleared(inputs.pair(self.guide)[1], inputs.mask)
+        return masked_mean(guided_variation(prediction, guide, self.beta), _with_neighbours(inputs.mask))
 
 
-def _cleared(image: Tensor, mask: Tensor | None) -> Tensor:
-    """The image with zeros where pixels do not count, whatever stands there."""
-    return image if mask is None else torch.where(mask[..., None], image, 0.0)
-
-
-def _mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of slopes [H, W, C] over the pixels that count with their neighbours; 0 where none does."""
+def _with_neighbours(mask: Tensor | None) -> Tensor | None:
+    """Which pixels [H, W] count together with their right and their lower neighbour."""
     if mask is None:
-        return values.mean()
+        return None
     counted = mask.clone()
     counted[:, :-1] &= mask[:, 1:]
     counted[:-1] &= mask[1:]
-    total = torch.where(counted[..., None], values, 0.0).sum()
-    return total / (counted.sum() * values.shape[2]).clamp(min=1)
+    return counted

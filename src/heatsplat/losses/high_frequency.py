@@ -10,13 +10,14 @@ from torch.nn import functional
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry.resampling import resampled
-from heatsplat.losses.compose import LossInputs
-from heatsplat.losses.edge import GAIN, sobel
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.low_resolution import check_fineness, counted_finely
+from heatsplat.losses.masking import masked_mean
+from heatsplat.losses.sobel import GAIN, sobel
 from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
-class HighFrequency:
+class HighFrequency(LossTerm):
     """The mean of W |H(prediction) - H(teacher)| on the fine grid of the prediction (SupIR-GS, Eq. 9-10).
 
     H is what lies between two averages and W, the confidence, falls where the teacher departs from the target. Both are
@@ -68,10 +69,7 @@ class HighFrequency:
             made.to(inputs.prediction) for made in self._teacher_images.of(inputs.view, inputs.target)
         )
         error = confidence * (self.detail(inputs.prediction) - detail).abs()
-        if inputs.mask is None:
-            return error.mean()
-        counted = counted_finely(inputs.mask, self.factor)
-        return torch.where(counted[..., None], error, 0.0).sum() / (counted.sum() * error.shape[2]).clamp(min=1)
+        return masked_mean(error, None if inputs.mask is None else counted_finely(inputs.mask, self.factor))
 
     def detail(self, image: Tensor) -> Tensor:
         """H: the average over the inner window minus that over the outer one, [H, W, C]; 0 for a flat image."""

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, check_option
 from heatsplat.geometry.resampling import KERNELS, resampled, scale_between
-from heatsplat.losses.compose import LossInputs, LossTerm, prepare
-from heatsplat.losses.edge import whole_windows
+from heatsplat.losses.compose import LossInputs, LossTerm, Wrapped
+from heatsplat.losses.masking import eroded
 from heatsplat.losses.photometric import Photometric
 
 
-class OnTargetGrid:
+class OnTargetGrid(Wrapped):
     """A term of the predictions reduced to the grids of their targets: consistency with what was recorded.
 
     A prediction that has its target's size already is passed on as it is.
@@ -29,16 +29,17 @@ class OnTargetGrid:
     """
 
     def __init__(self, term: LossTerm, kernel: str | None = None) -> None:
-        if kernel is not None and kernel not in KERNELS:
-            raise ValueError(f"unknown resampling kernel '{kernel}'; there are {', '.join(KERNELS)}")
-        self.term, self.kernel = term, kernel or "area"
+        if kernel is not None:
+            check_option("kernel", kernel, KERNELS)
+        super().__init__(term)
+        self.kernel = kernel or "area"
         self._follows = kernel is None
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Prepares the term, and finds the kernel where none is given."""
         if self._follows:
             self.kernel = scene.reduced_by or "area"
-        return prepare(self.term, scene, modality)
+        return super().prepare(scene, modality)
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
         fineness(inputs)
@@ -50,7 +51,7 @@ class OnTargetGrid:
         return resampled(prediction, *target.shape[:2], self.kernel)
 
 
-class Curriculum:
+class Curriculum(LossTerm):
     """The terms "l1" and "dssim": (1 + b(t)) mean|x - y| and s(t) (1 - mean SSIM) (SupIR-GS, Eq. 12, first two terms).
 
     Unlike in ``Photometric``, SSIM comes on top of the L1 term and not out of it.
@@ -118,4 +119,4 @@ def check_fineness(inputs: LossInputs, factor: int) -> None:
 
 def counted_finely(mask: Tensor, factor: int) -> Tensor:
     """Which pixels of a fine grid [factor H, factor W] count: those in a pixel of [H, W] with no masked one about it."""
-    return whole_windows(mask).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    return eroded(mask).repeat_interleave(factor, 0).repeat_interleave(factor, 1)

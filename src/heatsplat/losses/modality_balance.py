@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.compose import LossInputs, LossTerm, Weighted, scaled
 
 
-class ByOthersShare:
+class ByOthersShare(Weighted):
     """A term times a weight times the share of Gaussians that belong to the other modalities (MSMG).
 
     The modality with more Gaussians weighs less; with it shrink the screen gradients by which density control adds
@@ -16,11 +16,12 @@ class ByOthersShare:
     Args:
         term: what is weighted.
         opacity: column of the opacities that the modality has, counted as the model's images are: 0 is its own.
-        weight: factor.
+        weight: factor; at zero the term is neither prepared nor evaluated.
     """
 
     def __init__(self, term: LossTerm, opacity: int, weight: float = 1.0) -> None:
-        self.term, self.opacity, self.weight = term, opacity, weight
+        super().__init__(term, weight)
+        self.opacity = opacity
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         logits = inputs.splats["opacity_logits"].detach()
@@ -30,7 +31,7 @@ class ByOthersShare:
                 f"{logits.shape[1]}; give the thermal model opacities of its own for each image "
                 "(thermal.shared_opacity=false) and init=separate"
             )
-        factor = self.weight * (logits.argmax(dim=1) != self.opacity).float().mean()
-        values = self.term(inputs)
-        values = {"": values} if isinstance(values, Tensor) else values
-        return {name: factor * value for name, value in values.items()}
+        if self.weight == 0.0:
+            return {}
+        others = (logits.argmax(dim=1) != self.opacity).float().mean()
+        return scaled(self.term(inputs), self.weight * others)

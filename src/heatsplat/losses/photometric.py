@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from heatsplat.kernels import gpu
 from heatsplat.kernels import ssim as kernel
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import cleared
 
 WINDOW = 11  # taps of the Gaussian window
 SIGMA = 1.5  # its standard deviation in pixels
@@ -74,7 +75,7 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
     return luminance * (2 * covariance + C2) / ((x_variance + y_variance).clamp(min=0.0) + C2)
 
 
-class Photometric:
+class Photometric(LossTerm):
     """The terms "l1" and "dssim", weighted: (1 - w) mean|x - y| and w (1 - mean SSIM).
 
     Means run over the channels of the pixels that count. Masked pixels neither contribute nor receive a gradient, and
@@ -109,8 +110,7 @@ class Photometric:
         if fused is not None and self.dssim_weight > 0.0:
             difference, dissimilarity = fused.apply(prediction, target, mask, self.l1_weight, self.dssim_weight)
             return {"l1": difference, "dssim": dissimilarity}
-        if mask is not None:
-            prediction, target = (torch.where(mask[..., None], image, 0.0) for image in (prediction, target))
+        prediction, target = cleared(prediction, mask), cleared(target, mask)
         terms = {"l1": self.l1_weight * _mean(l1(prediction, target), mask).mean()}
         if self.dssim_weight > 0.0:
             terms["dssim"] = self.dssim_weight * _mean(1.0 - ssim_map(prediction, target, mask), mask).mean()
@@ -121,7 +121,7 @@ def _mean(image: Tensor, mask: Tensor | None) -> Tensor:
     """Mean over the pixels that count, [C]; 0 where none does."""
     if mask is None:
         return image.mean((0, 1))
-    return torch.where(mask[..., None], image, 0.0).sum((0, 1)) / mask.sum().clamp(min=1)
+    return cleared(image, mask).sum((0, 1)) / mask.sum().clamp(min=1)
 
 
 def _padded(image: Tensor, value: float) -> Tensor:

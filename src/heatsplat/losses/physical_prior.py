@@ -6,7 +6,7 @@ from torch import Tensor
 
 from heatsplat.contracts import check_option
 from heatsplat.geometry.spherical_harmonics import C0
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.same_bits import sigmoid
 
 OF = ("activated", "coefficients")
@@ -23,7 +23,7 @@ def kirchhoff_excess(emissivity: Tensor, reflectance: Tensor, tolerance: float) 
     return (emissivity + reflectance - (1.0 + tolerance)).relu()
 
 
-class PhysicalPrior:
+class PhysicalPrior(LossTerm):
     """B(ε)² + B(ρ)² + ReLU(ε + ρ - (1 + δ))² of all Gaussians (RaViGS, Eq. 15), of the constant harmonics.
 
     Gaussians without both attributes have no such prior, and the term is absent.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import cleared, masked_mean
 
 
 def neighbour_differences(image: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -18,9 +19,8 @@ def neighbour_differences(image: Tensor, mask: Tensor | None = None) -> Tensor:
         image: [H, W, C].
         mask: [H, W] bool, True where a pixel counts; None means that all do.
     """
+    image = cleared(image, mask)
     still = image.detach()
-    if mask is not None:  # whatever stands where pixels do not count, NaN too, stays out of the gradient
-        image, still = (torch.where(mask[..., None], x, 0.0) for x in (image, still))
     total = torch.zeros_like(image)
     for axis in (0, 1):
         length = image.shape[axis] - 1
@@ -33,7 +33,7 @@ def neighbour_differences(image: Tensor, mask: Tensor | None = None) -> Tensor:
     return total
 
 
-class Smoothness:
+class Smoothness(LossTerm):
     """The mean of ``neighbour_differences`` of the prediction over the pixels that count and their channels.
 
     ThermalGaussian's smoothness term; its code takes the neighbours beyond the border from the other side of the image.
@@ -47,7 +47,4 @@ class Smoothness:
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         prediction = inputs.pair(self.modality)[0]
-        differences = neighbour_differences(prediction, inputs.mask)
-        if inputs.mask is None:
-            return differences.mean()
-        return differences.sum() / (inputs.mask.sum() * differences.shape[2]).clamp(min=1)
+        return masked_mean(neighbour_differences(prediction, inputs.mask), inputs.mask)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.losses.masking import cleared
 
 
-class Squared:
+class Squared(LossTerm):
     """The term "squared": the mean of (x - y)² over the channels of the pixels that count; 0 where none does.
 
     Args:
@@ -22,6 +22,5 @@ class Squared:
         (prediction, target), mask = inputs.pair(self.modality), inputs.mask
         if mask is None:
             return {"squared": (prediction - target).square().mean()}
-        inside = mask[..., None]
-        errors = (torch.where(inside, prediction, 0.0) - torch.where(inside, target, 0.0)).square()
+        errors = (cleared(prediction, mask) - cleared(target, mask)).square()
         return {"squared": errors.mean(-1).sum() / mask.sum().clamp(min=1)}

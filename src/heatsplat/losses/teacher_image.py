@@ -9,13 +9,13 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData
 from heatsplat.geometry.resampling import resampled
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.low_resolution import OnTargetGrid, check_fineness, counted_finely, fineness
 from heatsplat.losses.photometric import Photometric
 from heatsplat.losses.teacher import Teacher, TeacherImages
 
 
-class TeacherAndTarget:
+class TeacherAndTarget(LossTerm):
     """(1 - w) L(prediction, teacher) + w L(small prediction, target), L = 0.8 L1 + 0.2 (1 - SSIM) (Feng et al. 2024).
 
     The terms are "teacher/l1", "teacher/dssim", "target/l1" and "target/dssim", weighted; a share of zero leaves its pair

@@ -5,17 +5,17 @@ from __future__ import annotations
 from torch import Tensor
 
 from heatsplat.contracts import SceneData
-from heatsplat.losses.compose import LossInputs
+from heatsplat.losses.compose import LossInputs, LossTerm
 
 
-class MeanOpacity:
+class MeanOpacity(LossTerm):
     """Mean opacity of all Gaussians, over modalities too (Kheradmand et al. 2024, Eq. 12)."""
 
     def __call__(self, inputs: LossInputs) -> Tensor:
         return inputs.splats.opacities.mean()
 
 
-class MeanSize:
+class MeanSize(LossTerm):
     """Mean semi-axis of all Gaussians in extents of the scene (Kheradmand et al. 2024, Eq. 12, in world units)."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneData
+from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
 from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
 from heatsplat.splats import ANCHORS, GAUSSIANS
 
@@ -44,8 +44,7 @@ class Renderer:
         background: str | float = "ambient",
         eps2d: float = EPS2D,
     ) -> None:
-        if backend not in ("auto", *BACKENDS):
-            raise ValueError(f"renderer.backend '{backend}' is unknown; choose auto, {', '.join(BACKENDS)}")
+        check_option("renderer.backend", backend, ("auto", *BACKENDS))
         if isinstance(background, str) and background != "ambient":
             raise ValueError(f"renderer.background must be 'ambient' or a number in [0, 1], got '{background}'")
         if not eps2d > 0:

@@ -167,6 +167,7 @@ class SplatTraining(pl.LightningModule):
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)
         self.smoothing.prepare(scene, self.splats.means.detach())
         self.surroundings.prepare(scene, self.renderer, self.splats, self.composited)
+        self.density.initial_count = len(self.splats)
         self.density.opacities_until = self.stages.held_from("opacity_logits")
         self.density.prepare(scene, self.modality)
         learned = (self.modality, *self.thermal.companions)

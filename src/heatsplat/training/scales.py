@@ -15,7 +15,7 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, ThermalRange, View, ViewSet
 
-log = logging.getLogger("heatsplat")
+log = logging.getLogger(__name__)
 
 
 def scales_of(scene: SceneData) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
 from heatsplat.training.module import SplatTraining
 
-log = logging.getLogger("heatsplat")
+log = logging.getLogger(__name__)
 
 
 class Unprofiled(PassThroughProfiler):

@@ -18,7 +18,10 @@ from heatsplat.viewer.payload import payload
 FILE = "viewer.html"
 CAMERAS = 36  # in a page: their images take 1 to 2 MB
 SOURCES = Path(__file__).resolve().parent / "page"
-SCRIPTS = ("payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "viewer.js")
+SCRIPTS = (
+    "payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "probes.js", "compare.js", "controls.js",
+    "viewer.js",
+)  # fmt: skip
 
 
 def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:

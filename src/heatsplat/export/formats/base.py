@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -42,6 +41,40 @@ class Format(ABC):
         """
 
 
+class Coloured(Format):
+    """A format whose Gaussians have colours.
+
+    Args:
+        colormap: name of a matplotlib map; "rgb" takes the visible colours of methods that have them.
+        range_c: °C at the ends of the map; None takes those that an image of the scene can show.
+    """
+
+    def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
+        self.colormap, self.range_c = colormap, checked_range(range_c)
+
+    def colours(self, moment: Moment) -> np.ndarray:
+        """Colours [N, 3] float32 in [0, 1] of the Gaussians' values, or of the visible image.
+
+        Raises:
+            SceneError: the model has no colours, or there is no such map.
+        """
+        if self.colormap == "rgb":
+            if moment.seen.colours is None:
+                raise SceneError("what.colormap=rgb: this method has no colours; give the name of a matplotlib map")
+            return moment.seen.colours.numpy()
+        low, high = self.range_c or moment.seen.limits
+        try:
+            colours = colorize(moment.values[:, None], low, high, self.colormap)
+        except (KeyError, ValueError) as error:
+            raise SceneError(f"what.colormap={self.colormap} is no map of matplotlib (and not rgb): {error}") from error
+        return colours[:, 0].astype(np.float32) / 255
+
+    def opacities(self, moment: Moment) -> Tensor:
+        """Opacities [N] that belong to these colours."""
+        visible = moment.seen.colour_opacities if self.colormap == "rgb" else None
+        return moment.seen.opacities if visible is None else visible
+
+
 def optional(package: str, what: str) -> ModuleType:
     """A package of the extra "export". Raises ImportError, naming the extra, where it is not installed."""
     try:
@@ -49,35 +82,6 @@ def optional(package: str, what: str) -> ModuleType:
     except ImportError as error:
         missing = package.partition(".")[0]
         raise ImportError(f"what={what} needs {missing}: pip install 'heatsplat[export]'") from error
-
-
-def colours_of(moment: Moment, colormap: str | None, range_c: Sequence[float] | None) -> Any:
-    """Colours [N, 3] float32 in [0, 1] of the Gaussians' values, or of the visible image where ``colormap`` is "rgb".
-
-    Args:
-        moment: the Gaussians.
-        colormap: name of a matplotlib map, or "rgb".
-        range_c: values at its ends; None takes those that an image of the scene can show.
-
-    Raises:
-        SceneError: the model has no colours, there is no such map, or the range is none.
-    """
-    if colormap == "rgb":
-        if moment.seen.colours is None:
-            raise SceneError("what.colormap=rgb: this method has no colours; give the name of a matplotlib map")
-        return moment.seen.colours.numpy()
-    low, high = checked_range(range_c) or moment.seen.limits
-    try:
-        colours = colorize(moment.values[:, None], low, high, colormap)
-    except (KeyError, ValueError) as error:
-        raise SceneError(f"what.colormap={colormap} is no map of matplotlib (and not rgb): {error}") from error
-    return colours[:, 0].astype(np.float32) / 255
-
-
-def opacities_of(moment: Moment, colormap: str | None) -> Tensor:
-    """Opacities [N] that belong to the colours of ``colours_of``."""
-    own = moment.seen.colour_opacities if colormap == "rgb" and moment.seen.colours is not None else None
-    return moment.seen.opacities if own is None else own
 
 
 def checked_range(range_c: Sequence[float] | None, name: str = "what.range_c") -> tuple[float, float] | None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import heatsplat
-from heatsplat.export.formats.base import Format, checked_range, colours_of, extra_columns, opacities_of
+from heatsplat.export.formats.base import Coloured, extra_columns
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import upright
 from heatsplat.geometry.spherical_harmonics import C0
@@ -24,25 +23,22 @@ FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962  # glTF's numbers
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-class Gltf(Format):
+class Gltf(Coloured):
     """Gaussians coloured at a moment, y up, in metres where the scene's scale is known.
 
     Viewers blend these colours; the attribute ``_TEMPERATURE`` holds °C, and others begin with an underscore, too. What is
     not known of a Gaussian (NaN) has no place in glTF: an attribute with such values stays out.
 
     Args:
-        colormap, range_c: as in ``formats.ply``.
+        colormap, range_c: as in ``Coloured``.
     """
 
     suffix = ".glb"
 
-    def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, checked_range(range_c)
-
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.numpy() for values in upright(moment))
-        colours = colours_of(moment, self.colormap, self.range_c)
-        opacities = opacities_of(moment, self.colormap).numpy()
+        colours = self.colours(moment)
+        opacities = self.opacities(moment).numpy()
         arrays = {
             "POSITION": means,
             "COLOR_0": np.concatenate(

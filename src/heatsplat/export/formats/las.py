@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, check_numbers, evenly_spread
-from heatsplat.export.formats.base import Format, checked_range, colours_of, extra_columns, optional
-from heatsplat.export.formats.mesh import look
+from heatsplat.export.formats.base import Coloured, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, place_of
 
@@ -24,14 +23,13 @@ VIEWS = 48  # training views at most that tell where surfaces are
 STEPS = 2**30  # of a coordinate, stored as a whole number of 32 bits
 
 
-class Las(Format):
+class Las(Coloured):
     """LAS 1.4, point format 7. What lies where no training view shows a surface, such as under the ground, is left out.
 
     Args:
         compressed: LAZ.
         least_opacity: fainter Gaussians are left out, in [0, 1]: much of a surface is made of faint ones, and so is haze.
-        colormap: colours of the points, as in ``formats.ply``.
-        range_c: °C at the ends of the map; None takes the scene's range.
+        colormap, range_c: as in ``Coloured``.
         gps: table of camera positions, "auto" or None (``export.place``).
     """
 
@@ -45,8 +43,8 @@ class Las(Format):
     ) -> None:
         check_numbers("what.least_opacity", least_opacity, error=SceneError)
         self.suffix = ".laz" if compressed else ".las"
-        self.least_opacity, self.colormap, self.gps = least_opacity, colormap, gps
-        self.range_c = checked_range(range_c)
+        super().__init__(colormap, range_c)
+        self.least_opacity, self.gps = least_opacity, gps
 
     def write(self, moment: Moment, path: Path) -> None:
         laspy = optional("laspy", "las")
@@ -84,7 +82,7 @@ class Las(Format):
             header.global_encoding.wkt = True
         data = laspy.LasData(header)
         data.x, data.y, data.z = points.T
-        data.red, data.green, data.blue = (colours_of(moment, self.colormap, self.range_c)[kept].T * 65535).astype("u2")
+        data.red, data.green, data.blue = (self.colours(moment)[kept].T * 65535).astype("u2")
         for name, values in zip(names, columns.values(), strict=True):
             data[name] = values.numpy()[kept]
         data.write(str(path))
@@ -96,5 +94,5 @@ def _shown(moment: Moment) -> Tensor:
     shown = torch.zeros(len(moment.seen.means), dtype=torch.bool)
     with torch.no_grad():
         for i in evenly_spread(len(frames), VIEWS):
-            shown |= look(moment, frames[i]).sees(moment.seen.means)[0]
+            shown |= moment.look(frames[i]).sees(moment.seen.means)[0]
     return shown

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
-from heatsplat.contracts import Frame, SceneError, check_count, evenly_spread
+from heatsplat.contracts import SceneError, check_count, evenly_spread
 from heatsplat.export.formats.base import Format, checked_range, optional
 from heatsplat.export.moment import Moment
-from heatsplat.geometry.coverage import OPEN, surface_depth
-from heatsplat.geometry.looks import Look, values_at
+from heatsplat.geometry.looks import values_at
 from heatsplat.io.pictures import colorize
 
 log = logging.getLogger("heatsplat")
@@ -66,7 +65,7 @@ class Mesh(Format):
         points, normals = (torch.from_numpy(np.array(part)) for part in (given.vertices, given.vertex_normals))
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
-        looks = [look(moment, scene.train.frames[i]) for i in chosen]
+        looks = [moment.look(scene.train.frames[i]) for i in chosen]
         # What was taken off the scene, where its coordinates are too large for float32.
         origin = torch.tensor(scene.notes.get("origin", [0.0, 0.0, 0.0]), dtype=torch.float64)
         values = values_at(looks, points - origin, None if self.two_sided else normals)
@@ -86,16 +85,3 @@ class Mesh(Format):
         faces["vertex_indices"] = given.faces
         elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
         PlyData(elements, byte_order="<").write(str(path))
-
-
-@torch.no_grad()
-def look(moment: Moment, frame: Frame) -> Look:
-    """The moment's values as the camera of a frame sees them."""
-    seen, module = moment.seen, moment.module
-    output = module.renderer(
-        seen.means, seen.quats, seen.scales, seen.opacities[None], moment.blended[:, None], frame.camera, None, (1,),
-        depth=True,
-    )  # fmt: skip
-    alpha = output.alpha[0]
-    means = (output.features[..., 0] / alpha).where(alpha >= OPEN, torch.nan)
-    return Look(frame.camera, surface_depth(output.depth, alpha), moment.of_blended(means))

@@ -5,12 +5,11 @@ from __future__ import annotations
 import gzip
 import math
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heatsplat.export.formats.base import Format, checked_range, colours_of, opacities_of
+from heatsplat.export.formats.base import Coloured
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import upright
 from heatsplat.geometry.spherical_harmonics import C0
@@ -22,22 +21,19 @@ COLOUR_SCALE = 0.15
 STEPS = 511  # of a component of a rotation, to each side
 
 
-class Spz(Format):
+class Spz(Coloured):
     """Gaussians coloured at a moment, y up; colours, opacities and sizes in 8 bits, without temperatures.
 
     Args:
-        colormap, range_c: as in ``formats.ply``.
+        colormap, range_c: as in ``Coloured``.
     """
 
     suffix = ".spz"
 
-    def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, checked_range(range_c)
-
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.double().numpy() for values in upright(moment))
-        opacities = opacities_of(moment, self.colormap).numpy()
-        colours = (colours_of(moment, self.colormap, self.range_c) - 0.5) / C0
+        opacities = self.opacities(moment).numpy()
+        colours = (self.colours(moment) - 0.5) / C0
         largest = float(np.abs(means).max())
         bits = int(min(MOST_FRACTION, math.floor(math.log2(PLACES / max(largest, 1e-9)))))
         if bits < 1:

@@ -1,10 +1,9 @@
-// The page: what is shown, how one moves, and what the controls do.
+// The page: what is shown, and how one moves in it.
 
 const $ = (id) => document.getElementById(id);
-const COLOURS = ["#ff9e4a", "#6cb6ff", "#7bd88f", "#f07ab8", "#c9a2ff", "#e8d44d", "#5fd3d0", "#ff7b72"];
 const AT_CAMERAS = "Images of cameras are known where and when they were taken: N and P go to the next.";
 const OTHER_CLOCK = "Images do not tell how far the clocks of both runs are apart: each counts from its own first training image.";
-const CHART_TIMES = 121, BINS = 96, PLAY_LIMIT_MS = 45, SAME_MOMENT_S = 1e-3, DIFFERENCES = "RdBu_r";
+const BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
 
 class Viewer {
   constructor(payload) {
@@ -12,7 +11,7 @@ class Viewer {
     this.splats = new Splats(payload);
     this.drawing = new Drawing($("canvas"));
     this.scene = this.drawing.load(this.splats);
-    this.run = null;  // a second one: {told, scene, sorter, later}
+    this.run = null;  // a second one
     this.sorter = new Sorter(this.splats, (ids) => {
       this.drawing.order(this.scene, ids);
       this.request();
@@ -28,17 +27,17 @@ class Viewer {
     this.off = new Set();  // parts of the camera's model that are switched off
     this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, spots: false, at: 0,
       time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
-    this.probes = [];
+    this.probes = new Probes(this);
     this.camera = this.cameras[0].camera;
     this.target = this.told.centre;
     this.quality = 1;
     this.errors = [];
     this.stale = { values: true, order: true };
     this.build();
-    this.listen();
+    new Controls(this).listen();
     this.goTo(0);
     this.fit();
-    for (const point of this.told.probes) if (this.probes.length < 3) this.pinPoint(point);
+    for (const point of this.told.probes) if (this.probes.list.length < 3) this.probes.pinPoint(point);
     this.request();
   }
 
@@ -332,11 +331,7 @@ class Viewer {
     if (other === "time" && layer) splats.fill(layer, otherTime, scene.filled, 1, 2);
     else if (beside && layer) splats.fill(beside, time, scene.filled, 1, 2);
     this.drawing.update(scene);
-    if (this.run && other === "run") {
-      const second = this.run.scene.splats;
-      second.fill(second.layer(this.state.quantity) || second.layers[0], time + this.run.later, this.run.scene.filled, 0, 2);
-      this.drawing.update(this.run.scene);
-    }
+    if (this.run && other === "run") this.run.fill(this.state.quantity, time);
   }
 
   paint() {
@@ -431,15 +426,14 @@ class Viewer {
       if (seen === null) return null;
       second = other === "recorded" ? seen : Math.min(Math.max(first + seen, told.limits[0]), told.limits[1]);
     } else if (other === "run") {
-      if (!ofRun || ofRun[j + 3] < 0.05) return null;
-      const [start, end] = this.run.told.tableEnds, rest = 1 - ofRun[j + 3];
-      second = this.run.scene.splats.decoded(ofRun[j + 3] * start + ofRun[j] * (end - start) + rest * this.run.told.background);
+      second = ofRun ? this.run.valueOf(ofRun, j) : null;
+      if (second === null) return null;
     } else second = value(blended[j + 1], other === "time" ? layer : splats.layer(other));
     return this.differing ? first - second : second;
   }
 
   // What was blended of a second run in a rectangle, where one is compared.
-  readRun(x, y, width, height) {
+  blendedOfRun(x, y, width, height) {
     return this.beside === "run" && this.run && this.layer ? this.drawing.read("second", x, y, width, height) : null;
   }
 
@@ -448,7 +442,7 @@ class Viewer {
     const { width, height } = $("canvas");
     const content = this.drawing.read("first", 0, 0, width, height);
     if (!content) return [];
-    const ofRun = this.readRun(0, 0, width, height);
+    const ofRun = this.blendedOfRun(0, 0, width, height);
     const stride = 4 * Math.max(1, Math.round(width * height / 60000)), found = [];
     for (let j = 0; j < content.length; j += stride) {
       const value = this.valueOf(content, j, j / 4 % width, height - 1 - Math.floor(j / 4 / width), ofRun);
@@ -498,7 +492,7 @@ class Viewer {
   // The hottest and the coldest place of the picture, left of the divider where there is one: {x, y, value}, in canvas pixels.
   extremes() {
     if (this.state.quantity === "visible") return null;
-    const { width, height } = $("canvas"), ofRun = this.readRun(0, 0, width, height), content = this.drawing.read("first", 0, 0, width, height);
+    const { width, height } = $("canvas"), ofRun = this.blendedOfRun(0, 0, width, height), content = this.drawing.read("first", 0, 0, width, height);
     const step = Math.max(1, Math.round(Math.sqrt(width * height / 2e5)));
     const end = this.beside !== "nothing" && !this.differing ? this.state.split * width : width;
     let hot = null, cold = null;
@@ -523,15 +517,6 @@ class Viewer {
 
   get stem() {
     return `${this.told.scene}_${this.told.method}`.replace(/[^\w.-]+/g, "_");
-  }
-
-  // The curves of the probes as a table: a row for each moment, and of each probe the model and, where it is known, the truth.
-  curves() {
-    const unit = this.told.unit ? ` (${this.told.unit})` : "";
-    const columns = this.probes.flatMap((one) => [[`probe ${one.name}${unit}`, one.model], [`probe ${one.name} truth${unit}`, one.truth]])
-      .filter(([, values]) => values);
-    const rows = this.chartTimes.map((time, i) => [time.toFixed(3), ...columns.map(([, values]) => values[i].toFixed(unit ? 3 : 5))]);
-    return [["time (s)", ...columns.map(([name]) => name)], ...rows].map((row) => row.join()).join("\n") + "\n";
   }
 
   // The picture with its marks and, below it, the scale and the time: a canvas.
@@ -622,7 +607,7 @@ class Viewer {
       + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
     drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
     this.drawMarks();
-    this.drawProbes();
+    this.probes.draw();
   }
 
   drawMarks() {
@@ -642,7 +627,7 @@ class Viewer {
         node("path", { class: "frustum", d: path }, svg);
       }
     }
-    this.probes.forEach((probe) => {
+    this.probes.list.forEach((probe) => {
       const at = place(probe.point);
       if (!at) return;
       node("circle", { cx: at[0], cy: at[1], r: 6, fill: probe.colour, stroke: "#fff", "stroke-width": 2 }, svg);
@@ -660,92 +645,12 @@ class Viewer {
     }
   }
 
-  // Probes ----------------------------------------------------------------------------------------------------------
+  // At the pointer --------------------------------------------------------------------------------------------------
 
   // Pixel of the camera's image at a place of the window.
   pixelAt(clientX, clientY) {
     const canvas = $("canvas"), box = canvas.getBoundingClientRect(), ratio = canvas.width / box.width, { view } = this;
     return [((clientX - box.left) * ratio - view.left) / view.scale, ((clientY - box.top) * ratio - view.top) / view.scale];
-  }
-
-  pin(px, py, name) {
-    const pixel = this.splats.weightsAt(this.camera, px, py);
-    if (pixel.left > 0.9) {
-      this.say("Nothing is there to measure.");
-      return null;
-    }
-    if (this.probes.length === COLOURS.length) this.probes.shift();
-    const used = this.probes.map((probe) => probe.colour);
-    this.numbered = (this.numbered || 0) + 1;
-    const probe = { name: name || String(this.numbered), colour: COLOURS.find((one) => !used.includes(one)), pixel, camera: this.camera, px, py,
-      point: this.camera.point(px, py, pixel.depth), dots: [] };
-    const [start, end] = this.told.span || [0, 0];
-    this.chartTimes = Array.from({ length: this.told.span ? CHART_TIMES : 1 }, (_, i) => start + i / (CHART_TIMES - 1) * (end - start));
-    this.probes.push(probe);
-    this.measure(probe);
-    if (this.told.span && !this.splats.layer("truth")) this.gatherDots(probe, 0);
-    this.request();
-    return probe;
-  }
-
-  measure(probe) {
-    const truth = this.splats.layer("truth");
-    const layer = this.layer || this.splats.layers[0];
-    probe.layer = layer;
-    probe.model = this.splats.seriesAt(probe.pixel, layer, this.chartTimes);
-    probe.truth = truth && layer !== truth ? this.splats.seriesAt(probe.pixel, truth, this.chartTimes) : null;
-  }
-
-  // What training images recorded of a probe: from cameras that see the point and nothing before it.
-  gatherDots(probe, i) {
-    if (i >= this.cameras.length || !this.probes.includes(probe)) return this.request();
-    const one = this.cameras[i], seen = one.camera.project(probe.point);
-    if (seen && one.time !== null && seen[0] >= 0 && seen[1] >= 0 && seen[0] < one.width && seen[1] < one.height) {
-      const { depth } = this.splats.weightsAt(one.camera, seen[0], seen[1]);
-      const [rows, columns] = one.size;
-      const value = one.recorded[Math.floor(seen[1] / one.height * rows) * columns + Math.floor(seen[0] / one.width * columns)];
-      if (Math.abs(depth - seen[2]) < 0.05 * seen[2] && !Number.isNaN(value)) probe.dots.push([one.time, value]);
-    }
-    setTimeout(() => this.gatherDots(probe, i + 1));
-    return undefined;
-  }
-
-  pinPoint(point) {
-    const seen = this.camera.project(point);
-    if (!seen || seen[0] < 0 || seen[1] < 0 || seen[0] > this.camera.width || seen[1] > this.camera.height) return;
-    const pixel = this.splats.weightsAt(this.camera, seen[0], seen[1]);
-    if (pixel.left < 0.5 && Math.abs(pixel.depth - seen[2]) < 0.05 * seen[2]) this.pin(seen[0], seen[1]);
-  }
-
-  drawProbes() {
-    const unit = this.told.unit, list = $("probes");
-    $("curves").hidden = !this.told.span || !this.probes.length;
-    $("chart").style.display = this.told.span && this.probes.length ? "" : "none";
-    if (this.told.span) drawCurves($("chart"), this.chartTimes || [], this.probes, this.state.time, unit, this.told.record);
-    const dots = this.probes.some((probe) => probe.dots.length), truth = this.probes.some((probe) => probe.truth);
-    $("chartNote").textContent = !this.told.span || !this.probes.length ? "" : `Lines: model${truth ? "; dashes: truth" : dots ? "; dots: training images" : ""}.`;
-    const items = this.probes.map((probe) => {
-      const item = document.createElement("li"), swatch = document.createElement("i");
-      const [value] = this.splats.seriesAt(probe.pixel, probe.layer, [this.state.time]);
-      const text = (content) => Object.assign(document.createElement("span"), { textContent: content });
-      swatch.style.background = probe.colour;
-      const close = Object.assign(document.createElement("button"), { textContent: "✕", title: `Take probe ${probe.name} away` });
-      close.setAttribute("aria-label", close.title);
-      close.onclick = () => {
-        this.probes = this.probes.filter((one) => one !== probe);
-        this.request();
-      };
-      item.append(swatch, text(`probe ${probe.name}`), text(unit ? `${value.toFixed(2)} ${unit}` : value.toFixed(4)), close);
-      if (this.splats.attributes.length) {
-        const number = (value) => Number.isNaN(value) ? "unknown" : Number(value.toPrecision(3));
-        const told = this.splats.attributes.map((one) => `${one.label} ${number(this.splats.attributeAt(probe.pixel, one))} ${one.unit}`.trim());
-        item.append(Object.assign(document.createElement("small"), { textContent: told.join(" · ") }));
-      }
-      return item;
-    });
-    const focused = [...list.querySelectorAll("button")].indexOf(document.activeElement);
-    list.replaceChildren(...items);
-    if (focused >= 0) (list.querySelectorAll("button")[focused] || $("canvas")).focus();
   }
 
   // A value of the picture, with its unit.
@@ -759,7 +664,7 @@ class Viewer {
     const x = Math.floor((clientX - box.left) * ratio), y = Math.floor((clientY - box.top) * ratio);
     const readout = $("readout");
     const inside = x >= 0 && y >= 0 && x < canvas.width && y < canvas.height;
-    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y, this.readRun(x, y, 1, 1)) : null;
+    const value = inside ? this.valueOf(this.drawing.read("first", x, y, 1, 1) || [0, 0, 0, 0], 0, x, y, this.blendedOfRun(x, y, 1, 1)) : null;
     readout.hidden = value === null;
     if (value === null) return;
     readout.textContent = this.words(value);
@@ -778,7 +683,7 @@ class Viewer {
       this.goTo(this.state.at ?? this.lastCamera ?? 0, true);
       this.say(AT_CAMERAS);
     }
-    if (this.layer && this.chartTimes) this.probes.forEach((probe) => this.measure(probe));
+    if (this.layer) this.probes.list.forEach((probe) => this.probes.measure(probe));
     const besideIt = "other" in changes && !this.byHand && (this.state.other === "time" || this.splats.layer(this.state.other));
     if (besideIt && this.layer && !this.differing) {  // colours for both sides
       this.frame(performance.now());
@@ -815,182 +720,22 @@ class Viewer {
     $("keys").scrollTop = 0;  // the button that has the focus is at its end
   }
 
-  // How many seconds later another run counts the same moment, from images that both know by name; null where these do not tell.
-  laterIn(told) {
-    const moments = ({ cameras, moments = [] }) => [...cameras.map((one) => [one.name, one.time]), ...moments].filter(([, time]) => time !== null);
-    const own = new Map(moments(this.told));
-    const apart = moments(told).filter(([name]) => own.has(name)).map(([name, time]) => time - own.get(name)).sort((a, b) => a - b);
-    return apart.length && apart.at(-1) - apart[0] < SAME_MOMENT_S ? apart[apart.length >> 1] : null;
-  }
-
   async openRun(file) {
     try {
-      const page = new DOMParser().parseFromString(await file.text(), "text/html");
-      const payload = await readPayload(page);
-      if (payload.told.unit !== this.told.unit) throw new Error(`its values are in ${payload.told.unit || "image values"}, these in ${this.told.unit || "image values"}`);
+      const payload = await readRun(file, this.told);
       if (this.run) this.run.sorter.stop();
-      const splats = new Splats(payload), scene = this.drawing.load(splats);
-      const sorter = new Sorter(splats, (ids) => {
-        this.drawing.order(scene, ids);
-        this.request();
-      });
-      const { told } = payload, later = this.told.span && told.span ? this.laterIn(told) : 0;
-      this.run = { told, scene, sorter, later: later ?? 0 };
-      sorter.sort(this.camera);
+      this.run = new SecondRun(payload, this);
+      this.run.sorter.sort(this.camera);
       $("other").querySelector("[value=run]")?.remove();
-      $("other").append(new Option(`run${later === null ? " by its own clock" : ""}: ${told.method}, ${told.scene}`, "run"));
+      $("other").append(new Option(this.run.label, "run"));
       this.choose({ other: "run" });
-      if (later === null) this.say(OTHER_CLOCK);
+      if (this.run.ownClock) this.say(OTHER_CLOCK);
     } catch (error) {
       this.say(`${file.name} cannot be opened: ${error.message}`);
     }
   }
 
-  listen() {
-    const canvas = $("canvas");
-    const pointers = new Map();
-    let moved = 0, pinch = 0, alone = true;
-    let clicks = [];  // the probes before each of the last two
-    canvas.onpointerdown = (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      pointers.set(event.pointerId, event);
-      alone = pointers.size === 1;
-      moved = 0;
-      this.dragging = true;
-      this.keyboard = false;
-    };
-    canvas.onpointermove = (event) => {
-      const before = pointers.get(event.pointerId);
-      if (!before) return this.hover(event.clientX, event.clientY);
-      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
-      moved += Math.hypot(dx, dy);
-      pointers.set(event.pointerId, event);
-      if (pointers.size === 2) {
-        const [a, b] = [...pointers.values()], now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
-        if (pinch) this.nearer(Math.log(now / pinch) / 0.08);
-        pinch = now;
-      } else if (moved > 3) {
-        if (event.buttons & 2 || event.shiftKey) this.move(-dx * 0.03, -dy * 0.03, 0);
-        else this.turn(dx * 0.006, -dy * 0.006);
-      }
-      return undefined;
-    };
-    const ended = (event) => {
-      const known = pointers.delete(event.pointerId);
-      pinch = 0;
-      this.dragging = pointers.size > 0;
-      if (known && event.type === "pointerup" && event.button === 0) {
-        clicks = [...clicks.slice(-1), { probes: [...this.probes], numbered: this.numbered }];
-        if (alone && moved <= 3) this.pin(...this.pixelAt(event.clientX, event.clientY));
-      }
-      this.request();
-    };
-    canvas.onpointerup = ended;
-    canvas.onpointercancel = ended;
-    canvas.onpointerleave = () => { $("readout").hidden = true; };
-    canvas.oncontextmenu = (event) => event.preventDefault();
-    canvas.ondblclick = (event) => {
-      Object.assign(this, clicks[0]);  // its clicks pinned nothing
-      this.request();
-      const [px, py] = this.pixelAt(event.clientX, event.clientY), pixel = this.splats.weightsAt(this.camera, px, py);
-      if (pixel.left < 0.9) this.target = this.camera.point(px, py, pixel.depth);
-    };
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.nearer(-event.deltaY / (event.deltaMode ? 3 : 60));
-    }, { passive: false });
-    canvas.onfocus = canvas.onblur = () => this.request();
-    const slide = (event) => {
-      const box = canvas.getBoundingClientRect();
-      this.state.split = Math.min(Math.max((event.clientX - box.left) / box.width, 0.02), 0.98);
-      this.request();
-    };
-    $("divider").onpointerdown = (event) => {
-      $("divider").setPointerCapture(event.pointerId);
-      $("divider").onpointermove = slide;
-    };
-    $("divider").onpointerup = $("divider").onpointercancel = () => { $("divider").onpointermove = null; };
-
-    $("quantity").onchange = () => this.choose({ quantity: $("quantity").value });
-    $("other").onchange = () => this.choose({ other: $("other").value });
-    for (const input of document.querySelectorAll("input[name=how]")) input.onchange = () => this.choose({ how: input.value });
-    for (const input of document.querySelectorAll("input[name=move]")) input.onchange = () => this.choose({ walk: input.value === "walk" });
-    $("map").onchange = () => this.choose({ map: $("map").value });
-    $("auto").onclick = () => {
-      this.byHand = false;
-      this.fit();
-    };
-    $("spots").onchange = () => this.choose({ spots: $("spots").checked });
-    $("save").onclick = () => this.picturePage().toBlob((blob) => this.keep(`${this.stem}.png`, blob));
-    $("curves").onclick = () => this.keep(`${this.stem}_probes.csv`, new Blob([this.curves()], { type: "text/csv" }));
-    const ends = () => {
-      const typed = ["low", "high"].map((id) => $(id).value), log = this.attribute?.log;
-      const [low, high] = typed.map((text) => log ? Math.log10(Number(text)) : Number(text));
-      this.request();
-      this.refused = true;  // the ends that hold are shown again
-      if (typed.includes("")) return;
-      if (![low, high].every(Number.isFinite)) return this.say("Both ends of logarithmic colours must be above 0.");
-      if (!(low < high)) return this.say("The lower end of the colours must be below the upper one.");
-      this.refused = false;
-      this.state.ranges[this.rangeName] = [low, high];
-      this.byHand = true;
-    };
-    $("low").onchange = $("high").onchange = ends;
-    $("time").oninput = () => this.setTime(Number($("time").value));
-    $("otherTime").oninput = () => this.choose({ otherTime: Number($("otherTime").value) });
-    $("play").onclick = () => this.play(!this.state.playing);
-    $("theme").onclick = () => this.theme();
-    $("help").onclick = () => this.help();
-    $("fold").onclick = () => this.fold(!document.body.classList.contains("folded"));
-    $("run").onchange = () => $("run").files[0] && this.openRun($("run").files[0]);
-    document.body.ondragover = (event) => event.preventDefault();
-    document.body.ondrop = (event) => {
-      event.preventDefault();
-      if (event.dataTransfer.files[0]) this.openRun(event.dataTransfer.files[0]);
-    };
-    new ResizeObserver(() => this.request()).observe($("stage"));
-    document.addEventListener("keydown", (event) => this.pressed(event));
-  }
-
-  pressed(event) {
-    const { target, key } = event;
-    if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
-    const moves = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"], presses = ["Enter", " "];
-    const own = target.matches("[type=range]") ? moves : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
-    if (target.matches("input[type=number], select") || own.includes(key)) return;
-    const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
-    const actions = {
-      ArrowLeft: () => this.turn(turn, 0), ArrowRight: () => this.turn(-turn, 0),
-      ArrowUp: () => this.turn(0, -turn), ArrowDown: () => this.turn(0, turn),
-      w: () => this.move(0, 0, far), s: () => this.move(0, 0, -far), a: () => this.move(-far, 0, 0), d: () => this.move(far, 0, 0),
-      q: () => this.move(0, far, 0), e: () => this.move(0, -far, 0),
-      "+": () => this.nearer(2), "=": () => this.nearer(2), "-": () => this.nearer(-2), _: () => this.nearer(-2),
-      " ": () => this.play(!this.state.playing),
-      ",": () => this.stepTime(-1), ".": () => this.stepTime(1), "<": () => this.stepTime(-10), ">": () => this.stepTime(10),
-      ";": () => this.stepTime(-10), ":": () => this.stepTime(10),
-      n: () => this.goTo((this.lastCamera ?? -1) + 1, true), p: () => this.goTo((this.lastCamera ?? 1) - 1, true),
-      Enter: () => this.pin(...this.middle()),
-      Delete: () => this.probes.pop() && this.request(), Backspace: () => this.probes.pop() && this.request(),
-      v: () => this.cycle("quantity", "quantity"), b: () => this.cycle("other", "other"),
-      f: () => this.choose({ how: this.state.how === "swipe" ? "difference" : "swipe" }),
-      "[": () => this.choose({ split: Math.max(this.state.split - 0.04, 0.02) }),
-      "]": () => this.choose({ split: Math.min(this.state.split + 0.04, 0.98) }),
-      c: () => this.cycle("map", "map"), r: () => this.fit(),
-      x: () => this.choose({ spots: !this.state.spots }),
-      o: () => {
-        this.choose({ walk: !this.state.walk });
-        this.say(this.state.walk ? "walk" : "orbit");
-      },
-      t: () => this.theme(), h: () => this.help(), "?": () => this.help(),
-      "\\": () => this.fold(!document.body.classList.contains("folded")),
-    };
-    const action = actions[key.length === 1 ? key.toLowerCase() : key];
-    if (!action) return;
-    event.preventDefault();
-    this.keyboard = true;
-    action();
-  }
-
+  // Pixel in the middle of the canvas.
   middle() {
     const { view } = this, { width, height } = $("canvas");
     return [(width / 2 - view.left) / view.scale, (height / 2 - view.top) / view.scale];

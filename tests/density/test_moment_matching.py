@@ -4,7 +4,7 @@ import mpmath
 import pytest
 import torch
 
-from heatsplat.density.moments import KEPT, Shapes, merged
+from heatsplat.density.moment_matching import KEPT, Shapes, merged
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.splats import Splats
 
