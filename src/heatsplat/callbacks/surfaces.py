@@ -83,8 +83,9 @@ def middle(scene: SceneData, frame: Frame) -> Frame:
 
 @torch.no_grad()
 def look(module: pl.LightningModule, frame: Frame) -> Look:
-    """What the model shows in a frame, without what its camera adds, °C."""
-    output = module.render(frame, depth=True)
+    """What the model shows in a frame, without what its camera adds, °C. It is that of the frame's camera as it is given, by
+    whose rays it is read."""
+    output = module.render(frame, depth=True, camera=frame.camera)
     values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
     return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
 

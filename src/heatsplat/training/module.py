@@ -571,13 +571,23 @@ class SplatTraining(pl.LightningModule):
         found = dict(zip(told, maps.unbind(-1), strict=True))
         return found | self.thermal.quotients(found)
 
-    def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
-        """What the camera of ``frame`` sees of values [N, C] of all rows of the splats, before black, in the first modality."""
+    def composited(
+        self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0, camera: Camera | None = None
+    ) -> RenderOutput:
+        """What is seen of values [N, C] of all rows of the splats, before black, in the first modality; from where ``render``
+        takes the image."""
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
         if self.thermal.per_row > 1:
             values = values.repeat_interleave(self.thermal.per_row, dim=0)
         return self.renderer(
-            *shape, opacities[:1], values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
+            *shape,
+            opacities[:1],
+            values,
+            camera or self.cameras.of(frame),
+            None,
+            (values.shape[1],),
+            depth=depth,
+            ratio=ratio,
         )
 
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
