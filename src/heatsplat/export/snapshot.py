@@ -111,7 +111,7 @@ def snapshot(module: Any) -> Snapshot:
         )
     scene: SceneData = module.scene
     span = span_of(scene)
-    middle = None if span is None else 0.5 * (min(scene.train.times_s) + max(scene.train.times_s))
+    middle = None if span is None else scene.middle_s
     first = scene.train.frames[0]
     own_id = first_free_id(scene)
 
@@ -221,15 +221,14 @@ def span_of(scene: SceneData) -> tuple[float, float] | None:
     """First and last moment of all views; None without times or where all are the same."""
     if "time" not in scene.metadata:
         return None
-    times = [time for views in (scene.train, scene.val, scene.test) for time in views.times_s if time is not None]
+    times = [frame.time_s for frame in scene.frames if frame.time_s is not None]
     return (min(times), max(times)) if max(times) > min(times) else None
 
 
 def _scale(scene: SceneData, modality: str) -> tuple[float, str]:
     """What an image value of 1 is in the unit of the scene, and that unit."""
-    if scene.thermal_range is None or modality != "thermal":
-        return 1.0, ""
-    return scene.thermal_range.span_k, "°C"
+    bounds = scene.range_of(modality)
+    return (1.0, "") if bounds is None else (bounds.span_k, "°C")
 
 
 def _slope(blended: Callable[[Tensor], Tensor], to_unit: float, channels: int) -> float:
@@ -275,7 +274,7 @@ def _layer(
 def _surface(module: Any, blended: Callable, kept: Tensor) -> ValuesAt | None:
     """Blended values of the temperature of the surface, where the model tells one."""
     scene = module.scene
-    if scene.thermal_range is None or module.modality != "thermal" or "time" not in scene.metadata:
+    if scene.range_of(module.modality) is None or "time" not in scene.metadata:
         return None
     if module.thermal.temperature(module.splats, scene.record[0]) is None:
         return None
@@ -314,8 +313,8 @@ def _ends(layers: list[Layer], background: float) -> tuple[float, float]:
 def _table(module: Any, scene: SceneData, ends: tuple[float, float], channels: int) -> Tensor:
     values = torch.linspace(*ends, TABLE, dtype=torch.float64)[:, None].expand(-1, channels)
     shown = module.composite.decode(values, channels)[:, 0]
-    celsius = scene.thermal_range if _scale(scene, module.modality)[1] else None
-    return (shown if celsius is None else celsius.to_celsius(shown)).float()
+    bounds = scene.range_of(module.modality)
+    return (shown if bounds is None else bounds.to_celsius(shown)).float()
 
 
 def _colours(module: Any, emitted: Tensor, opacities: Tensor) -> tuple[Tensor | None, Tensor | None]:

@@ -417,7 +417,7 @@ class SplatTraining(pl.LightningModule):
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         terms |= self.cameras.regularisers()
         if signs is not None:
-            terms["entropy"] = self.overlap.entropy(output, here)
+            terms["entropy"] = self.overlap.entropy(output)
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size

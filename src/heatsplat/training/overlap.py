@@ -21,7 +21,7 @@ class Overlap:
         """Random signs [N] to be composited in this step (``rasterization``); None where ``entropy`` is not wanted."""
         return None
 
-    def entropy(self, output: RenderOutput, step: int) -> Tensor:
+    def entropy(self, output: RenderOutput) -> Tensor:
         """A loss term, a scalar, where ``signs_at`` gave signs; here there are none, and it is 0."""
         return output.features.new_zeros(())
 
@@ -85,7 +85,7 @@ class ShortLists(Overlap):
             return None
         return 2.0 * torch.randint(2, (count,), generator=generator_for(seed, step, "signs")) - 1.0
 
-    def entropy(self, output: RenderOutput, step: int) -> Tensor:
+    def entropy(self, output: RenderOutput) -> Tensor:
         alone = output.signed.square() + (1.0 - output.alpha[0]).square()
         return self.weight * (1.0 - alone.mean())
 
