@@ -28,11 +28,13 @@ from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, ThermalModel
+from heatsplat.training.adam import load_waiting_gradients, waiting_gradients
 from heatsplat.training.averaging import Average
 from heatsplat.training.cameras import Cameras, aligned, seen_depths
 from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
+from heatsplat.training.loop import plain
+from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
@@ -135,13 +137,6 @@ class SplatTraining(pl.LightningModule):
         self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
-        if name == "_current_fx_name":
-            object.__setattr__(self, name, value)
-        else:
-            super().__setattr__(name, value)
-
     # Set-up ------------------------------------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
@@ -227,39 +222,19 @@ class SplatTraining(pl.LightningModule):
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
     def configure_optimizers(self):
-        cameras = self.cameras
+        group = self.optim.group
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
-        groups += [
-            {
-                "params": [self.splats[name]],
-                "name": name,
-                "lr": item.lr * (self.optim.pace if item.paced else 1.0),
-                "lr_end": item.lr_end,
-            }
-            | penalties(item, len(self.splats))
-            for name, item in self._declared.items()
-        ]
+        for name, item in self._declared.items():
+            rate = Rate(item.lr, item.lr_end, item.paced)
+            groups.append(group(name, self.splats[name], rate, **penalties(item, len(self.splats))))
         for name, parameter in self.thermal.named_parameters():
-            rate = self.thermal.rate_of(name)
-            lr = rate.lr * (self.optim.pace if rate.paced else 1.0)
-            held = self.optim.held(rate.held)
-            groups.append(
-                {"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": rate.lr_end, "held": held}
-            )
-        groups += [
-            {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
-            for name, part in self.sensor.parts.items()
-            for inner, parameter in part.named_parameters()
-        ]
-        groups += [
-            {
-                "params": [parameter],
-                "name": f"cameras.{name}",
-                "lr": cameras.lr * self.optim.pace,
-                "lr_end": cameras.lr_end,
-            }
-            for name, parameter in cameras.named_parameters()
-        ]
+            groups.append(group(f"thermal.{name}", parameter, self.thermal.rate_of(name)))
+        for name, part in self.sensor.parts.items():
+            for inner, parameter in part.named_parameters():
+                groups.append(group(f"sensor.{name}.{inner}", parameter, Rate(part.lr, part.lr_end)))
+        for name, parameter in self.cameras.named_parameters():
+            rate = Rate(self.cameras.lr, self.cameras.lr_end, paced=True)
+            groups.append(group(f"cameras.{name}", parameter, rate))
         optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
@@ -295,8 +270,7 @@ class SplatTraining(pl.LightningModule):
         """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
         if self.global_step < self.schedule.end:  # stopped by hand
             return
-        optimizer = self.trainer.optimizers[0]
-        found = self.merging(self, self.cloud(getattr(optimizer, "optimizer", optimizer)))
+        found = self.merging(self, self.cloud(plain(self.trainer.optimizers[0])))
         if found is not None:
             self._show(self.splats)
             self.results.run["merging"] = found
@@ -449,14 +423,14 @@ class SplatTraining(pl.LightningModule):
     def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
         step = self.global_step
         if step == 0 or self._updates(step - 1):
-            inner = getattr(optimizer, "optimizer", optimizer)
-            inner.takes_unwritten = not self.trainer.gradient_clip_val  # what Lightning clips has to be in grad
+            # What Lightning clips has to be in grad.
+            plain(optimizer).takes_unwritten = not self.trainer.gradient_clip_val
             optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
-        inner = getattr(optimizer, "optimizer", optimizer)
+        inner = plain(optimizer)
         if step in self.schedule.restarts:
             inner.state.clear()
             for statistic in self._density_state.values():
