@@ -28,7 +28,7 @@ from heatsplat.thermal.base import Rate, ThermalModel
 from heatsplat.training.adam import load_waiting_gradients, waiting_gradients
 from heatsplat.training.averaging import Average
 from heatsplat.training.cameras import Cameras
-from heatsplat.training.init import Initialisation
+from heatsplat.training.init import Start
 from heatsplat.training.loop import plain
 from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
@@ -86,7 +86,7 @@ class SplatTraining(SceneModel):
         sensor: SensorChain,
         density: DensityControl,
         loss: Loss,
-        init: Initialisation,
+        init: Start,
         optim: Optimisation,
         stages: Stages | None = None,
         composite: Composite | None = None,
@@ -187,7 +187,7 @@ class SplatTraining(SceneModel):
             )
         if rows != GAUSSIANS and self.smoothing.changes:
             raise SceneError(f"{model} {what}, which no filter of Gaussians in space knows: give smoothing=none")
-        if rows == NOTHING and type(self.overlap) is not Overlap:
+        if rows not in self.overlap.rows:
             raise SceneError(
                 f"{model} {what}, whose sizes {type(self.overlap).__name__} would reset: give overlap=none"
             )

@@ -9,13 +9,20 @@ from torch import Tensor
 
 from heatsplat.contracts import RenderOutput
 from heatsplat.density.ops import Cloud
+from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING
 from heatsplat.training.rng import generator_for
 
 RECOVERY = 0.5  # share of the steps between two resets after which sizes have come back (ours)
 
 
 class Overlap:
-    """Does nothing: nothing is stored and nothing is computed."""
+    """Does nothing: nothing is stored and nothing is computed.
+
+    Attributes:
+        rows: of which models (``ThermalModel.rows``) it knows the rows of the splats.
+    """
+
+    rows = frozenset({GAUSSIANS, ANCHORS, NOTHING})
 
     def signs_at(self, step: int, count: int, seed: int) -> Tensor | None:
         """Random signs [N] to be composited in this step (``rasterization``); None where ``entropy`` is not wanted."""
@@ -57,6 +64,8 @@ class ShortLists(Overlap):
 
     Source: Speeding Up the Learning of 3D Gaussians with Much Shorter Gaussian Lists (CVPR 2026).
     """
+
+    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(
         self,
