@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, ViewSet, evenly_spread
 
 
 @pytest.mark.parametrize(
@@ -29,3 +29,28 @@ def test_a_camera_projects_points_of_the_world():
     pixels, depths = Camera(viewmat, K, 60, 40).project(torch.tensor([[1.0, 1.0, 2.0], [0.0, 0.0, -3.0]]))
     assert pixels[0].tolist() == [100 / 4 + 30, 50 * 2 / 4 + 20]
     assert depths.tolist() == [4.0, -1.0] and pixels.dtype == depths.dtype == torch.float64
+
+
+def scene(times_s, test_times_s=()) -> SceneData:
+    """Training frames, and test frames of which validation has the first as well."""
+    at = Camera(torch.eye(4), torch.eye(3), 8, 6)
+    frames = [Frame(f"{i}.png", i, at, time_s) for i, time_s in enumerate((*times_s, *test_times_s))]
+    parts = frames[: len(times_s)], frames[len(times_s) :][:1], frames[len(times_s) :]
+    return SceneData(
+        "a", *(ViewSet(part, list) for part in parts), torch.zeros(1, 3), thermal_range=ThermalRange(10, 50)
+    )
+
+
+def test_the_frames_of_a_scene_are_those_of_all_splits_once():
+    assert [frame.frame_id for frame in scene([0.0, 8.0], [3.0, 9.0]).frames] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("times_s", "middle_s"), [([2.0, 12.0, 4.0], 7.0), ([None, 3.0], 3.0), ([None], None)])
+def test_the_middle_of_a_record_lies_between_its_ends(times_s, middle_s):
+    assert scene(times_s, [100.0]).middle_s == middle_s
+
+
+def test_thermal_images_alone_have_a_range():
+    known = scene([0.0])
+    assert known.range_of("thermal") is known.range_of("clean") is known.thermal_range
+    assert known.range_of("rgb") is None

@@ -20,7 +20,7 @@ from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels.peak import memory_rate, vector_rate
 from heatsplat.renderers import rasterization
 from heatsplat.studies.options import check_count, filled
-from heatsplat.training.optimisation import OnePassAdam
+from heatsplat.training.adam import OnePassAdam
 
 MAPS = 3
 GROUPS = 24  # frequencies of a heat source

@@ -385,6 +385,22 @@ class SceneData:
         centers = torch.stack([frame.camera.center for frame in self.train.frames])
         return (self.points.double().median(0).values - centers).norm(dim=1).median().item()
 
+    def range_of(self, modality: str) -> ThermalRange | None:
+        """The range of the images of a modality ("clean" is a thermal image, too); None where they are no temperatures."""
+        return self.thermal_range if modality in ("thermal", "clean") else None
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The frames of all splits, those of training first, each once though splits may share it."""
+        parts = (self.train, self.val, self.test)
+        return tuple({frame.frame_id: frame for part in parts for frame in part.frames}.values())
+
+    @property
+    def middle_s(self) -> float | None:
+        """The middle of the training record in seconds; None where no training view has a time."""
+        times = [time_s for time_s in self.train.times_s if time_s is not None]
+        return (min(times) + max(times)) / 2 if times else None
+
     @property
     def record(self) -> tuple[float, float]:
         """First training time in seconds and the span from there to the last; a span of 1 where all are the same.

@@ -59,7 +59,7 @@ def shot_frames(
     if time is None:
         record = [t for t in scene.train.times_s if t is not None]
         if record:
-            time = (min(record), max(record)) if trajectory == "view" else (min(record) + max(record)) / 2
+            time = (min(record), max(record)) if trajectory == "view" else scene.middle_s
     moments = [None] * count if time is None else _moments(time, count)
     first_free = first_free_id(scene)
     return [
@@ -97,7 +97,7 @@ def checked_unseen(name: str, value: str | float) -> str:
 
 def first_free_id(scene: SceneData) -> int:
     """The first ``frame_id`` that no frame of the scene has."""
-    return 1 + max(frame.frame_id for part in (scene.train, scene.test) for frame in part.frames)
+    return 1 + max(frame.frame_id for frame in scene.frames)
 
 
 def at_time(scene: SceneData, frame: Frame, moment: float | None) -> Frame:

@@ -144,7 +144,7 @@ class Uncertainty:
     then makes the interval hold 68 % of their pixels beyond the noise of the camera. What no training view has seen has the
     whole prior on top.
 
-    **Convention:** °C; image values where the scene has no thermal range. It is the error of what the surfaces send, without
+    **Convention:** °C; image values where they are no temperatures. It is the error of what the surfaces send, without
     the noise of an image that is taken of them.
 
     Args:
@@ -165,7 +165,8 @@ class Uncertainty:
                 "Leave out weather, or uncertainty"
             )
         self.module = module
-        self.unit = scene.thermal_range.span_k if scene.thermal_range is not None else 1.0
+        bounds = scene.range_of(module.modality)
+        self.unit = 1.0 if bounds is None else bounds.span_k
         self.noise = noise_of_views(scene.train, module.modality)
         # Copies, for a slice would keep its whole image in memory.
         known = torch.cat([_pixels(view, module.modality)[::7].clone() for view in scene.train])
@@ -190,7 +191,7 @@ class Uncertainty:
             log.warning(
                 "how far off temperatures of scene '%s' are is hidden in the camera's noise of %.3g %s: intervals are as wide as "
                 "what may hide there, %.3g in the median, and errors are likely smaller",
-                scene.name, self.noise * self.unit, "image units" if scene.thermal_range is None else "°C", self.usual,
+                scene.name, self.noise * self.unit, "image units" if bounds is None else "°C", self.usual,
             )  # fmt: skip
 
     def calibrate(self, without: Collection[str] = ()) -> bool:

@@ -13,7 +13,7 @@ def test_coverage_and_width_are_scores_with_a_definition(monkeypatch, bounds):
     told = SimpleNamespace(coverage=lambda: 0.7, usual=0.2)
     monkeypatch.setattr(coverage, "Uncertainty", lambda module: told)
     results = RunResults()
-    module = SimpleNamespace(results=results, scene=SimpleNamespace(thermal_range=bounds))
+    module = SimpleNamespace(results=results, modality="thermal", scene=SimpleNamespace(range_of=lambda _: bounds))
     coverage.Coverage().on_test_epoch_end(None, module)
     assert results.test == {"coverage_68": 0.7, "deviation_c": None if bounds is None else 0.2}
     assert set(results.definitions) == {"coverage_68", "deviation_c"}

@@ -11,9 +11,8 @@ from heatsplat.geometry.looks import surface_points
 from heatsplat.io.tables import read_csv
 
 
-def render(frame, depth):
+def render(frame, depth, camera):
     """The wall in z = 4: a warm patch of 0.5 x 0.4 about (-0.5, 0.1), all else at 0.1."""
-    camera = frame.camera
     away = torch.full((camera.height, camera.width), 4.0)
     points = surface_points(camera, away)
     patch = ((points[..., 0] + 0.5).abs() < 0.25) & ((points[..., 1] - 0.1).abs() < 0.2)

@@ -6,14 +6,16 @@ import pytest
 import torch
 
 from heatsplat.callbacks.temperatures import TemperatureRenders
-from heatsplat.contracts import Camera, Frame, ThermalRange, View
+from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
 from heatsplat.io.tiff import read_temperature
 
 BOUNDS = ThermalRange(10.0, 30.0)
 
 
 def shown(folder, image: str, bounds: ThermalRange | None = BOUNDS, modality: str = "thermal") -> None:
-    module = SimpleNamespace(scene=SimpleNamespace(thermal_range=bounds), modality=modality, output_dir=folder)
+    none = ViewSet([], list)
+    scene = SceneData("a", none, none, none, torch.zeros(0, 3), thermal_range=bounds)
+    module = SimpleNamespace(scene=scene, modality=modality, output_dir=folder)
     frame = Frame("near_00004.png", 4, Camera(torch.eye(4), torch.eye(3), 3, 2))
     outputs = {
         "view": View(frame),

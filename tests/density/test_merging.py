@@ -148,7 +148,7 @@ def test_models_whose_gaussians_depend_on_each_other_are_refused_by_name(model):
 
 
 def test_images_without_degrees_are_refused(module):
-    scene = SimpleNamespace(thermal_range=None, name="photos")
+    scene = SimpleNamespace(range_of=lambda _: None, name="photos")
     with pytest.raises(SceneError, match="photos.*no temperatures"):
         FlatMerging().check(SimpleNamespace(thermal=module.thermal, modality="thermal", scene=scene))
 

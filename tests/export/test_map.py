@@ -11,6 +11,7 @@ from heatsplat.export.basis import constant_basis
 from heatsplat.export.formats.map import Map
 from heatsplat.export.moment import moments
 from heatsplat.export.place import place_of
+from heatsplat.training.cameras import RefinedCameras
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
 
@@ -44,6 +45,19 @@ def test_temperature_and_attributes_lie_where_they_are(two_plates, tmp_path):
             assert values[1] == pytest.approx(seconds, rel=1e-4)
         (nothing,) = found.sample([(0.5 * (places[0][0] + places[1][0]), 0.5 * (places[0][1] + places[1][1]))])
         assert np.isnan(nothing).all()
+
+
+def test_what_was_seen_does_not_depend_on_what_cameras_were_learned(two_plates, tmp_path, monkeypatch):
+    module, shown = two_plates.module, []
+    cameras = RefinedCameras()
+    cameras.prepare(module.scene)
+    for turned_px in (0.0, 20.0):
+        torch.nn.init.constant_(cameras.moves, turned_px)
+        monkeypatch.setitem(module._modules, "cameras", cameras)
+        Map(resolution=0.1, above=[0, 0, 1]).write(two_plates, tmp_path / "a.tif")
+        with rasterio.open(tmp_path / "a.tif") as found:
+            shown.append(np.isfinite(found.read(1)))
+    assert np.array_equal(*shown) and shown[0].any()
 
 
 def test_attributes_that_few_of_a_pixel_lack_are_those_of_the_others(two_plates, tmp_path):

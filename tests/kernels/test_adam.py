@@ -8,7 +8,7 @@ import torch
 
 from heatsplat.kernels import adam
 from heatsplat.kernels.scheduling import thread_count, use_threads
-from heatsplat.training.optimisation import OnePassAdam
+from heatsplat.training.adam import OnePassAdam
 from heatsplat.training.rng import generator_for
 
 SHAPES = ((), (5,), (16, 3), (700, 2, 24), (adam.SHARE + 1,), (0, 3))

@@ -7,7 +7,7 @@ from triton_device import DEVICE
 pytest.importorskip("triton", reason="compares Triton's kernel with torch's optimiser")
 
 from heatsplat.kernels.gpu import adam
-from heatsplat.training.optimisation import OnePassAdam
+from heatsplat.training.adam import OnePassAdam
 
 SHAPES = ((), (5,), (700, 2, 24), (adam.BLOCK + 1,), (0, 3), (3, 7))
 DECAYS = (0.0, 0.1, 1e-3, 0.0, 0.0, 0.2)

@@ -306,8 +306,9 @@ class Clock(CostMeter):
 
     now = 0.0
 
-    def state_dict(self):
-        return {"seconds": {"train": self.now}}
+    @property
+    def train_seconds(self):
+        return self.now
 
 
 def a_module(steps: int = 1000):

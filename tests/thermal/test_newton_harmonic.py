@@ -16,7 +16,8 @@ from heatsplat.physics.relaxation import temperature
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
-from heatsplat.training.optimisation import OnePassAdam, penalties
+from heatsplat.training.adam import OnePassAdam
+from heatsplat.training.optimisation import penalties
 
 RANGE = ThermalRange(20.0, 70.0)
 SPAN_S = 400.0

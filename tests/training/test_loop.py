@@ -9,7 +9,8 @@ from test_runs import state_of
 
 from heatsplat.composition import compose
 from heatsplat.runs.run import begin
-from heatsplat.training.session import STEP_HOOKS, fit, without_idle_hooks
+from heatsplat.training.loop import STEP_HOOKS, without_idle_hooks
+from heatsplat.training.session import fit
 
 SHORT = (*TINY, "method=etgs", "max_steps=4", "test=false", "logger=none")
 

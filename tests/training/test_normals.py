@@ -65,7 +65,7 @@ def test_a_gaussian_faces_as_what_it_depicts_wherever_it_lies_along_the_line_of_
         means = centre + share * (scene.points - centre)
         shapes = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1), torch.full((len(means), 3), 0.15 * share)
 
-        def show(frame, values, depth=False, ratio=1.0):
+        def show(frame, values, depth=False, ratio=1.0, camera=None):
             opacities = torch.full((1, len(means)), 0.9)
             return Renderer("cpu")(
                 means, *shapes, opacities, values, frame.camera, None, (values.shape[1],), depth=depth, ratio=ratio
@@ -82,7 +82,7 @@ def test_what_no_view_shows_keeps_its_normal():
     scene = data(ROOM)
     normals, found, _ = looked(ROOM)
 
-    def hidden(frame, values, depth=False, ratio=1.0):
+    def hidden(frame, values, depth=False, ratio=1.0, camera=None):
         means = scene.points + 1e3
         shapes = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1), torch.full((len(means), 3), 0.01)
         opacities = torch.full((1, len(means)), 0.9)

@@ -58,7 +58,7 @@ def test_the_entropy_is_that_of_brute_force_in_the_mean_over_signs_and_so_is_its
     for code in range(0, every, 7):
         signs = torch.tensor([1.0] + [2.0 * ((code >> bit) & 1) - 1 for bit in range(COUNT - 1)])
         opacity = scene()[3].requires_grad_()
-        value = rule.entropy(drawn(torch.zeros(COUNT, 1), opacity, signs), 0)
+        value = rule.entropy(drawn(torch.zeros(COUNT, 1), opacity, signs))
         value.backward()
         found, slopes = found + value.item(), slopes + opacity.grad
     draws = len(range(0, every, 7))

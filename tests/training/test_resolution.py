@@ -9,10 +9,12 @@ import pytest
 import torch
 from helpers import ALL_METHODS
 from running import TINY, run
+from scipy.fft import dctn
 from test_runs import state_of
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, View
+from heatsplat.geometry.spectrum import RINGS, held
 from heatsplat.runs.stepping import Stepper
 from heatsplat.sensors.base import Composite
 from heatsplat.training import resolution
@@ -22,9 +24,7 @@ from heatsplat.training.resolution import (
     Cosine,
     Pyramid,
     area_average,
-    held,
     rendered,
-    spectrum,
 )
 
 GROWING = {
@@ -123,31 +123,23 @@ def test_noise_of_the_camera_is_no_detail():
     clean = torch.nn.functional.avg_pool2d(inverse_frequency(512).permute(2, 0, 1)[None], 9, 1, 4)[0, 0, ..., None]
     noisy = [clean + 0.7 * (white(512, seed) - 0.5) for seed in range(1, 9)]
     with_floor = first_ratio(*noisy)
-    without = 1 / np.interp(0.25, held(np.sqrt(power_by_ring(noisy))), np.linspace(0, 1, resolution.RINGS + 1))
+    without = 1 / np.interp(0.25, held(np.sqrt(power_by_ring(noisy))), np.linspace(0, 1, RINGS + 1))
     assert first_ratio(clean) == 8  # the most
     assert with_floor > 6 > 3 > without
 
 
 def power_by_ring(images):
     """Sums of amplitudes squared, times counts, by a plain loop over rings."""
-    total = np.zeros(resolution.RINGS)
+    total = np.zeros(RINGS)
     for image in images:
-        waves = resolution.dctn(image.numpy()[..., 0], norm="ortho")
+        waves = dctn(image.numpy()[..., 0], norm="ortho")
         waves[0, 0] = 0
         rows, columns = (np.arange(side) / side for side in waves.shape)
-        place = np.floor(resolution.RINGS * np.maximum(rows[:, None], columns))
-        for ring in range(resolution.RINGS):
+        place = np.floor(RINGS * np.maximum(rows[:, None], columns))
+        for ring in range(RINGS):
             inside = waves[place == ring]
             total[ring] += np.mean(inside**2) * inside.size**2
     return total
-
-
-def test_a_spectrum_is_that_of_the_wave_that_an_image_is():
-    k = 96  # half waves down 256 rows
-    wave = torch.cos(math.pi * k * (torch.arange(256, dtype=torch.float64) + 0.5) / 256)
-    found = spectrum([(0.5 + 0.2 * wave)[:, None, None].expand(256, 200, 1)])
-    assert found.argmax() == resolution.RINGS * k // 256
-    assert (np.delete(found, found.argmax()) < 1e-6 * found.max()).all()
 
 
 def test_the_finest_of_several_modalities_decides():

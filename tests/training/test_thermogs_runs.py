@@ -101,7 +101,7 @@ def test_a_trained_network_serves_another_scene_without_learning(finished, tmp_p
     [
         ("lost.ply", None, "there is no such file"),
         ("bad.ply", b"no points", "not a PLY"),
-        ("bad.ckpt", b"nothing", "no checkpoint of heatsplat"),
+        ("bad.ckpt", b"nothing", "not a checkpoint that can be read"),
     ],
 )
 def test_files_without_splats_are_refused(tmp_path, name, content, message):

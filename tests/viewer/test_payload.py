@@ -81,14 +81,13 @@ def test_the_same_images_tell_the_time_however_a_scene_is_split():
     def split(first, test_every):
         at = Camera(torch.eye(4), torch.eye(3), 8, 6)
         shown = [Frame(f"{i}.png", i, at, 10.0 * (i - first)) for i in range(50)]
-        parts = [[f for i, f in enumerate(shown) if (i % test_every == 0) == held] for held in (False, True)]
-        train, test = (SimpleNamespace(frames=part) for part in parts)
-        return SimpleNamespace(train=train, val=test, test=test)
+        train, test = ([f for i, f in enumerate(shown) if (i % test_every == 0) == held] for held in (False, True))
+        return SimpleNamespace(frames=train + test)
 
     one, other = _moments(split(0, 8)), _moments(split(3, 7))
     assert [name for name, _ in one] == [name for name, _ in other] and len(one) == MOMENTS
     assert {b - a for (_, a), (_, b) in zip(one, other, strict=True)} == {-30.0}
-    assert _moments(SimpleNamespace(**dict.fromkeys(("train", "val", "test"), SimpleNamespace(frames=[])))) == []
+    assert _moments(SimpleNamespace(frames=[])) == []
 
 
 def test_a_page_says_that_it_shows_the_mean_of_the_codes_of_images(tmp_path):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_picture
 from heatsplat.callbacks.images import file_stem
 from heatsplat.contracts import Frame, evenly_spread
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
@@ -51,10 +49,8 @@ class AttributeMaps(pl.Callback):
             if picture is None:
                 return
             name = file_stem(frames[i])
-            write_png(module.output_dir / "renders" / "attributes" / split / f"{name}.png", picture)
-            writer: Any = board(module)
-            if writer is not None:
-                writer.add_image(f"attributes/{split}/{name}", picture, step, dataformats="HWC")
+            png = write_png(module.output_dir / "renders" / "attributes" / split / f"{name}.png", picture)
+            add_picture(module, f"attributes/{split}/{name}", picture, png, step)
 
 
 class AttributeErrors(pl.Callback):
@@ -96,8 +92,7 @@ class LearnedValues(pl.Callback):
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene, frame = module.scene, module.scene.train.frames[0]
         if frame.time_s is not None:
-            start, span = scene.record
-            frame = at_time(scene, frame, start + span / 2)
+            frame = at_time(scene, frame, scene.middle_s)
         told = module.attributes(frame)
         if not told:
             return

@@ -92,7 +92,7 @@ class BudgetClock(pl.Callback):
             self._moved = step if self._moved is None else self._moved
 
     def _spent(self) -> float:
-        return self._meter.state_dict()["seconds"]["train"]
+        return self._meter.train_seconds
 
     def _dearer(self, progress: float) -> float:
         """How much longer than one of the last steps those that are left will take, for the Gaussians that are still to come.

@@ -8,7 +8,7 @@ from typing import Any
 import pytorch_lightning as pl
 from matplotlib.figure import Figure
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import SHARE_OF_RANGE, Course
 from heatsplat.io.pictures import figure_picture, time_unit, write_png
 from heatsplat.io.tables import write_csv
@@ -24,8 +24,8 @@ class LearnedCourses(pl.Callback):
     """
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        bounds = module.scene.thermal_range
-        span_k = None if bounds is None or module.modality != "thermal" else bounds.span_k
+        bounds = module.scene.range_of(module.modality)
+        span_k = None if bounds is None else bounds.span_k
         found = [
             _in_celsius(course, span_k)
             for part in (module.thermal, *module.sensor.parts.values())
@@ -41,10 +41,8 @@ class LearnedCourses(pl.Callback):
         ]
         write_csv(module.output_dir / COURSES_FILE, rows)
         picture = figure_picture(_figure(found, sorted(t for t in module.scene.train.times_s if t is not None)))
-        write_png(module.output_dir / COURSES_PICTURE, picture)
-        writer = board(module)
-        if writer is not None:
-            writer.add_image("test/courses", picture, trainer.global_step, dataformats="HWC")
+        png = write_png(module.output_dir / COURSES_PICTURE, picture)
+        add_picture(module, "test/courses", picture, png, trainer.global_step)
 
 
 def _in_celsius(course: Course, span_k: float | None) -> Course:

@@ -23,6 +23,6 @@ class Coverage(pl.Callback):
             "0.68 is right: share of pixels of held-out images within one standard deviation of what is rendered, the "
             "camera's noise included; each image by the calibration on the others"
         )
-        known = module.scene.thermal_range is not None
+        known = module.scene.range_of(module.modality) is not None
         results.put("test", "deviation_c", told.usual if known else None, "the scene has no temperature bounds")
         results.definitions["deviation_c"] = "°C: median standard deviation of the pixels of held-out images"

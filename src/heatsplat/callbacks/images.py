@@ -10,8 +10,8 @@ import numpy as np
 import pytorch_lightning as pl
 from torch import Tensor
 
-from heatsplat.callbacks.board import add_png, board
-from heatsplat.contracts import Frame, SceneData, SceneError, ThermalRange, View, check_option, evenly_spread
+from heatsplat.callbacks.board import add_picture
+from heatsplat.contracts import Frame, SceneData, SceneError, View, check_option, evenly_spread
 from heatsplat.io.pictures import (
     Panel,
     bounds_of,
@@ -90,7 +90,7 @@ class ImagePanels(pl.Callback):
         step: int,
         limits: Mapping[str, float] | None = None,
     ) -> None:
-        view, writer = outputs["view"], board(module)
+        view = outputs["view"]
         self._bounds = self._bounds or scene_bounds(module.scene, module.modality)
         for modality, image in _images(module, outputs).items():
             name = file_stem(view.frame) + ("" if modality == module.modality else f"_{modality}")
@@ -100,8 +100,7 @@ class ImagePanels(pl.Callback):
             png = write_png(path, picture)
             if self.figures is not None and split == "test":
                 write_figure(path.with_suffix(f".{self.figures}"), shown, title)
-            if writer is not None:
-                add_png(writer, f"{split}/{name}", png, *picture.shape[:2], step)
+            add_picture(module, f"{split}/{name}", picture, png, step)
 
 
 def _images(module: pl.LightningModule, outputs: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -111,7 +110,7 @@ def _images(module: pl.LightningModule, outputs: Mapping[str, Any]) -> dict[str,
 
 def scene_bounds(scene: SceneData, modality: str) -> tuple[float, float]:
     """Ends of the colours of all images of a scene, in °C or image values: those of some training images."""
-    known = _range_of(scene, modality)
+    known = scene.range_of(modality)
     values = []
     for i in evenly_spread(len(scene.train), RANGE_VIEWS):
         view = scene.train[i]
@@ -135,7 +134,7 @@ def panels(
     """Ground truth, render and error of one image of a view, and a title with its scores."""
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
-    thermal_range = _range_of(scene, modality)
+    thermal_range = scene.range_of(modality)
     title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
     if view.frame.time_s is not None:
         title.append(f"t = {moment(view.frame.time_s)}")
@@ -154,12 +153,8 @@ def magnitudes(view: View, modality: str, prediction: Tensor, scene: SceneData) 
     """Magnitudes [n] of the errors of an image where it counts, in °C or image values."""
     target = view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
-    counted, error = difference(target, prediction.float().cpu(), _range_of(scene, modality), mask)
+    counted, error = difference(target, prediction.float().cpu(), scene.range_of(modality), mask)
     return np.abs(error[counted])
-
-
-def _range_of(scene: SceneData, modality: str) -> ThermalRange | None:
-    return scene.thermal_range if modality in ("thermal", "clean") else None
 
 
 def file_stem(frame: Frame) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import pytorch_lightning as pl
 from torch import Tensor
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_scalars
 from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.io.results import CURVE_FILE
 from heatsplat.io.tables import write_csv
@@ -80,14 +80,13 @@ class QualityMetrics(pl.Callback):
     def _begin(self, module: pl.LightningModule, lpips: bool, threshold: float | None = None) -> None:
         """Makes the scorer of one pass over views."""
         self._rows, self._empty = [], 0
-        thermal_range = module.scene.thermal_range if module.modality == "thermal" else None
         network = None
         if lpips and self.lpips_net is not None:
             try:
                 network = load_lpips(self.lpips_net, self.lpips_weights).to(module.device)
             except LpipsUnavailable as error:
                 self._no_lpips = str(error)
-        self._scorer = Scorer(thermal_range, threshold, self.cold_scene, network)
+        self._scorer = Scorer(module.scene.range_of(module.modality), threshold, self.cold_scene, network)
         self._image_scorer = Scorer(lpips=network)
 
     def _score(self, module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
@@ -143,8 +142,8 @@ class QualityMetrics(pl.Callback):
     # Test ------------------------------------------------------------------------------------------------------------
 
     def on_test_epoch_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        thermal = module.modality == "thermal" and module.scene.thermal_range is not None
-        threshold = scene_threshold(_all_images(module.scene)) if thermal else None
+        known = module.scene.range_of(module.modality) is not None
+        threshold = scene_threshold(_all_images(module.scene)) if known else None
         self._begin(module, lpips=True, threshold=threshold)
 
     def on_test_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
@@ -215,10 +214,7 @@ class QualityMetrics(pl.Callback):
         """
         known = {f"{tag}/{name}": value for name, value in scores.items() if value is not None}
         module.log_dict(known, logger=False)
-        writer = board(module)
-        if writer is not None:
-            for name, value in known.items():
-                writer.add_scalar(name, value, step)
+        add_scalars(module, known, step)
 
     # Resume ----------------------------------------------------------------------------------------------------------
 

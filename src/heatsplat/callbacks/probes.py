@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, time_unit, write_png
 from heatsplat.io.tables import write_csv
@@ -70,7 +70,7 @@ class TemperatureCurves(pl.Callback):
             self._dots = (
                 [recorded(probe, scene, module.modality) for probe in self._probes] if scene.truth is None else []
             )
-        span = [t for views in (scene.train, scene.val, scene.test) for t in views.times_s if t is not None]
+        span = [frame.time_s for frame in scene.frames if frame.time_s is not None]
         if not self._probes or min(span) == max(span):
             return
         times = torch.linspace(min(span), max(span), self.times, dtype=torch.float64)
@@ -78,19 +78,17 @@ class TemperatureCurves(pl.Callback):
         truth = None
         if scene.truth is not None:
             truth = scene.truth(torch.stack([probe.point for probe in self._probes]), times).double().cpu().numpy()
-        unit = "°C" if scene.thermal_range is not None and module.modality == "thermal" else "image value"
-        to_unit = scene.thermal_range.to_celsius if unit == "°C" else lambda value: value
+        bounds = scene.range_of(module.modality)
+        unit, to_unit = ("image value", lambda value: value) if bounds is None else ("°C", bounds.to_celsius)
         model = to_unit(model)
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
         names = [probe.name for probe in self._probes]
         title = f"{scene.name}, step {step}"
         record = min(scene.train.times_s), max(scene.train.times_s)
         picture = figure_picture(_figure(times.numpy(), record, names, model, truth, dots, unit, title))
-        write_png(module.output_dir / "renders" / "probes.png", picture)
+        png = write_png(module.output_dir / "renders" / "probes.png", picture)
         self._write(module, times.tolist(), model, truth)
-        writer = board(module)
-        if writer is not None:
-            writer.add_image(tag, picture, step, dataformats="HWC")
+        add_picture(module, tag, picture, png, step)
 
     def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
         """Image values of the probes' pixels, [n, F] float64; one render per camera and time serves all its probes."""

@@ -44,7 +44,7 @@ class ExtremeSurfaces(pl.Callback):
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene = module.scene
-        if scene.thermal_range is None or module.modality != "thermal":
+        if scene.range_of(module.modality) is None:
             return
         frames = [middle(scene, scene.train.frames[i]) for i in evenly_spread(len(scene.train), self.views)]
         looks = [look(module, frame) for frame in frames]
@@ -76,15 +76,17 @@ def middle(scene: SceneData, frame: Frame) -> Frame:
     Between images, by day where all were taken by night, the model would only predict. In scenes without time, as it is.
     """
     if frame.time_s is not None:
-        start, span = scene.record
-        frame = at_time(scene, frame, min(scene.train.times_s, key=lambda time_s: abs(time_s - start - span / 2)))
+        taken_s = (time_s for time_s in scene.train.times_s if time_s is not None)
+        middle_s = scene.middle_s
+        frame = at_time(scene, frame, min(taken_s, key=lambda time_s: abs(time_s - middle_s)))
     return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
 
 
 @torch.no_grad()
 def look(module: pl.LightningModule, frame: Frame) -> Look:
-    """What the model shows in a frame, without what its camera adds, °C."""
-    output = module.render(frame, depth=True)
+    """What the model shows in a frame, without what its camera adds, °C. It is that of the frame's camera as it is given, by
+    whose rays it is read."""
+    output = module.render(frame, depth=True, camera=frame.camera)
     values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
     return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
 

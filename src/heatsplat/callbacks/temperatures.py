@@ -22,8 +22,9 @@ class TemperatureRenders(pl.Callback):
         self.folder, self.image = folder, image
 
     def on_test_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
-        if module.scene.thermal_range is None or module.modality != "thermal":
+        bounds = module.scene.range_of(module.modality)
+        if bounds is None:
             return
         image = outputs["companions"].get(self.image, outputs["prediction"])
         path = module.output_dir / self.folder / f"{Path(outputs['view'].frame.name).stem}.tiff"
-        write_temperature(path, module.scene.thermal_range.to_celsius(image.cpu()))
+        write_temperature(path, bounds.to_celsius(image.cpu()))

@@ -12,7 +12,7 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 
-from heatsplat.callbacks.board import board
+from heatsplat.callbacks.board import add_scalars
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -88,10 +88,8 @@ class CostMeter(pl.Callback):
         self.steps += 1
         if trainer.global_step % self.every == 0:
             self._publish(module)
-            writer = board(module)
-            if writer is not None:
-                for name in ("train_seconds", "steps_per_second", "peak_memory_mb"):
-                    writer.add_scalar(f"cost/{name}", module.results.cost[name], trainer.global_step)
+            shown = ("train_seconds", "steps_per_second", "peak_memory_mb")
+            add_scalars(module, {f"cost/{name}": module.results.cost[name] for name in shown}, trainer.global_step)
 
     def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._since is not None:
@@ -116,6 +114,11 @@ class CostMeter(pl.Callback):
         running = 0.0 if self._since is None else time.perf_counter() - self._since
         return {phase: value + running * (phase == self._phase) for phase, value in self.seconds.items()}
 
+    @property
+    def train_seconds(self) -> float:
+        """Seconds of training up to now."""
+        return self._reading()["train"]
+
     def _cpu_reading(self) -> float:
         """Processor seconds of training up to now, likewise."""
         running = self._since is not None and self._phase == "train"
@@ -136,8 +139,7 @@ class CostMeter(pl.Callback):
         put("cost", "warmup_seconds", seconds["warmup"])
         put("cost", "evaluation_seconds", seconds["evaluation"])
         put("cost", "wall_seconds", sum(seconds.values()))
-        self.peak_mb = max(self.peak_mb, _peak_mb(module.device))
-        put("cost", "peak_memory_mb", self.peak_mb)
+        self._publish_peak(module)
         put("cost", "gaussians", len(module.splats))
 
     def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
@@ -161,6 +163,9 @@ class CostMeter(pl.Callback):
             module.results.put("cost", "render_fps", 1.0 / statistics.median(self._render_seconds(module, chosen)))
         else:
             module.results.put("cost", "render_fps", None, "the scene has no test views")
+        self._publish_peak(module)
+
+    def _publish_peak(self, module: pl.LightningModule) -> None:
         self.peak_mb = max(self.peak_mb, _peak_mb(module.device))
         module.results.put("cost", "peak_memory_mb", self.peak_mb)
 

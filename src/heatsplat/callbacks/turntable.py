@@ -31,7 +31,7 @@ class Turntable(pl.Callback):
         self.frames, self.size, self.milliseconds = frames, size, milliseconds
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        scene, known = module.scene, module.scene.thermal_range if module.modality == "thermal" else None
+        scene, known = module.scene, module.scene.range_of(module.modality)
         try:
             frames = shot_frames(scene, "orbit", count=self.frames)
         except ValueError:  # all cameras on one line of sight

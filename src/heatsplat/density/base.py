@@ -153,7 +153,7 @@ class Merging:
         """Merges Gaussians of a trained module; what came of it, for the report. None when it did nothing.
 
         Args:
-            module: ``training.module.SplatTraining`` with its scene.
+            module: ``training.scene_model.SceneModel`` with its scene.
             cloud: its Gaussians with their moments, through which alone they come and go.
         """
         return None

@@ -109,7 +109,7 @@ class FlatMerging(Merging):
                 f"the Gaussians of {type(module.thermal).__name__} cannot be merged: {module.thermal.inseparable}. "
                 "Give merge=none"
             )
-        if module.modality != "thermal" or module.scene.thermal_range is None:
+        if module.scene.range_of(module.modality) is None:
             raise SceneError(
                 f"merge.tolerance_c is in °C, and the images of scene '{module.scene.name}' are no temperatures: "
                 "give the data set their range, or merge=none"

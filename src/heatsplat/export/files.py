@@ -20,7 +20,7 @@ def write_files(
     """Paths of the files written, ``<scene>_<seconds>s<suffix>``; what they do not hold is warned of.
 
     Args:
-        module: a training module with its scene (``training.module.SplatTraining``).
+        module: a training module with its scene (``training.scene_model.SceneModel``).
         form: the format.
         folder: of the files; it is made.
         times: seconds since the first training frame, one or several; None takes the middle of the record.

@@ -84,8 +84,7 @@ def moments_in(
             raise SceneError(f"time={times}: scene '{scene.name}' does not change in time; leave time out")
         return [None]
     if wanted is None:
-        start, length = scene.record
-        return [start + length / 2]
+        return [scene.middle_s]
     for time_s in wanted:
         if not span[0] <= time_s <= span[1]:
             raise SceneError(

@@ -168,7 +168,7 @@ class _Visible:
         self.module, self.scene = module, module.scene
         train = self.scene.train
         self.span = span_of(self.scene)
-        self.middle = None if self.span is None else 0.5 * (min(train.times_s) + max(train.times_s))
+        self.middle = None if self.span is None else self.scene.middle_s
         self._free_id = first_free_id(self.scene)
         self.frame = self._at(train.frames[0], self.middle)
         means, quats, scales, opacities = module.shapes(self.frame)
@@ -361,9 +361,8 @@ def span_of(scene: SceneData) -> tuple[float, float] | None:
 
 def _scale(scene: SceneData, modality: str) -> tuple[float, str]:
     """What an image value of 1 is in the unit of the scene, and that unit."""
-    if scene.thermal_range is None or modality != "thermal":
-        return 1.0, ""
-    return scene.thermal_range.span_k, "°C"
+    bounds = scene.range_of(modality)
+    return (1.0, "") if bounds is None else (bounds.span_k, "°C")
 
 
 def _inside(values_at: ValuesAt) -> ValuesAt:

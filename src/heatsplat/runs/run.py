@@ -33,11 +33,11 @@ from heatsplat.runs.trust import trusted
 from heatsplat.runs.verdicts import decided, with_verdicts
 from heatsplat.shots import UNSEEN, at_time, first_free_id, sightings, warn_beyond_record
 from heatsplat.training.checkpoints import CheckpointFiles, load_checkpoint
-from heatsplat.training.loop import lean
+from heatsplat.training.loop import lean, without_idle_hooks
 from heatsplat.training.machine import prepare_machine
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
 from heatsplat.training.scales import on_scales
-from heatsplat.training.session import fit, restore, without_idle_hooks
+from heatsplat.training.session import fit, restore
 
 log = logging.getLogger("heatsplat")
 

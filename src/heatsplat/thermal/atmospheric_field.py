@@ -120,7 +120,7 @@ class AtmosphericField(Wrapper):
         if self.time == "auto":
             self.by_index.fill_("time" not in scene.metadata)
         if self.by_index:
-            ids = [frame.frame_id for part in (scene.train, scene.val, scene.test) for frame in part.frames]
+            ids = [frame.frame_id for frame in scene.frames]
             self.clock.record.copy_(torch.tensor([0.0, max(*ids, 1)]))
         elif self.time != "none":
             self.clock.prepare(scene)

@@ -212,10 +212,9 @@ class EnergyBalance(ThermalModel):
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
         self._moments = torch.tensor(sorted(set(scene.train.times_s) - {None}), dtype=torch.float64)
         self.under(weather)
-        for part in (scene.train, scene.val, scene.test):
-            for frame in part.frames:
-                if frame.time_s is not None:
-                    weather.at(frame.time_s)  # refuses a frame outside the record before anything is trained
+        for frame in scene.frames:
+            if frame.time_s is not None:
+                weather.at(frame.time_s)  # refuses a frame outside the record before anything is trained
 
     def under(self, weather: Weather) -> None:
         """Lives in another weather from here on; what was learned stays.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
 from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
+from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger(__name__)
@@ -26,8 +28,27 @@ ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gr
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
 
 
-class Initialisation:
+class Start(ABC):
     """How splats start.
+
+    Attributes:
+        rows: of which models (``ThermalModel.rows``) it knows how the rows of their splats start.
+    """
+
+    rows = frozenset({GAUSSIANS, ANCHORS})
+
+    @abstractmethod
+    def __call__(
+        self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
+    ) -> tuple[Splats, dict[str, PerGaussian]]:
+        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties).
+
+        There are at most ``cap_max`` of them (``DensityControl``): of more points, a seeded draw.
+        """
+
+
+class Initialisation(Start):
+    """Splats start at points, of the scene or drawn.
 
     Args:
         source: "sfm" takes the scene's points, "random" draws ``count`` of them in the box of the points.
@@ -41,8 +62,6 @@ class Initialisation:
     Raises:
         ValueError: an option is unknown or out of its range.
     """
-
-    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(
         self,
@@ -64,10 +83,6 @@ class Initialisation:
     def __call__(
         self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
     ) -> tuple[Splats, dict[str, PerGaussian]]:
-        """Splats for a scene, and what the thermal model declared about its tensors (learning rates, penalties).
-
-        There are at most ``cap_max`` of them (``DensityControl``): of more points, a seeded draw.
-        """
         times = len(thermal.opacity_channels) if self.separate else 1
         most = None if cap_max is None else max(cap_max / times, 1)
         means = self._means(scene, generator_for(seed, 0, "init"), most)
@@ -100,12 +115,10 @@ class Initialisation:
                 f"scene '{scene.name}' has {len(points)} points, at least {NEIGHBOURS + 1} are needed to start from; "
                 "use init=random."
             )
-        if count < len(points):
-            points = points[torch.randperm(len(points), generator=generator)[:count].sort().values]
-        return points
+        return _drawn(points, count, generator)
 
 
-class NoSplats:
+class NoSplats(Start):
     """No rows: how fields start, whose tables and networks the model draws itself."""
 
     rows = frozenset({NOTHING})
@@ -146,12 +159,10 @@ class Voxels(Initialisation):
                 f"most points of scene '{scene.name}' coincide, so no voxel size can be derived from them: give init.voxel"
             )
         means = middles(torch.unique(cells(scene.points, size), dim=0), size)
-        if most is not None and most < len(means):
-            means = means[torch.randperm(len(means), generator=generator)[: int(most)].sort().values]
-        return means
+        return means if most is None else _drawn(means, int(most), generator)
 
 
-class Pretrained:
+class Pretrained(Start):
     """Splats whose geometry and opacity are those of an earlier run or of a file; heat starts as it does elsewhere.
 
     Args:
@@ -161,8 +172,6 @@ class Pretrained:
     Raises:
         SceneError: there is no such file, or it holds no splats, or anchors where Gaussians are wanted.
     """
-
-    rows = frozenset({GAUSSIANS, ANCHORS})
 
     def __init__(self, path: str | None) -> None:
         if path is None:
@@ -189,6 +198,13 @@ class Pretrained:
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
         return with_heat(geometry, scene, thermal, seed)
+
+
+def _drawn(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Points [n, 3] in their order, at most ``count`` of them: of more, a draw."""
+    if count >= len(points):
+        return points
+    return points[torch.randperm(len(points), generator=generator)[:count].sort().values]
 
 
 def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -235,11 +251,15 @@ def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], str]:
 def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
     """Geometry of a checkpoint, and what its rows are."""
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-        geometry = {name: stored["state_dict"][f"splats.raw.{name}"] for name in GEOMETRY}
-        rows = stored.get("heatsplat", {}).get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
-    except Exception as error:
-        raise SceneError(f"init.path={path} is no checkpoint of heatsplat that can be read: {error!r}") from error
+        stored = load_checkpoint(path)
+    except SceneError as error:
+        raise SceneError(f"init.path: {error}") from error
+    tensors = stored.get("state_dict", {})
+    missing = [name for name in GEOMETRY if f"splats.raw.{name}" not in tensors]
+    if missing:
+        raise SceneError(f"init.path={path} is no checkpoint of heatsplat: it holds no {', '.join(missing)} of splats")
+    geometry = {name: tensors[f"splats.raw.{name}"] for name in GEOMETRY}
+    rows = stored.get("heatsplat", {}).get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
     return geometry, rows
 
 

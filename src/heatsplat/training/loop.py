@@ -14,6 +14,25 @@ from pytorch_lightning.loops.training_epoch_loop import _TrainingEpochLoop
 from pytorch_lightning.profilers import PassThroughProfiler
 from pytorch_lightning.strategies import SingleDeviceStrategy
 
+# Lightning's hooks of a training step.
+STEP_HOOKS = (
+    "on_train_batch_start",
+    "on_before_zero_grad",
+    "on_before_backward",
+    "on_after_backward",
+    "on_before_optimizer_step",
+    "on_train_batch_end",
+)
+
+
+def without_idle_hooks(part: pl.Callback | pl.LightningModule) -> pl.Callback | pl.LightningModule:
+    """A callback or module, of which Lightning calls no hook of a step that it leaves empty: a hundred calls a step otherwise."""
+    kind = pl.Callback if isinstance(part, pl.Callback) else pl.LightningModule
+    for name in STEP_HOOKS:
+        if getattr(type(part), name) is getattr(kind, name):
+            setattr(part, name, None)
+    return part
+
 
 def lean(trainer: pl.Trainer) -> None:
     """Gives a trainer that has not begun the loops below in place of Lightning's."""
@@ -90,15 +109,21 @@ class LeanOptimization(_AutomaticOptimization):
         return outputs
 
 
+def plain(optimizer: Any) -> torch.optim.Optimizer:
+    """The optimiser itself, of what Lightning or ``LeanOptimization`` hands to hooks in its place."""
+    return getattr(optimizer, "optimizer", optimizer)
+
+
 def _alone(trainer: pl.Trainer) -> bool:
     """Whether there is one device, and nobody takes the time of hooks."""
     return type(trainer.strategy) is SingleDeviceStrategy and isinstance(trainer.profiler, PassThroughProfiler)
 
 
 def _tell(trainer: pl.Trainer, name: str, *arguments: Any) -> None:
-    """Calls a hook of the callbacks and of the module, of those that have one (``session.without_idle_hooks``)."""
+    """Calls a hook of the callbacks and of the module, of those that have one (``without_idle_hooks``)."""
     module = trainer.lightning_module
-    module._current_fx_name = name  # what is logged in a hook is kept under its name
+    # What is logged in a hook is kept under its name. torch would look forty times a step whether that is a tensor.
+    object.__setattr__(module, "_current_fx_name", name)
     for callback in trainer.callbacks:
         hook = getattr(callback, name)
         if hook is not None:
@@ -106,7 +131,7 @@ def _tell(trainer: pl.Trainer, name: str, *arguments: Any) -> None:
     hook = getattr(module, name)
     if hook is not None:
         hook(*arguments)
-    module._current_fx_name = None
+    object.__setattr__(module, "_current_fx_name", None)
 
 
 class _Stepping:

@@ -1,42 +1,41 @@
-"""The LightningModule: one view, one render, one loss, one step of one optimiser. It knows no variant by name."""
+"""The training of a scene: one view, one render, one loss, one step of one optimiser. It knows no variant by name."""
 
 from __future__ import annotations
 
 import logging
 import operator
-import statistics
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property, partial, reduce
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
-from heatsplat.geometry.coverage import gap_free, seen_means, surface_depth
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
-from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING, Splats
-from heatsplat.thermal.base import Geometry, PerGaussian, Query, ThermalModel
+from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING
+from heatsplat.thermal.base import Rate, ThermalModel
+from heatsplat.training.adam import load_waiting_gradients, waiting_gradients
 from heatsplat.training.averaging import Average
-from heatsplat.training.cameras import Cameras, aligned, seen_depths
-from heatsplat.training.init import Initialisation
-from heatsplat.training.optimisation import Optimisation, load_waiting_gradients, penalties, waiting_gradients
+from heatsplat.training.cameras import Cameras
+from heatsplat.training.init import Start
+from heatsplat.training.loop import plain
+from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.scales import scales_of
+from heatsplat.training.scene_model import SceneModel
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
 from heatsplat.training.surroundings import Surroundings
@@ -46,14 +45,12 @@ log = logging.getLogger(__name__)
 CHECKPOINT_KEY = "heatsplat"
 
 
-class SplatTraining(pl.LightningModule):
+class SplatTraining(SceneModel):
     """Trains splats with a thermal model on the views of a scene.
 
-    Public attributes for callbacks: ``scene``, ``splats``, ``thermal``, ``sensor``, ``modality``, ``results``,
-    ``output_dir``, ``predict(frame)``, ``attribute_maps(frame)``, ``schedule`` (how far the run is, and when it ends),
-    ``density_change`` (what density control did in the last step, None for nothing), and ``config``, the resolved
-    configuration as plain containers: it travels in the checkpoint, so that a checkpoint and its data are enough to evaluate
-    or render.
+    Callbacks know, beside what is in ``SceneModel``, the parts below by their names, ``results`` (what metrics.json will hold),
+    ``schedule`` (how far the run is, and when it ends) and ``density_change`` (what density control did in the last step, None
+    for nothing).
 
     Args:
         thermal: what splats emit.
@@ -89,7 +86,7 @@ class SplatTraining(pl.LightningModule):
         sensor: SensorChain,
         density: DensityControl,
         loss: Loss,
-        init: Initialisation,
+        init: Start,
         optim: Optimisation,
         stages: Stages | None = None,
         composite: Composite | None = None,
@@ -105,42 +102,28 @@ class SplatTraining(pl.LightningModule):
         dtype: str = "float32",
         output_dir: Path | str = ".",
     ) -> None:
-        super().__init__()
-        self.thermal, self.renderer, self.sensor = thermal, renderer, sensor
+        super().__init__(
+            thermal, renderer, sensor, composite or Composite(), smoothing or Smoothing(), cameras or Cameras(), seed
+        )
         self.density, self.loss, self.init, self.optim = density, loss, init, optim
         self.stages = stages or Stages({})
         self.schedule = Schedule(max_steps, self.stages.restarts)
-        self.composite = composite or Composite()
-        self.smoothing = smoothing or Smoothing()
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
-        self.cameras = cameras or Cameras()
         self.surroundings = surroundings or Surroundings()
-        self.seed, self.output_dir = seed, Path(output_dir)
-        self.config: dict[str, Any] = {}
-        self.modality = thermal.modality
+        self.output_dir = Path(output_dir)
         self.supersample = supersample
         if dtype not in ("float32", "float64"):
             raise ValueError(f"dtype must be float32 or float64, got '{dtype}'")
         self._wide = dtype == "float64"
         self.results = RunResults()
-        self.scene: SceneData | None = None
-        self.splats: Splats | None = None
-        self._declared: dict[str, PerGaussian] = {}
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
         self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Lightning notes which hook it is in forty times a step; torch would look each time whether that is a tensor."""
-        if name == "_current_fx_name":
-            object.__setattr__(self, name, value)
-        else:
-            super().__setattr__(name, value)
 
     # Set-up ------------------------------------------------------------------------------------------
 
@@ -205,7 +188,7 @@ class SplatTraining(pl.LightningModule):
             )
         if rows != GAUSSIANS and self.smoothing.changes:
             raise SceneError(f"{model} {what}, which no filter of Gaussians in space knows: give smoothing=none")
-        if rows == NOTHING and type(self.overlap) is not Overlap:
+        if rows not in self.overlap.rows:
             raise SceneError(
                 f"{model} {what}, whose sizes {type(self.overlap).__name__} would reset: give overlap=none"
             )
@@ -228,39 +211,19 @@ class SplatTraining(pl.LightningModule):
         self._density_state = {name: tensor.to(self.device) for name, tensor in self._density_state.items()}
 
     def configure_optimizers(self):
-        cameras = self.cameras
+        group = self.optim.group
         groups = self.optim.geometry_groups(self.splats, self.scene.extent)
-        groups += [
-            {
-                "params": [self.splats[name]],
-                "name": name,
-                "lr": item.lr * (self.optim.pace if item.paced else 1.0),
-                "lr_end": item.lr_end,
-            }
-            | penalties(item, len(self.splats))
-            for name, item in self._declared.items()
-        ]
+        for name, item in self._declared.items():
+            rate = Rate(item.lr, item.lr_end, item.paced)
+            groups.append(group(name, self.splats[name], rate, **penalties(item, len(self.splats))))
         for name, parameter in self.thermal.named_parameters():
-            rate = self.thermal.rate_of(name)
-            lr = rate.lr * (self.optim.pace if rate.paced else 1.0)
-            held = self.optim.held(rate.held)
-            groups.append(
-                {"params": [parameter], "name": f"thermal.{name}", "lr": lr, "lr_end": rate.lr_end, "held": held}
-            )
-        groups += [
-            {"params": [parameter], "name": f"sensor.{name}.{inner}", "lr": part.lr, "lr_end": part.lr_end}
-            for name, part in self.sensor.parts.items()
-            for inner, parameter in part.named_parameters()
-        ]
-        groups += [
-            {
-                "params": [parameter],
-                "name": f"cameras.{name}",
-                "lr": cameras.lr * self.optim.pace,
-                "lr_end": cameras.lr_end,
-            }
-            for name, parameter in cameras.named_parameters()
-        ]
+            groups.append(group(f"thermal.{name}", parameter, self.thermal.rate_of(name)))
+        for name, part in self.sensor.parts.items():
+            for inner, parameter in part.named_parameters():
+                groups.append(group(f"sensor.{name}.{inner}", parameter, Rate(part.lr, part.lr_end)))
+        for name, parameter in self.cameras.named_parameters():
+            rate = Rate(self.cameras.lr, self.cameras.lr_end, paced=True)
+            groups.append(group(f"cameras.{name}", parameter, rate))
         optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
@@ -296,94 +259,10 @@ class SplatTraining(pl.LightningModule):
         """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
         if self.global_step < self.schedule.end:  # stopped by hand
             return
-        optimizer = self.trainer.optimizers[0]
-        found = self.merging(self, self.cloud(getattr(optimizer, "optimizer", optimizer)))
+        found = self.merging(self, self.cloud(plain(self.trainer.optimizers[0])))
         if found is not None:
             self._show(self.splats)
             self.results.run["merging"] = found
-
-    def render(
-        self,
-        frame: Frame,
-        depth: bool = False,
-        absgrad: bool = False,
-        maps: int = 0,
-        ratio: float = 1.0,
-        signs: Tensor | None = None,
-        values: Tensor | None = None,
-        generator: torch.Generator | None = None,
-        camera: Camera | None = None,
-    ) -> RenderOutput:
-        """The clean image that the splats send to the camera of ``frame`` at its time.
-
-        Where its pixels are ``ratio`` times as large as those of full size, Gaussians look as they do there. ``values``
-        [N, C] are what rows of the splats emit in place of what the thermal model makes of them.
-        ``generator`` draws where samples along rays lie, of fields. The image is taken from where ``camera`` stands, by default
-        where the camera of ``frame`` is known to have stood (``Cameras.of``); what the splats emit is that towards the camera of
-        ``frame``.
-        """
-
-        channels = self.thermal.modality_channels[0]
-        if self.thermal.rows == NOTHING:
-            return self._render_field(frame, channels, generator)
-        moved = self.thermal.geometry(self.splats, _query(frame))
-
-        def emitted(ids: Tensor) -> Tensor:
-            query = _query(frame, ids, moved)
-            if values is None:
-                told = self.thermal.features(self.splats, query)
-            else:
-                told = values.index_select(0, ids // self.thermal.per_row)
-            return self.composite.encode(told, channels)
-
-        raw = moved is None and not self.smoothing.changes
-        output = self.renderer(
-            *(self._raw_shapes() if raw else self._shapes(moved)),
-            emitted,
-            camera or self.cameras.of(frame),
-            self.background,
-            self.thermal.opacity_channels,
-            absgrad=absgrad,
-            depth=depth,
-            maps=maps,
-            ratio=ratio,
-            signs=signs,
-            raw=raw,
-        )
-        if self.thermal.per_row > 1:
-            output.meta["opacities"], output.meta["rows_in_view"] = moved.opacities.detach(), moved.in_view
-        image = self.composite.decode(output.features, channels)
-        return output if image is output.features else replace(output, features=image)
-
-    def _render_field(self, frame: Frame, channels: int, generator: torch.Generator | None) -> RenderOutput:
-        """As ``render``, of a model without Gaussians."""
-
-        def sent(known: Tensor, directions: Tensor) -> Tensor:
-            return self.composite.encode(self.thermal.values(known, directions, _query(frame)), channels)
-
-        output = self.renderer.of_field(
-            self.thermal.density, sent, self.thermal.span, frame.camera, self.background, generator
-        )
-        return replace(output, features=self.composite.decode(output.features, channels))
-
-    def _raw_shapes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, rotations, logarithms of scales and logits of opacities of all Gaussians."""
-        splats = self.splats
-        return splats.means, splats.quats, splats["log_scales"], splats["opacity_logits"].T
-
-    def _shapes(self, moved: Geometry | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, rotations, scales and opacities of all Gaussians, as a model moved them or as they are.
-
-        Raises:
-            SceneError: the model has none.
-        """
-        if self.thermal.rows == NOTHING:
-            raise SceneError(
-                f"{type(self.thermal).__name__} has no Gaussians, which this asks for: leave it out, or train a method of splats "
-                "such as method=3dgs"
-            )
-        shown = self.splats if moved is None else moved
-        return shown.means, shown.quats, *self.smoothing(shown.scales, shown.opacities)
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
@@ -418,7 +297,7 @@ class SplatTraining(pl.LightningModule):
         terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
         terms |= self.cameras.regularisers()
         if signs is not None:
-            terms["entropy"] = self.overlap.entropy(output, here)
+            terms["entropy"] = self.overlap.entropy(output)
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
@@ -430,11 +309,6 @@ class SplatTraining(pl.LightningModule):
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
-
-    def _images(self, output: RenderOutput) -> Sequence[Tensor]:
-        """The image of each modality, the model's own first."""
-        channels = self.thermal.modality_channels
-        return [output.features] if len(channels) == 1 else output.features.split(channels, dim=-1)
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
@@ -450,14 +324,14 @@ class SplatTraining(pl.LightningModule):
     def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
         step = self.global_step
         if step == 0 or self._updates(step - 1):
-            inner = getattr(optimizer, "optimizer", optimizer)
-            inner.takes_unwritten = not self.trainer.gradient_clip_val  # what Lightning clips has to be in grad
+            # What Lightning clips has to be in grad.
+            plain(optimizer).takes_unwritten = not self.trainer.gradient_clip_val
             optimizer.zero_grad()
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
         step = self.global_step
-        inner = getattr(optimizer, "optimizer", optimizer)
+        inner = plain(optimizer)
         if step in self.schedule.restarts:
             inner.state.clear()
             for statistic in self._density_state.values():
@@ -495,90 +369,6 @@ class SplatTraining(pl.LightningModule):
 
     # Evaluation --------------------------------------------------------------------------------------
 
-    @torch.no_grad()
-    def predict(self, frame: Frame) -> Tensor:
-        """The image that the camera would record of ``frame``, [H, W, C] in [0, 1]; this is what metrics score."""
-        return self.predict_all(frame)[self.modality]
-
-    @torch.no_grad()
-    def predict_all(self, frame: Frame) -> dict[str, Tensor]:
-        """The image that the camera would record and the images of the model's companions, by modality.
-
-        Last comes "clean", what a camera without the flaws of the sensor chain would record.
-        """
-        output = self.render(frame, depth=self.sensor.needs_depth)
-        image, *companions = self._images(output)
-        images = (self.sensor(image, frame, output.seen_depth), *companions, image)
-        names = (self.modality, *self.thermal.companions, "clean")
-        return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
-
-    @torch.no_grad()
-    def depth(self, frame: Frame) -> Tensor:
-        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none. It is that of the
-        frame's camera as it is given, by whose rays it is read."""
-        output = self.render(frame, depth=True, camera=frame.camera)
-        return surface_depth(output.depth, output.alpha[0]).cpu()
-
-    @contextmanager
-    def showing(self, splats: Splats) -> Iterator[None]:
-        """While it lasts, other splats of the same tensors are rendered in place of its own."""
-        own = self.splats
-        self._show(splats)
-        try:
-            yield
-        finally:
-            self._show(own)
-
-    def _show(self, splats: Splats) -> None:
-        self.splats = splats
-        self.smoothing.follow(splats.means.detach(), self.schedule.end, self.schedule.end, True)
-
-    @torch.no_grad()
-    def shapes(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, rotations, scales and opacities [M, N] of all Gaussians as they are rendered in a frame."""
-        return self._shapes(self.thermal.geometry(self.splats, _query(frame)))
-
-    @torch.no_grad()
-    def emissions(self, splats: Splats, frame: Frame, ids: Tensor | None = None) -> Tensor:
-        """What the thermal model makes of all Gaussians of some splats in a frame, or of ``ids``, [n, C] in image units."""
-        return self.thermal.features(splats, _query(frame, ids))
-
-    @property
-    def constants(self) -> frozenset[str]:
-        """Names of tensors of the thermal model that are given and not trained, such as the class of a surface."""
-        return frozenset(name for name, item in self._declared.items() if item.lr == 0)
-
-    def generator(self, number: int, purpose: str) -> torch.Generator:
-        """A generator of random numbers of the run's seed."""
-        return generator_for(self.seed, number, purpose)
-
-    @torch.no_grad()
-    def attributes(self, frame: Frame) -> dict[str, Tensor]:
-        """What the thermal model tells of every Gaussian at the time of ``frame``, by name, each [N]."""
-        return self.thermal.attributes(self.splats, _query(frame))
-
-    @torch.no_grad()
-    def attribute_maps(self, frame: Frame) -> dict[str, Tensor]:
-        """Images [H, W] of what the thermal model tells of its Gaussians (``ThermalModel.attributes``), by name.
-
-        Each is the mean over the Gaussians of a pixel, weighted as they are seen in the first modality, or follows from such
-        means (``ThermalModel.quotients``); NaN where none is seen, or most have none. Empty for models that tell nothing.
-        """
-        told = self.attributes(frame)
-        if not told:
-            return {}
-        output = self.composited(frame, gap_free(torch.stack(list(told.values()), dim=1)))
-        maps = seen_means(output.features, output.alpha[0], len(told))
-        found = dict(zip(told, maps.unbind(-1), strict=True))
-        return found | self.thermal.quotients(found)
-
-    def composited(self, frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
-        """What the camera of ``frame`` sees of values [N, C] of all rows of the splats, before black, in the first modality."""
-        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
-        if self.thermal.per_row > 1:
-            values = values.repeat_interleave(self.thermal.per_row, dim=0)
-        return self.renderer.values_seen((*shape, opacities[:1]), values, frame.camera, depth, ratio)
-
     def validation_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         return self._scored(view, view.frame)
 
@@ -588,15 +378,6 @@ class SplatTraining(pl.LightningModule):
             return self._scored(view, view.frame)
         self.results.data["test_cameras_aligned"] = f"each to its image, in {steps} steps"
         return self._scored(view, replace(view.frame, camera=self.aligned(view, view.frame.camera, steps)))
-
-    def aligned(self, view: View, camera: Camera, steps: int) -> Camera:
-        """The camera beside ``camera`` from which the image of a view differs least, as far as so many steps go."""
-        return aligned(camera, partial(self.squared_error, view), steps, self._middle)
-
-    @cached_property
-    def _middle(self) -> float:
-        """How far away what the cameras see lies, in the median."""
-        return statistics.median(seen_depths(self.scene))
 
     def _scored(self, view: View, frame: Frame) -> dict[str, Any]:
         """What is scored of a view, from the camera and at the time of ``frame``."""
@@ -608,16 +389,6 @@ class SplatTraining(pl.LightningModule):
             torch.cuda.synchronize()
         seconds = time.perf_counter() - start
         return {"view": view, "prediction": images.pop(self.modality), "companions": images, "seconds": seconds}
-
-    def squared_error(self, view: View, camera: Camera) -> Tensor:
-        """Mean squared error of the image of a view as seen from a camera, over the pixels that count."""
-        output = self.render(view.frame, self.sensor.needs_depth, camera=camera)
-        image = self.sensor(self._images(output)[0], view.frame, output.seen_depth)
-        target = view.image(self.modality)
-        if view.mask is not None:
-            counts = view.mask.clone()  # autograd keeps no tensor of Lightning's inference mode
-            image, target = image[counts], target[counts]
-        return (image - target).square().mean()
 
     def transfer_batch_to_device(self, batch: View, device: torch.device, dataloader_idx: int) -> View:
         return batch.to(device)
@@ -656,11 +427,6 @@ class SplatTraining(pl.LightningModule):
             self._average.load_state_dict(own["average"], self.device)
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
-
-
-def _query(frame: Frame, ids: Tensor | None = None, geometry: Geometry | None = None) -> Query:
-    """What is asked of the thermal model for a frame: the Gaussians ``ids``, or all, with the geometry it gave them."""
-    return Query(ids, frame.camera, frame.time_s, frame.frame_id, geometry)
 
 
 def check_same_method(module: SplatTraining, checkpoint: dict[str, Any]) -> None:

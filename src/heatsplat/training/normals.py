@@ -9,13 +9,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import Frame, RenderOutput, SceneData, evenly_spread
+from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, evenly_spread
 from heatsplat.geometry.coverage import OPEN
 from heatsplat.geometry.rotations import matrices_to_quats
 from heatsplat.geometry.surfaces import depth_normals, on_the_side_of, plane_axes
 from heatsplat.renderers.settings import Renderer
 
-Show = Callable[..., RenderOutput]  # (frame, values [N, 3] of all Gaussians, depth=bool, ratio=of the frame's pixels)
+# (frame, values [N, 3] of all Gaussians, depth=bool, ratio=of the frame's pixels, camera=that looks)
+Show = Callable[..., RenderOutput]
 
 POINTS = 100_000  # of the scene's, at most
 OPACITY, FLATNESS = 0.95, 0.1  # of discs, and their thickness by their radius
@@ -86,8 +87,8 @@ class Normals:
             torch.full((1, len(points)), OPACITY),
         )
 
-        def show(frame: Frame, values: Tensor, depth: bool = False, ratio: float = 1.0) -> RenderOutput:
-            return renderer.values_seen(discs, values, frame.camera, depth, ratio)
+        def show(frame: Frame, values: Tensor, ratio: float, camera: Camera) -> RenderOutput:
+            return renderer.values_seen(discs, values, camera, ratio=ratio)
 
         towards = torch.zeros_like(points)
         for frame, ratio in self._frames:
@@ -98,7 +99,7 @@ class Normals:
         self.discs = Discs(discs, normals)
         self._maps = []
         for frame, ratio in self._frames:
-            seen = show(frame, normals, ratio=ratio)
+            seen = show(frame, normals, ratio=ratio, camera=frame.camera)
             shown = torch.nn.functional.normalize(seen.features, dim=-1)
             self._maps.append(torch.where((seen.alpha[0] >= OPEN)[..., None], shown, 0.0))
         _, nearest = cKDTree(points.double().numpy()).query(means.double().numpy())
@@ -111,7 +112,7 @@ class Normals:
         for (frame, ratio), map_ in zip(self._frames, self._maps, strict=True):
             facing = map_.to(normals)
             if bool((facing == 0).all(-1).any()):
-                seen = show(frame, normals, depth=True, ratio=ratio)
+                seen = show(frame, normals, depth=True, ratio=ratio, camera=frame.camera)
                 own = depth_normals(seen.depth, seen.alpha[0], frame.camera)
                 facing = torch.where((facing == 0).all(-1, keepdim=True), own, facing)
             total += _gathered(show, frame, ratio, facing, normals)
@@ -132,6 +133,6 @@ def _gathered(show: Show, frame: Frame, ratio: float, map_: Tensor, like: Tensor
     """Σ_p w[p, i] map_[p] of Gaussians i, [N, 3]: a map [H, W, 3] by the blending weights of a view."""
     values = torch.zeros_like(like, requires_grad=True)
     with torch.enable_grad():
-        image = show(frame, values, ratio=ratio).features
+        image = show(frame, values, ratio=ratio, camera=frame.camera).features
         (gathered,) = torch.autograd.grad((image * map_).sum(), [values])
     return gathered

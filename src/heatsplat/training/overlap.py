@@ -9,19 +9,26 @@ from torch import Tensor
 
 from heatsplat.contracts import RenderOutput
 from heatsplat.density.ops import Cloud
+from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING
 from heatsplat.training.rng import generator_for
 
 RECOVERY = 0.5  # share of the steps between two resets after which sizes have come back (ours)
 
 
 class Overlap:
-    """Does nothing: nothing is stored and nothing is computed."""
+    """Does nothing: nothing is stored and nothing is computed.
+
+    Attributes:
+        rows: of which models (``ThermalModel.rows``) it knows the rows of the splats.
+    """
+
+    rows = frozenset({GAUSSIANS, ANCHORS, NOTHING})
 
     def signs_at(self, step: int, count: int, seed: int) -> Tensor | None:
         """Random signs [N] to be composited in this step (``rasterization``); None where ``entropy`` is not wanted."""
         return None
 
-    def entropy(self, output: RenderOutput, step: int) -> Tensor:
+    def entropy(self, output: RenderOutput) -> Tensor:
         """A loss term, a scalar, where ``signs_at`` gave signs; here there are none, and it is 0."""
         return output.features.new_zeros(())
 
@@ -58,6 +65,8 @@ class ShortLists(Overlap):
     Source: Speeding Up the Learning of 3D Gaussians with Much Shorter Gaussian Lists (CVPR 2026).
     """
 
+    rows = frozenset({GAUSSIANS, ANCHORS})
+
     def __init__(
         self,
         entropy: float = 0.015,
@@ -85,7 +94,7 @@ class ShortLists(Overlap):
             return None
         return 2.0 * torch.randint(2, (count,), generator=generator_for(seed, step, "signs")) - 1.0
 
-    def entropy(self, output: RenderOutput, step: int) -> Tensor:
+    def entropy(self, output: RenderOutput) -> Tensor:
         alone = output.signed.square() + (1.0 - output.alpha[0]).square()
         return self.weight * (1.0 - alone.mean())
 

@@ -1,4 +1,4 @@
-"""One run on one machine: threads, graceful interruption, fit, test."""
+"""One run: graceful interruption, fit, test; and the module of a run that is over."""
 
 from __future__ import annotations
 
@@ -25,26 +25,6 @@ class Unprofiled(PassThroughProfiler):
 
     def profile(self, action_name: str) -> AbstractContextManager:
         return self._nothing
-
-
-# Lightning's hooks of a training step.
-STEP_HOOKS = (
-    "on_train_batch_start",
-    "on_before_zero_grad",
-    "on_before_backward",
-    "on_after_backward",
-    "on_before_optimizer_step",
-    "on_train_batch_end",
-)
-
-
-def without_idle_hooks(part: pl.Callback | pl.LightningModule) -> pl.Callback | pl.LightningModule:
-    """A callback or module, of which Lightning calls no hook of a step that it leaves empty: a hundred calls a step otherwise."""
-    kind = pl.Callback if isinstance(part, pl.Callback) else pl.LightningModule
-    for name in STEP_HOOKS:
-        if getattr(type(part), name) is getattr(kind, name):
-            setattr(part, name, None)
-    return part
 
 
 class StopOnInterrupt(pl.Callback):

@@ -15,7 +15,7 @@ from fnmatch import fnmatchcase
 import torch
 from torch import Tensor
 
-from heatsplat.training.optimisation import forget_gradients
+from heatsplat.training.adam import forget_gradients
 
 log = logging.getLogger(__name__)
 

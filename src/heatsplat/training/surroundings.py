@@ -27,7 +27,7 @@ class Surroundings:
 
     @torch.no_grad()
     def prepare(self, scene: SceneData, renderer: Renderer, splats: Splats, show: Show) -> None:
-        """Looks at the scene's points, then at the splats as ``show`` renders them (``SplatTraining.composited``)."""
+        """Looks at the scene's points, then at the splats as ``show`` renders them (``SceneModel.composited``)."""
         if NORMALS in splats:
             splats[NORMALS].copy_(self.normals.prepare(scene, renderer, splats.means.detach()))
             self._face(splats, show)

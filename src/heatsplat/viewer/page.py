@@ -28,7 +28,7 @@ def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
     """The path of the page that was written: a trained scene that a browser opens from a file, offline.
 
     Args:
-        module: a training module with its scene (``training.module.SplatTraining``).
+        module: a training module with its scene (``training.scene_model.SceneModel``).
         path: of the file.
         cameras: how many training cameras are in it at most, with small images.
 

@@ -109,8 +109,7 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
 def _moments(scene: SceneData) -> list[tuple[str, float]]:
     """Names and times of some images, spread over those of all splits: the same images for every split of a scene, by which the
     page finds how far the clocks of two runs are apart."""
-    views = (scene.train, scene.val, scene.test)
-    known = {frame.name: frame.time_s for part in views for frame in part.frames if frame.time_s is not None}
+    known = {frame.name: frame.time_s for frame in scene.frames if frame.time_s is not None}
     ordered = sorted(known.items(), key=lambda moment: (moment[1], moment[0]))
     return [ordered[i] for i in evenly_spread(len(ordered), MOMENTS)]
 

@@ -155,8 +155,7 @@ class Map(Format):
         means = means.where(output.alpha[0, ..., None] >= OPEN, torch.nan)
         depth = surface_depth(output.depth, output.alpha[0])
         if self.unseen == "nan":
-            scene = module.scene
-            known = covered(camera, depth, sightings(scene, lambda frame: _depth(module, frame)))
+            known = covered(camera, depth, sightings(module.scene, module.depth))
             means = means.where(known[..., None], torch.nan)
         unit = seen.unit.replace("°", "deg ")
         unit = f" [{unit}]" if unit else ""
@@ -202,9 +201,3 @@ def _from_above(
     focal = away / pixel
     K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float64)
     return Camera(viewmat, K, width, height)
-
-
-@torch.no_grad()
-def _depth(module: object, frame: Frame) -> Tensor:
-    output = module.render(frame, depth=True)
-    return surface_depth(output.depth, output.alpha[0]).cpu()
