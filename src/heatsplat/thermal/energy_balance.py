@@ -286,9 +286,8 @@ class EnergyBalance(ThermalModel):
         heat capacity per area (of bodies without an end their effusivity), and the heat that a wall loses with its U-value,
         which are estimates (``physics.walls``)."""
         surface = self._surface(splats, query)
-        if (
-            self.options.semi_infinite
-        ):  # in which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63
+        if self.options.semi_infinite:
+            # In which a step is followed by 1 - erfc(1) e = 0.57; of a rate it would be 0.63.
             values = {"settling_time_h": torch.exp(-surface.log_rate) / 3600.0}
         else:
             values = {"time_constant_h": torch.exp(-surface.log_rate) / 3600.0}
