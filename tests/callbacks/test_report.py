@@ -21,8 +21,9 @@ from heatsplat.callbacks.report import Report, hyperparameters, pictures_of, rep
 from heatsplat.callbacks.statistics import SplatStatistics
 from heatsplat.callbacks.timing import CostMeter
 from heatsplat.contracts import Camera, Frame
-from heatsplat.io.results import COST, TEST, RunResults
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import read_csv
+from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 
 CONFIG = {
     "name": "etgs",
@@ -77,7 +78,7 @@ def test_scores_are_means_of_images(run):
 
 def test_every_number_is_there_or_explained(run):
     content = json.loads((run[1] / "metrics.json").read_text())
-    assert set(TEST) <= set(content["test"]) and set(COST) <= set(content["cost"])
+    assert set(DEFINITIONS) <= set(content["test"]) and set(COSTS) <= set(content["cost"])
     for section in ("test", "cost"):
         for name, value in content[section].items():
             assert (value is None) == (f"{section}.{name}" in content["reasons"]), name

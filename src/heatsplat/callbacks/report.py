@@ -29,24 +29,12 @@ from heatsplat.io.citations import citations
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE, RunResults, collect_versions, processor, write_atomically
 from heatsplat.io.tables import NONE, markdown_table, read_csv
-from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 REPORT_FILE = "report.md"
 CURVES_FILE = "renders/curves.png"
 
-COST_UNITS = {
-    "choosing_seconds": "s",
-    "train_seconds": "s",
-    "cpu_seconds": "s",
-    "steps_per_second": "1/s",
-    "render_fps": "1/s",
-    "peak_memory_mb": "MB",
-    "gaussians": "",
-    "warmup_seconds": "s",
-    "evaluation_seconds": "s",
-    "wall_seconds": "s",
-}
 # Parts of the configuration that say what was learned and how; the others say where and when, or repeat these.
 HYPERPARAMETERS = (
     "name", "seed", "max_steps", "dtype", "data", "thermal", "sensor", "composite", "renderer", "smoothing", "density",
@@ -200,16 +188,16 @@ def draw_curves(folder: Path) -> Path | None:
     if not (folder / CURVE_FILE).exists():
         return None
     rows = [row for row in read_csv(folder / CURVE_FILE) if row["train_seconds"] is not None]
-    scores = [("psnr", "PSNR (dB)"), ("ssim", "SSIM"), ("mae_c", "MAE (°C)"), ("loss", "loss, training")]
-    scores = [(name, label) for name, label in scores if any(row.get(name) is not None for row in rows)]
+    labels = {name: f"{DEFINITIONS[name].heading}, validation" for name in ("psnr", "ssim", "mae_c")}
+    scores = [name for name in (*labels, "loss") if any(row.get(name) is not None for row in rows)]
     if len(rows) < 2 or not scores:
         return None
     figure = Figure(figsize=(2.9 * len(scores), 2.6), dpi=110, layout="constrained")
-    for i, (name, label) in enumerate(scores):
+    for i, name in enumerate(scores):
         axes = figure.add_subplot(1, len(scores), i + 1)
         points = [(row["train_seconds"], row[name]) for row in rows if row.get(name) is not None]
         axes.plot(*zip(*points, strict=True), marker="o", markersize=3, color=f"C{i}")
-        axes.set(xlabel="seconds of training", ylabel=label if name == "loss" else f"{label}, validation")
+        axes.set(xlabel="seconds of training", ylabel=labels.get(name, "loss, training"))
         axes.grid(alpha=0.25)
     write_png(folder / CURVES_FILE, figure_picture(figure))
     return folder / CURVES_FILE
@@ -359,10 +347,9 @@ def effects_table(effects: Mapping[str, Any]) -> list[str]:
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
     """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
-    units = COST_UNITS | {name: definition.unit for name, definition in DEFINITIONS.items()}
     cells = []
     for name, value in content[section].items():
-        unit = units.get(name, units.get(name.partition("_")[2], ""))  # clean_mae_c has the unit of mae_c
+        unit = quantity.unit if (quantity := described(name)) is not None else ""
         cells.append((name, "–" if value is None else f"{_number(value)} {unit}".rstrip()))
     return cells
 

@@ -12,14 +12,13 @@ from matplotlib.figure import Figure
 
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table, number
+from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import NAMES, SEEDS
-from heatsplat.studies.frontier_runs import Recipe, dominated
+from heatsplat.studies.frontier_runs import SCORES, Recipe, dominated
 
-COLUMNS = {  # digits, and whether the spread stands beside the mean
-    "train_seconds": (1, True), "psnr": (2, True), "ssim": (4, False), "mae_c": (3, True),
-    "peak_memory_mb": (0, False), "render_fps": (0, False), "gaussians": (0, False),
-}  # fmt: skip
+COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
+WITH_SPREAD = {"train_seconds", "psnr", "mae_c"}  # beside the mean
 
 
 def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
@@ -49,25 +48,18 @@ def tables(
     found = []
     for scene in dict.fromkeys(recipe.scene for recipe in recipes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
-        head = [
-            "recipe",
-            "runs",
-            "train (s)",
-            "PSNR (dB)",
-            "SSIM",
-            "MAE (°C)",
-            "memory (MB)",
-            "frames/s",
-            "Gaussians",
-            "front",
-        ]
+        head = ["recipe", "runs", *(described(name).heading for name in COLUMNS), "front"]
         rows = []
         for recipe in own:
             cells = [
-                number(recipe.mean(name), digits, (spread and recipe.spread(name)) or None)
-                for name, (digits, spread) in COLUMNS.items()
+                number(
+                    recipe.mean(name),
+                    described(name).digits,
+                    (recipe.spread(name) or None) if name in WITH_SPREAD else None,
+                )
+                for name in COLUMNS
             ]
-            marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
+            marks = [DEFINITIONS[name].title for name in SCORES if recipe.on_front.get(name)]
             rows.append([recipe.name, str(recipe.count), *cells, ", ".join(marks)])
         found.append((f"{scene}: results beside their costs{_views_of(own)}", head, rows))
         psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
@@ -133,7 +125,7 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
     for i, scene in enumerate(scenes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
-        for k, (name, label) in enumerate((("psnr", "PSNR (dB)"), ("mae_c", "MAE (°C)"))):
+        for k, name in enumerate(SCORES):
             axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
             for recipe in own:
                 j = places[recipe.name]
@@ -148,11 +140,12 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
                         x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
                         linestyle="", label=literal(recipe.name),
                     )  # fmt: skip
-            sign = 1.0 if name == "psnr" else -1.0
+            sign = DEFINITIONS[name].sign
             every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
             front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
             if len(front) > 1:
                 axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
+            label = DEFINITIONS[name].heading
             axes.set(xlabel="seconds of training", ylabel=label, title=literal(scene), xscale="log")
             if name == "mae_c":
                 axes.set_yscale("log")

@@ -18,13 +18,15 @@ from typing import Any
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.results import RunResults, write_atomically
 from heatsplat.io.tables import markdown_table, number, write_csv
+from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, trained
 from heatsplat.studies.finished import reason_of
 from heatsplat.studies.options import check_count, counted, listed
 
 log = logging.getLogger("heatsplat")
 
-SCORES = {"psnr": "maximize", "mae_c": "minimize"}
+SCORES = ("psnr", "mae_c")  # by which settings may be compared
+COLUMNS = ("psnr", "mae_c", "gaussians", "cpu_seconds")
 DIGITS = 3  # to which values of a range are rounded, so that they can be read and typed
 CASE = {"scene", "knobs"}
 SEARCH_SEED = 0
@@ -108,7 +110,7 @@ class Check:
         """How much better the best is than the default with each seed; negative where it is worse, none where it failed."""
         if self.failed:
             return []
-        sign = 1.0 if SCORES[self.score] == "maximize" else -1.0
+        sign = DEFINITIONS[self.score].sign
         return [
             sign * (now.test[self.score] - before.test[self.score])
             for before, now in zip(self.default, self.best, strict=True)
@@ -265,7 +267,8 @@ def _search(
     """The trials of a method, each as soon as it has ended."""
     optuna = _optuna()
     space = {key: _distribution(runs.method, key, values) for key, values in knobs.items()}
-    study = optuna.create_study(direction=SCORES[score], sampler=optuna.samplers.TPESampler(seed=0))
+    direction = "maximize" if DEFINITIONS[score].higher else "minimize"
+    study = optuna.create_study(direction=direction, sampler=optuna.samplers.TPESampler(seed=0))
     spent = 0.0
     for count in range(trials):
         if seconds is not None and spent >= seconds:
@@ -293,7 +296,7 @@ def _words(settings: Mapping[str, Any]) -> list[str]:
 
 def _best(tried: Sequence[Trial], score: str) -> Trial:
     """The trial with the best score, the default where none is better."""
-    sign = 1.0 if SCORES[score] == "maximize" else -1.0
+    sign = DEFINITIONS[score].sign
     measured = [trial for trial in tried if trial.results is not None and trial.results.test[score] is not None]
     if not measured:
         raise SceneError(f"no run of method={tried[0].method} has the score {score}: choose another with study.score")
@@ -340,18 +343,8 @@ def markdown(
     about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
     which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
     lines = ["# Tuning", "", about, "", f"## The best settings of each search beside the default, {which}", ""]
-    head = [
-        "method",
-        "steps",
-        "settings",
-        "seeds",
-        "PSNR (dB)",
-        "MAE (°C)",
-        "Gaussians",
-        "cpu s",
-        f"gain ({score})",
-        "verdict",
-    ]
+    columns = [described(name).heading for name in COLUMNS]
+    head = ["method", "steps", "settings", "seeds", *columns, f"gain ({score})", "verdict"]
     rows = []
     for check in checks:
         best = _best([trial for trial in tried if trial.method == check.method], score)
@@ -367,9 +360,9 @@ def markdown(
         own, knobs = [trial for trial in tried if trial.method == method], list(cases[method]["knobs"])
         lines += ["", f"## {method}: {' '.join(cases[method]['scene'])}, {steps} steps, seed 0", ""]
         lines += markdown_table(
-            [*knobs, "PSNR (dB)", "MAE (°C)", "Gaussians", "cpu s"],
+            [*knobs, *columns],
             [[*(spelled(trial.settings.get(key, "default")) for key in knobs), *_scores(trial)] for trial in own],
-            "r" * (len(knobs) + 4),
+            "r" * (len(knobs) + len(columns)),
         )
     return "\n".join(lines) + "\n"
 
@@ -383,13 +376,12 @@ def _scores(trial: Trial) -> list[str]:
 def _cells(several: Sequence[RunResults]) -> list[str]:
     """Number of runs, then means and spreads of their scores and costs."""
 
-    def cell(section: str, name: str, digits: int) -> str:
-        values = [getattr(one, section)[name] for one in several]
+    def cell(name: str) -> str:
+        values = [(results.test | results.cost)[name] for results in several]
         known = [value for value in values if value is not None]
-        return number(statistics.fmean(known) if known else None, digits, _spread(known))
+        return number(statistics.fmean(known) if known else None, described(name).digits, _spread(known))
 
-    kinds = (("test", "psnr", 2), ("test", "mae_c", 3), ("cost", "gaussians", 0), ("cost", "cpu_seconds", 1))
-    return [str(len(several)), *(cell(*kind) for kind in kinds)]
+    return [str(len(several)), *(cell(name) for name in COLUMNS)]
 
 
 def _spread(values: Sequence[float]) -> float | None:

@@ -84,7 +84,7 @@ class Board:
     @property
     def higher(self) -> bool:
         """Whether more of it is better."""
-        return DEFINITIONS[self.score].better == "higher"
+        return DEFINITIONS[self.score].higher
 
     @property
     def reference(self) -> str:

@@ -18,7 +18,6 @@ log = logging.getLogger("heatsplat")
 
 TABLE_FILE, CSV_FILE, PAGE_FILE = "leaderboard.md", "leaderboard.csv", "leaderboard.html"
 TIES = "methods are tied and share ranks if they differ by less than two standard errors of the difference."
-DIGITS = {"psnr": 2, "ssim": 4, "mae_c": 3}
 
 
 def write_leaderboard(folder: Path, board: Board) -> list[Path]:
@@ -123,7 +122,7 @@ def rank_text(entry: Entry) -> str:
 def _cell(entry: Entry | None, score: str) -> str:
     if entry is None or entry.mean(score) is None:
         return NONE
-    text = f"{number(entry.mean(score), DIGITS.get(score, 3))} ({rank_text(entry)})"
+    text = f"{number(entry.mean(score), DEFINITIONS[score].digits)} ({rank_text(entry)})"
     return f"**{text}**" if entry.rank[0] == 1 else text
 
 
