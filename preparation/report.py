@@ -13,8 +13,8 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from heatsplat.callbacks.page import PAGE_FILE, plain, write_page
 from heatsplat.contracts import evenly_spread
+from heatsplat.io.page import PAGE_FILE, plain, write_page
 from heatsplat.io.pictures import literal
 from heatsplat.io.results import write_atomically
 from heatsplat.io.tables import markdown_table
