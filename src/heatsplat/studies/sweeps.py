@@ -9,9 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import figure_picture, literal, write_png
+from heatsplat.io.pictures import figure_picture, literal, series_look, write_png
 from heatsplat.io.results import write_atomically
-from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
@@ -95,7 +95,7 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
             *([row.scene] if several else []),
             row.label,
             row.count,
-            *(number(row.mean(name), described(name).digits, row.spread(name)) for name in columns),
+            *(over_seeds(row.values(name), described(name).digits) for name in columns),
             *(paper.get(row.name, {}).get(name, NONE) for name in printed),
         ]
         for row in rows
@@ -136,9 +136,10 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
             x, y = row.mean("train_seconds"), row.mean(name)
             if x is not None and y is not None:
                 label = literal(f"{row.label}, {row.scene}" if several else row.label)
+                color, mark = series_look(j)
                 axes.errorbar(
-                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, "os^Dv"[j // 10 % 5], color=f"C{j % 10}",
-                    capsize=2, markersize=6, label=label,
+                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, mark, color=color, capsize=2, markersize=6,
+                    label=label,
                 )  # fmt: skip
         axes.set(xlabel="seconds of training", ylabel=f"{described(name).heading}, test")
         axes.grid(alpha=0.25)

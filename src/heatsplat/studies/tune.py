@@ -17,11 +17,11 @@ from typing import Any
 
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.results import RunResults, write_atomically
-from heatsplat.io.tables import markdown_table, number, write_csv
+from heatsplat.io.tables import markdown_table, number, over_seeds, write_csv
 from heatsplat.metrics.definitions import DEFINITIONS, described
-from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, trained
+from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, train_or_read
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.options import check_count, counted, listed
+from heatsplat.studies.options import check_count, listed, whole_numbers
 
 log = logging.getLogger("heatsplat")
 
@@ -70,7 +70,7 @@ class MethodRuns:
     def result(self, name: str, settings: Mapping[str, Any], steps: int, seed: int) -> RunResults:
         """Of a run, which is trained unless it is there. Raises SceneError where it fails."""
         wanted = [*self.common, f"max_steps={steps}", f"seed={seed}", *_words(settings)]
-        return trained(self._place(name, steps, seed), self.train, wanted, self.folder)
+        return train_or_read(self._place(name, steps, seed), self.train, wanted, self.folder)
 
     def attempt(self, name: str, settings: Mapping[str, Any], steps: int, seed: int = SEARCH_SEED) -> Trial:
         """A run that may fail: a rate may be too high to train with. Raises OtherSettingsError as ``result`` does."""
@@ -125,7 +125,8 @@ class Check:
         if self.failed:
             return f"failed: {self.failed}"
         gains, mean = self.gains, statistics.fmean(self.gains)
-        spread = _spread([one.test[self.score] for one in self.default]) or 0.0
+        scores = [results.test[self.score] for results in self.default]
+        spread = statistics.stdev(scores) if len(scores) > 1 else 0.0
         if len(gains) < 2 or abs(mean) <= spread or min(gains) <= 0 <= max(gains):
             return "within the spread"
         return "better" if mean > 0 else "worse"
@@ -212,7 +213,7 @@ def _checked(
     if score not in SCORES:
         raise SceneError(f"study.score={score}: give one of {', '.join(SCORES)}")
     check_count("study.trials", trials)
-    counted("study.seeds", seeds, least=0)
+    whole_numbers("study.seeds", seeds, least=0)
     if SEARCH_SEED in seeds or len({*seeds}) < len(seeds):
         raise SceneError(
             f"study.seeds={seeds}: give every seed once, and not {SEARCH_SEED}, with which the settings were found"
@@ -348,7 +349,7 @@ def markdown(
     rows = []
     for check in checks:
         best = _best([trial for trial in tried if trial.method == check.method], score)
-        gain = number(statistics.fmean(check.gains), 3, _spread(check.gains)) if check.gains else ""
+        gain = over_seeds(check.gains, 3) if check.gains else ""
         rows.append([check.method, check.steps, "default", *_cells(check.default), "", ""])
         rows.append(["", "", ", ".join(_words(best.settings)), *_cells(check.best), gain, check.verdict])
     lines += markdown_table(head, rows, "lrlrrrrrrl")
@@ -379,10 +380,6 @@ def _cells(several: Sequence[RunResults]) -> list[str]:
     def cell(name: str) -> str:
         values = [(results.test | results.cost)[name] for results in several]
         known = [value for value in values if value is not None]
-        return number(statistics.fmean(known) if known else None, described(name).digits, _spread(known))
+        return over_seeds(known, described(name).digits)
 
     return [str(len(several)), *(cell(name) for name in COLUMNS)]
-
-
-def _spread(values: Sequence[float]) -> float | None:
-    return statistics.stdev(values) if len(values) > 1 else None

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import literal
+from heatsplat.io.pictures import literal, series_look
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import NAMES, SEEDS
-from heatsplat.studies.frontier_runs import SCORES, Recipe, dominated
+from heatsplat.studies.frontier.runs import SCORES, Recipe, dominated
 
 COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
+LEGEND = (
+    "Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto front "
+    "of both; ends with a black edge are those that no other recipe equalled sooner."
+)
 WITH_SPREAD = {"train_seconds", "psnr", "mae_c"}  # beside the mean
 
 
@@ -92,8 +94,8 @@ def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -
     found = {key: [one.results.run.get(key) for one in runs] for key in ("seed", "threads")}
     lines = ["# Accuracy against training time", "", all_rows(sorted(set.intersection(*jobs)), **found), ""]
     for title, head, rows in tables(recipes, levels):
-        lines += [f"## {title}", "", *markdown_table(head, rows), ""]
-    return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])
+        lines += [f"## {title}", "", *markdown_table(head, rows, "l" + "r" * (len(head) - 1)), ""]
+    return "\n".join([*lines, "![quality against seconds](frontier.svg)", "", LEGEND, ""])
 
 
 def records(recipes: Sequence[Recipe]) -> list[dict[str, Any]]:
@@ -128,8 +130,7 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
         for k, name in enumerate(SCORES):
             axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
             for recipe in own:
-                j = places[recipe.name]
-                color, mark = f"C{j % 10}", "os^Dv<>P"[j // 10 % 8]
+                color, mark = series_look(places[recipe.name])
                 for course in recipe.table["course"]:
                     if course[name]:
                         axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
@@ -156,23 +157,3 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
             if k == 0 and own:
                 axes.legend(fontsize=7)
     return figure
-
-
-def page(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]], vector: str) -> str:
-    """A page that needs no other file: the picture and the tables."""
-    picture_data = base64.b64encode(vector.encode()).decode()
-    parts = [
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Accuracy against training time</title>',
-        "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1100px;padding:0 1em}"
-        "table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ccc;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}img{width:100%}</style>",
-        "<h1>Accuracy against training time</h1>",
-        f'<img alt="quality against seconds" src="data:image/svg+xml;base64,{picture_data}">',
-        "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto "
-        "front of both; ends with a black edge are those that no other recipe equalled sooner.</p>",
-    ]
-    for title, head, rows in tables(recipes, levels):
-        cells = "".join(f"<th>{html.escape(text)}</th>" for text in head)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows)
-        parts.append(f"<h2>{html.escape(title)}</h2><table><tr>{cells}</tr>{body}</table>")
-    return "\n".join(parts)

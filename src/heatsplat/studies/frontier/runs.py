@@ -81,10 +81,10 @@ def find_runs(folders: Iterable[Path], clock: str = "train_seconds") -> pd.DataF
             courses.append(None)
     found["course"] = courses
     found = found[found["course"].notna()]
-    return found.assign(measured=[_measured(one.results.data, one.data) for one in found.itertuples()])
+    return found.assign(measured=[_conditions(one.results.data, one.data) for one in found.itertuples()])
 
 
-def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
+def _conditions(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
     """What tells the validation and test views of a run from others of a scene of this name; what is not known is left out.
 
     Args:

@@ -8,11 +8,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import literal
-from heatsplat.io.tables import NONE, markdown_table, number
+from heatsplat.io.pictures import literal, series_look
+from heatsplat.io.tables import NONE, markdown_table, over_seeds
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.frontier_runs import SCORES
-from heatsplat.studies.time_to_accuracy_runs import Outcome, Panel
+from heatsplat.studies.frontier.runs import SCORES
+from heatsplat.studies.time_to_accuracy.runs import Outcome, Panel
 
 CLOCK_LABELS = {"train_seconds": "seconds of training", "cpu_seconds": "processor seconds of training"}
 
@@ -27,12 +27,10 @@ def named(panel: Panel, one: Outcome) -> str:
     )
 
 
-def _over_seeds(measures: Sequence[dict[str, float | None]], name: str, digits: int) -> str:
-    """Mean and standard deviation (n - 1); a dash where a run has none."""
+def _mean_and_spread(measures: Sequence[dict[str, float | None]], name: str, digits: int) -> str:
+    """Mean and standard deviation of a measure; a dash where a run has none."""
     values = [each.get(name) for each in measures]
-    if not values or None in values:
-        return NONE
-    return number(statistics.fmean(values), digits, statistics.stdev(values) if len(values) > 1 else None)
+    return NONE if None in values else over_seeds(values, digits)
 
 
 def _scores(panel: Panel) -> list[str]:
@@ -59,16 +57,16 @@ def ends(panel: Panel) -> list[str]:
 
 def _end_cells(panel: Panel, own: Sequence[Outcome], scores: Sequence[str]) -> list[str]:
     measures = [panel.measures(one) for one in own]
-    cells = [_over_seeds(measures, "seconds", 1), _over_seeds(measures, "time_ratio", 2)]
+    cells = [_mean_and_spread(measures, "seconds", 1), _mean_and_spread(measures, "time_ratio", 2)]
     for score in scores:
         digits = DEFINITIONS[score].digits
         good = sum(each[f"end_{score}"] is not None for each in measures)
         cells += [
-            _over_seeds(measures, score, digits),
-            _over_seeds(measures, f"{score}_off", digits),
+            _mean_and_spread(measures, score, digits),
+            _mean_and_spread(measures, f"{score}_off", digits),
             f"{good} of {len(own)}",
         ]
-    return [*cells, _over_seeds(measures, "gaussians", 0), _over_seeds(measures, "gaussians_ratio", 2)]
+    return [*cells, _mean_and_spread(measures, "gaussians", 0), _mean_and_spread(measures, "gaussians_ratio", 2)]
 
 
 def times(panel: Panel, way: str) -> list[str]:
@@ -90,7 +88,7 @@ def times(panel: Panel, way: str) -> list[str]:
     for own in panel.groups():
         measures = [panel.measures(one) for one in own]
         cells = [
-            _over_seeds(measures, f"{way}_{score}{suffix}", digits)
+            _mean_and_spread(measures, f"{way}_{score}{suffix}", digits)
             for score in scores
             for suffix, digits in (("", 1), ("_of_own", 2), ("_of_all", 2))
         ]
@@ -134,7 +132,9 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
     counts as good as it (means over the seeds).
     """
     names = sorted({one.recipe for panel in panels for one in panel.outcomes if one.recipe is not None})
-    looks = {name: (f"C{i % 10}", "s^Dv<>P"[i // 10 % 7]) for i, name in enumerate(names)} | {None: ("black", "o")}
+    looks = {name: series_look(i + 10) for i, name in enumerate(names)} | {
+        None: ("black", "o")
+    }  # circles: the standard's
     figure = Figure(figsize=(11, 4.4 * len(panels)), dpi=110, layout="constrained")
     for i, panel in enumerate(panels):
         scores = _scores(panel)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import PLACES, settings_of
-from heatsplat.studies.frontier_runs import panel_titles, seconds_to
+from heatsplat.studies.frontier.runs import panel_titles, seconds_to
 from heatsplat.studies.options import listed
 
 log = logging.getLogger("heatsplat")
