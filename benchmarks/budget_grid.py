@@ -27,8 +27,8 @@ from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
-from heatsplat.studies.child_runs import all_rows, trained
-from heatsplat.studies.options import check_count, counted, filled, listed
+from heatsplat.studies.child_runs import all_rows, train_or_read
+from heatsplat.studies.options import check_count, listed, non_empty, whole_numbers
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
 
@@ -119,7 +119,7 @@ def run(
         off = ("reset_every", "multiple") if cap else ("reset_every",)  # as budget= trains
         wanted += [f"density.{name}=null" for name in off if name in density]
         wanted += [f"density.cap_max={cap}"] if cap else []
-        results = trained(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
+        results = train_or_read(place, train, [*common, *_of(method, scene, seed), *wanted], folder)
         mean = mean_gaussians(place / CURVE_FILE, results.data["points"])
         grid.append(Trained(method, scene, length, cap, decay, seed, results, mean, settings))
     points = means(grid)
@@ -130,7 +130,7 @@ def run(
         write_points(merged(_known(curves), points), source)
     plans = hashlib.sha256(source.read_bytes()).hexdigest()[:8]  # other curves plan other runs
     planned = [
-        (method, scene, budget, trained(
+        (method, scene, budget, train_or_read(
             folder / "planned" / f"{method}_{scene}_{budget:g}s_{plans}" / "0", train,
             [*common, *_of(method, scene, 0), f"budget={budget:g}s", f"budget_curves={source}"], folder,
         ))
@@ -148,7 +148,7 @@ def _known(curves: str | None) -> list[Point]:
 
 def _pairs(scenes: Sequence[str]) -> list[tuple[str, ...]]:
     """Method and scene of each entry."""
-    scenes = filled("study.scenes", scenes)
+    scenes = non_empty("study.scenes", scenes)
     pairs = [tuple(str(pair).split("/")) for pair in scenes]
     if any(len(pair) != 2 for pair in pairs):
         raise SceneError(f"study.scenes has entries of the form method/scene, such as etgs/heated, got {scenes}")
@@ -160,8 +160,8 @@ def _asked(whole: Mapping[str, Sequence[Any]], further: Sequence[Mapping[str, An
     asked: dict[tuple[Any, ...], None] = {}
     for part in [{}, *further]:
         own = {name: part.get(name, values) for name, values in whole.items()}
-        steps, seeds = counted("study.steps", own["steps"]), counted("study.seeds", own["seeds"], least=0)
-        caps, decays = filled("study.caps", own["caps"]), filled("study.decays", own["decays"])
+        steps, seeds = whole_numbers("study.steps", own["steps"]), whole_numbers("study.seeds", own["seeds"], least=0)
+        caps, decays = non_empty("study.caps", own["caps"]), non_empty("study.decays", own["decays"])
         for cap in caps:
             if cap is not None:
                 check_count("study.caps", cap)

@@ -14,9 +14,9 @@ from heatsplat.effects import assembly
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults
-from heatsplat.io.tables import markdown_table, number
-from heatsplat.studies.child_runs import all_rows, trained
-from heatsplat.studies.options import counted, filled, listed, named
+from heatsplat.io.tables import markdown_table, number, over_seeds
+from heatsplat.studies.child_runs import all_rows, train_or_read
+from heatsplat.studies.options import listed, non_empty, subset_of, whole_numbers
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
 SELECTIONS = ("auto", "none", "all", "oracle")
@@ -109,8 +109,11 @@ def run(
             there is none of what makes a run.
     """
     check_option("study.clock", clock, CLOCKS, SceneError)
-    chosen = filled("study.presets", list(presets)) if only is None else named("study.only", only, presets)
-    selections, seeds = named("study.selections", selections, SELECTIONS), counted("study.seeds", seeds, least=0)
+    chosen = non_empty("study.presets", list(presets)) if only is None else subset_of("study.only", only, presets)
+    selections, seeds = (
+        subset_of("study.selections", selections, SELECTIONS),
+        whole_numbers("study.seeds", seeds, least=0),
+    )
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *listed(overrides)]
     known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on
@@ -120,7 +123,7 @@ def run(
         if expected is not None and (job.preset, job.seed, expected) in known:
             return known[job.preset, job.seed, expected]
         place = folder / "runs" / job.folder / str(job.seed)
-        results = trained(place, train, [*common, *job.overrides(presets[job.preset])], folder)
+        results = train_or_read(place, train, [*common, *job.overrides(presets[job.preset])], folder)
         return known.setdefault((job.preset, job.seed, _on(results)), results)
 
     rows = []
@@ -173,7 +176,8 @@ def tables(rows: Sequence[Row], clock: str, about: str) -> str:
     """Markdown: what all runs have, selections side by side, then what leaving each effect out costs."""
     chosen = [
         (
-            row.job.preset, row.job.selection, row.shown, _told(row.psnr, 2), _told(row.clean_psnr, 2), _told(row.mae_c, 3),
+            row.job.preset, row.job.selection, row.shown,
+            over_seeds(row.psnr, 2), over_seeds(row.clean_psnr, 2), over_seeds(row.mae_c, 3),
             number(row.parameters, 0), number(row.ms_per_step, 1),
         )
         for row in rows
@@ -194,8 +198,8 @@ def tables(rows: Sequence[Row], clock: str, about: str) -> str:
     for row in (row for row in rows if row.job.left_out):
         auto = whole[row.job.preset]
         left.append((
-            row.job.preset, row.job.left_out, _told(_less(auto.psnr, row.psnr), 2),
-            _told(_less(auto.clean_psnr, row.clean_psnr), 2), _told(_less(row.mae_c, auto.mae_c), 3),
+            row.job.preset, row.job.left_out, over_seeds(_less(auto.psnr, row.psnr), 2),
+            over_seeds(_less(auto.clean_psnr, row.clean_psnr), 2), over_seeds(_less(row.mae_c, auto.mae_c), 3),
             number(auto.parameters - row.parameters, 0), number(auto.ms_per_step - row.ms_per_step, 2),
         ))  # fmt: skip
     if left:
@@ -212,13 +216,6 @@ def tables(rows: Sequence[Row], clock: str, about: str) -> str:
         lines += ["Losses (PSNR down, MAE up) and savings without the effect and everything that depends on it.", ""]
         lines += markdown_table(head, left, align="llrrrrr")
     return "\n".join([*lines, ""])
-
-
-def _told(values: Sequence[float], digits: int) -> str:
-    """Mean of values by seed, with their standard deviation where there are several."""
-    if not values:
-        return number(None, digits)
-    return number(statistics.fmean(values), digits, statistics.stdev(values) if len(values) > 1 else None)
 
 
 def _less(more: Sequence[float], less: Sequence[float]) -> list[float]:

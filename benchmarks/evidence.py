@@ -26,7 +26,7 @@ from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.tables import markdown_table
 from heatsplat.studies.child_runs import refuse_others
-from heatsplat.studies.options import check_count, filled, listed
+from heatsplat.studies.options import check_count, listed, non_empty
 from heatsplat.training.machine import cores, prepare_machine
 
 log = logging.getLogger("heatsplat")
@@ -254,7 +254,7 @@ def run(
     scenes = SCENES if scenes is None else scenes
     if jobs is not None:
         check_count("study.jobs", jobs)
-    sizes, scenes, seeds, unseen = filled("study.sizes", sizes), listed(scenes), listed(seeds), listed(unseen)
+    sizes, scenes, seeds, unseen = non_empty("study.sizes", sizes), listed(scenes), listed(seeds), listed(unseen)
     numbers = {name: range(first, first + count) for name, (first, count) in (drawn or {}).items()}
     cases = [(scene, size, seed) for size in sizes for scene in scenes for seed in (*seeds, *unseen)]
     cases += [(f"{DRAWN}{number}", sizes[0], number) for these in numbers.values() for number in these]

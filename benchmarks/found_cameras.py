@@ -33,8 +33,8 @@ from heatsplat.io.command_lines import setting
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number
-from heatsplat.studies.child_runs import refuse_others, trained
-from heatsplat.studies.options import counted, filled, listed
+from heatsplat.studies.child_runs import refuse_others, train_or_read
+from heatsplat.studies.options import listed, non_empty, whole_numbers
 
 TABLE_FILE, SPENT_FILE, CASE_FILE = "found_cameras.md", "spent.json", "case.json"
 FLIGHT = "flight"  # a case's scene: the synthetic yard from a drone; others are presets
@@ -77,9 +77,9 @@ def run(
         SceneError: there is no case or seed or no such scene, prepare.py found no cameras, a run failed, or what is done was done
             with other settings.
     """
-    output_dir, seeds = Path(output_dir), counted("study.seeds", seeds, least=0)
+    output_dir, seeds = Path(output_dir), whole_numbers("study.seeds", seeds, least=0)
     overrides = None if overrides is None else listed(overrides)
-    filled("study.cases", list(cases or {}))
+    non_empty("study.cases", list(cases or {}))
     for name, case in cases.items():
         if "files" not in case:
             check_option(f"study.cases.{name}.scene", case.get("scene"), (FLIGHT, *PRESETS), SceneError)
@@ -101,7 +101,7 @@ def run(
         lines = [*overrides, *case.get("train", ()), "data=colmap", f"threads={'null' if threads is None else threads}"]
         for kind in ("found", "true"):
             runs = [
-                trained(
+                train_or_read(
                     place / f"trained_{kind}_{seed}",
                     train,
                     [*lines, f"seed={seed}", setting("data.root", place / kind)],

@@ -23,7 +23,7 @@ from pathlib import Path
 import yaml
 
 from heatsplat.io.tables import markdown_table
-from heatsplat.studies.options import check_count, named
+from heatsplat.studies.options import check_count, subset_of
 
 log = logging.getLogger("heatsplat")
 
@@ -226,7 +226,7 @@ def run(
     """
     check_count("study.processes", processes)
     names = [mutation.name for mutation in MUTATIONS]
-    wanted = names if only is None else named("study.only", only, names)
+    wanted = names if only is None else subset_of("study.only", only, names)
     chosen = [mutation for mutation in MUTATIONS if mutation.name in wanted]
     # A child of this process would inherit OpenMP threads that do not run in it, and die of its first parallel kernel.
     context = multiprocessing.get_context("forkserver")

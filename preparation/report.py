@@ -13,9 +13,9 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from heatsplat.callbacks.page import PAGE_FILE, plain, write_page
 from heatsplat.contracts import evenly_spread
 from heatsplat.io.files import write_atomically
+from heatsplat.io.page import PAGE_FILE, plain, write_page
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty

@@ -7,11 +7,11 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from heatsplat.callbacks.page import PAGE_FILE
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.io.files import read_json_object, write_atomically
+from heatsplat.io.page import PAGE_FILE
 
 RECORD = ".prepared"  # file in the folder: what wrote it, and a hash of the cameras that it wrote
 PARTIAL = ".partial"  # folder of what is being written

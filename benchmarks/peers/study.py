@@ -24,7 +24,7 @@ from benchmarks.peers.scenes import SharedScene, shared
 from benchmarks.peers.training import score, train_heatsplat, train_opensplat
 from benchmarks.renderer.peers import from_path
 from heatsplat.contracts import SceneError
-from heatsplat.studies.options import check_count, counted
+from heatsplat.studies.options import check_count, whole_numbers
 
 log = logging.getLogger("heatsplat")
 
@@ -72,7 +72,7 @@ def run(
     if opensplat is not None and shutil.which(opensplat) is None:
         raise SceneError(f"study.opensplat={opensplat} is no program: give the path of its executable")
     check_count("study.rounds", rounds)
-    steps, threads = counted("study.steps", steps), counted("study.threads", threads)
+    steps, threads = whole_numbers("study.steps", steps), whole_numbers("study.threads", threads)
     renderers = {name: from_path(path) for name, path in rasteriser.items()}
     output_dir = Path(output_dir).resolve()
     begin, load = time.perf_counter(), os.getloadavg()[0]

@@ -19,7 +19,7 @@ from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels.peak import memory_rate, vector_rate
 from heatsplat.renderers import rasterization
-from heatsplat.studies.options import check_count, filled
+from heatsplat.studies.options import check_count, non_empty
 from heatsplat.training.adam import OnePassAdam
 
 MAPS = 3
@@ -50,8 +50,12 @@ def run(
     Raises:
         SceneError: a list is empty, or a number counts nothing.
     """
-    cases, threads, views = filled("study.cases", cases), filled("study.threads", threads), filled("study.views", views)
-    filled("study.methods", list(methods))
+    cases, threads, views = (
+        non_empty("study.cases", cases),
+        non_empty("study.threads", threads),
+        non_empty("study.views", views),
+    )
+    non_empty("study.methods", list(methods))
     for case in cases:
         check_numbers("each of study.cases", case, 3, SceneError)
     for key, counts in {"steps": [steps], "rounds": [rounds], "threads": threads, "views": views}.items():

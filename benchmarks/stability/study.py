@@ -18,7 +18,7 @@ import torch
 
 from benchmarks.stability.case import TYPES, Case, measured
 from heatsplat.io.tables import markdown_table
-from heatsplat.studies.options import named
+from heatsplat.studies.options import subset_of
 
 log = logging.getLogger("heatsplat")
 
@@ -62,7 +62,7 @@ def run(output_dir: Path | str, document: str | None = None, families: Sequence[
     Raises:
         SceneError: there is no such family.
     """
-    families = None if families is None else named("study.families", families, FAMILIES)
+    families = None if families is None else subset_of("study.families", families, FAMILIES)
     torch.set_num_threads(1)  # tiny tensors
     committed = Path(document).read_text(encoding="utf-8") if document and Path(document).exists() else ""
     text = written(measurements(families), committed)

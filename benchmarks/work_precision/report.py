@@ -322,7 +322,7 @@ def _name(row: Any) -> str:
 def _least(points: Sequence[Any], level: float) -> str:
     good = [r for r in points if r.worst_k <= level]
     if not good:
-        return "–"
+        return NONE
     return f"{_time(min(r.us for r in good))} / {_time(min(r.us_alone for r in good))}"
 
 

@@ -25,7 +25,7 @@ from benchmarks.work_precision.solvers import ADAPTIVE, NAMES, RADAU, Missing, O
 from heatsplat.composition import compose
 from heatsplat.io.tables import write_csv
 from heatsplat.kernels.scheduling import thread_count, use_threads
-from heatsplat.studies.options import listed, named
+from heatsplat.studies.options import listed, subset_of
 
 log = logging.getLogger("heatsplat")
 
@@ -125,8 +125,8 @@ def measurements(
         SceneError: a name is unknown, or there is no problem.
     """
     makers = problems(gaussians, frames, frequencies)
-    only = list(makers) if only is None else named("study.only", only, makers)
-    solvers = list(NAMES) if solvers is None else listed(solvers) and named("study.solvers", solvers, NAMES)
+    only = list(makers) if only is None else subset_of("study.only", only, makers)
+    solvers = list(NAMES) if solvers is None else listed(solvers) and subset_of("study.solvers", solvers, NAMES)
     before = thread_count(), torch.get_num_threads()
     use_threads(1)
     torch.set_num_threads(1)

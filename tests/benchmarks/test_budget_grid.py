@@ -79,7 +79,7 @@ def test_further_settings_are_measured_beside_the_same_without(tmp_path, monkeyp
         (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
         return paced(0.01, 5000.0).results
 
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    monkeypatch.setattr(budget_grid, "train_or_read", trained)
     grid = {
         "scenes": ["etgs/heated"],
         "steps": [250, 500],
@@ -119,7 +119,7 @@ def test_the_grid_trains_every_combination_and_leaves_the_curves_of_other_scenes
         (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
         return a_run(0, None, 0, 20.0 + len(asked), 5.0).results
 
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    monkeypatch.setattr(budget_grid, "train_or_read", trained)
     longer = replace(POINTS[4], steps=9000)
     write_points([replace(POINTS[0], scene="cooling"), POINTS[3], longer], tmp_path / "curves.csv")
     settings = {"train": "train.py", "steps": [250, 500], "caps": [8000, None], "decays": [1.0, 0.25], "seeds": [0]}
@@ -150,7 +150,7 @@ def test_planned_runs_read_the_curves_just_written_on_the_threads_asked_for(tmp_
         results.run["budget"] = {"train_s": 5.0, "calibration_s": 0.1, "off_percent": 0.0, "steps": 250}
         return results
 
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    monkeypatch.setattr(budget_grid, "train_or_read", trained)
     monkeypatch.chdir(tmp_path)
     write_points([POINTS[5]], tmp_path / "curves.csv")
     settings = {
@@ -180,7 +180,7 @@ def noted(monkeypatch) -> list[list[str]]:
         (place / "curve.csv").write_text("step,train_seconds,gaussians\n50,1,5000\n")
         return a_run(0, None, 0, 20.0, 5.0).results
 
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    monkeypatch.setattr(budget_grid, "train_or_read", trained)
     return asked
 
 
@@ -195,7 +195,7 @@ def test_other_curves_plan_other_runs(tmp_path, monkeypatch):
         results.run["budget"] = {"train_s": 5.0, "calibration_s": 0.1, "off_percent": 0.0, "steps": 250}
         return results
 
-    monkeypatch.setattr(budget_grid, "trained", trained)
+    monkeypatch.setattr(budget_grid, "train_or_read", trained)
     settings = {"train": None, "caps": [None], "decays": [1.0], "seeds": [0], "overrides": [], "curves": None}
     for steps in ([250], [250], [250, 500]):
         budget_grid.run(tmp_path, scenes=["etgs/heated"], steps=steps, budgets=[30.0], **settings)
@@ -226,7 +226,7 @@ def test_settings_of_all_runs_choose_what_a_cap_turns_off(tmp_path, monkeypatch)
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_trained(wrong, message, tmp_path, monkeypatch):
-    monkeypatch.setattr(budget_grid, "trained", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(budget_grid, "train_or_read", lambda *_: pytest.fail("trained"))
     options = {"scenes": ["etgs/heated"], "steps": [250], "caps": [None], "decays": [1.0], "seeds": [0], "budgets": []}
     with pytest.raises(SceneError, match=message):
         budget_grid.run(tmp_path, None, **options | {"overrides": [], "curves": None} | wrong)
@@ -267,7 +267,7 @@ def test_caps_go_to_density_control(tmp_path, monkeypatch):
 
 
 def test_curves_that_are_none_are_told_before_anything_is_trained(tmp_path, monkeypatch):
-    monkeypatch.setattr(budget_grid, "trained", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(budget_grid, "train_or_read", lambda *_: pytest.fail("trained"))
     (tmp_path / "notes.txt").write_text("not curves")
     settings = {
         "steps": [250],

@@ -66,7 +66,7 @@ def test_cameras_are_compared_and_both_trained_with_the_same_points(tmp_path, mo
         return results
 
     monkeypatch.setattr(found_cameras, "prepared", pretend)
-    monkeypatch.setattr(found_cameras, "trained", train)
+    monkeypatch.setattr(found_cameras, "train_or_read", train)
     case = {"room": CASE | {"settings": ["poses.clip=2"]}}
     found_cameras.run(tmp_path, "prepare.py", "train.py", case, ["max_steps=3"], 1, seeds)
     table = (tmp_path / TABLE_FILE).read_text()

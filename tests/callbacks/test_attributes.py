@@ -17,7 +17,7 @@ from heatsplat.callbacks.attributes import (
     attribute_picture,
 )
 from heatsplat.callbacks.metrics import QualityMetrics
-from heatsplat.callbacks.report import learned_section
+from heatsplat.callbacks.report_text import learned_section
 from heatsplat.contracts import ViewSet
 from heatsplat.io.pictures import UNKNOWN
 from heatsplat.io.tables import read_csv

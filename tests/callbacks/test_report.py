@@ -1,7 +1,6 @@
 """A short run with all callbacks: what it leaves behind, compared with what can be computed without them."""
 
 import csv
-import html
 import json
 import re
 
@@ -13,16 +12,16 @@ from fake_run import HEIGHT, RANGE, SECONDS, WIDTH, FakeModule, evaluate, events
 from skimage.metrics import peak_signal_noise_ratio
 
 from heatsplat.callbacks.images import ImagePanels
-from heatsplat.callbacks.metrics import CURVE_COLUMNS, QualityMetrics
-from heatsplat.callbacks.page import page
+from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves
 from heatsplat.callbacks.progress import Progress
-from heatsplat.callbacks.report import Report, hyperparameters, pictures_of, report, show
+from heatsplat.callbacks.report import Report, pictures_of
 from heatsplat.callbacks.statistics import SplatStatistics
 from heatsplat.callbacks.timing import CostMeter
 from heatsplat.contracts import Camera, Frame
-from heatsplat.io.results import COST, TEST, RunResults
+from heatsplat.io.results import RunResults
 from heatsplat.io.tables import read_csv
+from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 
 CONFIG = {
     "name": "etgs",
@@ -77,7 +76,7 @@ def test_scores_are_means_of_images(run):
 
 def test_every_number_is_there_or_explained(run):
     content = json.loads((run[1] / "metrics.json").read_text())
-    assert set(TEST) <= set(content["test"]) and set(COST) <= set(content["cost"])
+    assert set(DEFINITIONS) <= set(content["test"]) and set(COSTS) <= set(content["cost"])
     for section in ("test", "cost"):
         for name, value in content[section].items():
             assert (value is None) == (f"{section}.{name}" in content["reasons"]), name
@@ -105,7 +104,7 @@ def test_costs_add_up(run):
 def test_course_over_steps_and_seconds(run):
     module, folder, _ = run
     rows = read_csv(folder / "curve.csv")
-    assert tuple(rows[0]) == CURVE_COLUMNS
+    assert list(rows[0]) == ["step", "train_seconds", "cpu_seconds", "gaussians", "loss", *DEFINITIONS]
     assert [row["step"] for row in rows] == [8, 16, 24]
     seconds = [row["train_seconds"] for row in rows]
     assert 0 < seconds[0] < seconds[1] < seconds[2] <= module.results.cost["train_seconds"]
@@ -186,21 +185,6 @@ def test_a_view_s_companions_come_after_it_and_take_no_other_view_s_place(tmp_pa
     assert pictures_of(tmp_path, frames, 0) == []
 
 
-def test_names_are_shown_as_they_are(tmp_path, capsys):
-    name = "*hall* [new](x) __b__ outdoor_true <b>q<b> &amp; :fire: #"
-    results = RunResults(run={"method": "etgs", "scene": name}, data={"images": {"first": "[z](y)_1"}})
-    (tmp_path / "[old]").mkdir()
-    text = report(results, tmp_path, [], None)
-    shown = html.escape(name)
-    written = page(text, tmp_path)
-    assert f"<title>etgs on {shown}</title>" in written and f"<h1>etgs on {shown}</h1>" in written
-    assert f"<li>scene: {shown}</li>" in written and "<li>images: first [z](y)_1</li>" in written
-    assert "outdoor_true" in text  # no backslash where none is needed
-    show(results, tmp_path / "[old]", tmp_path / "[old]" / "a [b].png")
-    said = " ".join(capsys.readouterr().out.split())
-    assert "[new](x)" in said and ":fire:" in said and "[old]/report.md" in said and "a [b].png" in said
-
-
 def test_curves_at_probes(run):
     module, folder, _ = run
     rows = read_csv(folder / "renders" / "probes.csv")
@@ -211,14 +195,3 @@ def test_curves_at_probes(run):
     model = 10 + 40 * module.value.item() * warmth(torch.from_numpy(times)).numpy()  # probe 1 lies on the warm half
     assert [row["probe 1"] for row in rows] == pytest.approx(model, rel=1e-5)
     assert [row["probe 2"] for row in rows] == pytest.approx([14.0] * 9, rel=1e-5)
-
-
-def test_hyperparameters_are_flat_and_say_what_was_learned():
-    flat = hyperparameters(CONFIG)
-    assert flat == {
-        "name": "etgs",
-        "seed": 3,
-        "thermal": "NewtonHarmonic",
-        "thermal.frequencies": 24,
-        "thermal.grid": "[1, 2]",
-    }

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.io.results import COST, TEST, RunResults
+from heatsplat.io.results import RunResults
+from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 
 
 def filled():
@@ -39,8 +40,8 @@ def test_round_trip(tmp_path):
 
 def test_every_number_is_there_or_explained():
     content = filled().as_json()
-    assert set(TEST) <= set(content["test"])
-    assert set(COST) <= set(content["cost"])
+    assert set(DEFINITIONS) <= set(content["test"])
+    assert set(COSTS) <= set(content["cost"])
     for section in ("test", "cost"):
         for name, value in content[section].items():
             assert (value is None) == (f"{section}.{name}" in content["reasons"]), name

@@ -26,7 +26,7 @@ def stored(folder, config):
 
 
 FOREIGN = {
-    "a study": {"_target_": "heatsplat.studies.child_runs.trained", "command": ["touch", "x"]},
+    "a study": {"_target_": "heatsplat.studies.child_runs.train_or_read", "command": ["touch", "x"]},
     "a reader of pickles": {"_target_": "joblib.load", "filename": "x"},
     "torch": {"_target_": "torch.load", "f": "x", "weights_only": False},
     "eval in disguise": {"_target_": "sympy.sympify", "a": "__import__('os').getcwd()"},

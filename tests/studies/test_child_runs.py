@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.child_runs import OtherSettingsError, all_rows, trained
+from heatsplat.studies.child_runs import OtherSettingsError, all_rows, train_or_read
 
 SCRIPT = """import json, sys
 from pathlib import Path
@@ -39,18 +39,20 @@ def script(tmp_path) -> str:
 def test_a_run_is_trained_once(script, tmp_path, name):
     place = tmp_path / "study" / name
     for curves in ("here", "there"):  # where a file lies says nothing of what it holds
-        assert trained(place, script, ["seed=3", f"budget_curves={curves}"], tmp_path / "study").run["seed"] == "3"
+        assert (
+            train_or_read(place, script, ["seed=3", f"budget_curves={curves}"], tmp_path / "study").run["seed"] == "3"
+        )
     assert (place / "times").read_text() == "once\n"
 
 
 def test_a_folder_with_a_run_of_other_settings_is_refused(script, tmp_path):
     place = tmp_path / "study" / "one"
-    trained(place, script, ["seed=3", "max_steps=5"], tmp_path / "study")
+    train_or_read(place, script, ["seed=3", "max_steps=5"], tmp_path / "study")
     message = r"one was made with other settings \(max_steps=5, max_steps=9\): give the former ones, delete it"
     with pytest.raises(OtherSettingsError, match=message):
-        trained(place, script, ["seed=3", "max_steps=9"], tmp_path / "study")
+        train_or_read(place, script, ["seed=3", "max_steps=9"], tmp_path / "study")
     with pytest.raises(OtherSettingsError, match=r"\(threads=2\)"):  # whose seconds stand in no table beside others
-        trained(place, script, ["seed=3", "max_steps=5", "threads=2"], tmp_path / "study")
+        train_or_read(place, script, ["seed=3", "max_steps=5", "threads=2"], tmp_path / "study")
 
 
 def test_a_report_says_what_all_of_its_runs_have():
@@ -62,6 +64,6 @@ def test_a_report_says_what_all_of_its_runs_have():
 def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):
     place = tmp_path / "study" / "one"
     with pytest.raises(SceneError, match="unlucky") as failure:
-        trained(place, script, ["seed=13"], tmp_path / "study")
+        train_or_read(place, script, ["seed=13"], tmp_path / "study")
     assert f"{place / 'FAILED'} says why" in str(failure.value) and sys.executable in str(failure.value)
     assert f"hydra.run.dir={tmp_path / 'study'} goes on" in str(failure.value)

@@ -42,7 +42,7 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
     assert (
         "Seconds of later runs are multiplied by 0.33 (equal steps)" in text and "| `theirs` | 0.24 | 1 | 99 |" in text
     )
-    pictures = read_page(then / "leaderboard.html", board(root, **asked))["scenes"][0]["pictures"]
+    pictures = read_page(then / "leaderboard.html", board(root, **asked)).pictures.values()
     assert all(set(shown[which]) == {"3dgs", "etgs", "theirs"} for shown in pictures for which in ("renders", "errors"))
 
 

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.published import METRICS, TITLES, figures, source, tables
-from heatsplat.studies.published.figures import doubts
+from heatsplat.studies.published.figures import METRICS, TITLES, doubts, figures, tables
+from heatsplat.studies.published.sources import source
 from heatsplat.thermal.land_cover import TABLE
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.options import counted, filled, listed, named
+from heatsplat.studies.options import listed, non_empty, subset_of, whole_numbers
 
 
 @pytest.mark.parametrize(
@@ -26,16 +26,18 @@ def test_a_word_or_number_is_a_list_of_one(typed, expected):
 @pytest.mark.parametrize("empty", [[], None])
 def test_an_option_without_a_value_is_named(empty):
     with pytest.raises(SceneError, match=r"^study\.seeds=.* has nothing in it: give at least one value$"):
-        filled("study.seeds", empty)
-    assert filled("study.seeds", 0) == [0]
+        non_empty("study.seeds", empty)
+    assert non_empty("study.seeds", 0) == [0]
 
 
 def test_a_name_that_there_is_not_and_a_number_that_counts_nothing_are_told_one_by_one():
-    assert named("study.only", "hot", ["hot", "cold"]) == ["hot"] and counted("study.seeds", 0, least=0) == [0]
+    assert subset_of("study.only", "hot", ["hot", "cold"]) == ["hot"] and whole_numbers("study.seeds", 0, least=0) == [
+        0
+    ]
     with pytest.raises(SceneError, match="each of study.only must be one of hot, cold, got 'warm'"):
-        named("study.only", ["hot", "warm"], ["hot", "cold"])
+        subset_of("study.only", ["hot", "warm"], ["hot", "cold"])
     with pytest.raises(SceneError, match="study.steps must be a whole number, 1 or more, got long"):
-        counted("study.steps", [5, "long"])
-    for check in (counted, lambda key, value: named(key, value, ["hot"])):
+        whole_numbers("study.steps", [5, "long"])
+    for check in (whole_numbers, lambda key, value: subset_of(key, value, ["hot"])):
         with pytest.raises(SceneError, match="study.only=.* has nothing in it"):
             check("study.only", [])

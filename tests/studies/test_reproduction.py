@@ -19,8 +19,8 @@ from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
 from heatsplat.studies.finished import Runs
-from heatsplat.studies.published import Reproduction, Run, reproduction_of
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
+from heatsplat.studies.published.reproduction import Reproduction, Run, reproduction_of
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENTS = sorted((ROOT / "conf" / "experiment").glob("table_*.yaml"))

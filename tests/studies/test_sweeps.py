@@ -8,22 +8,18 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import succeeds
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
-from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, row_names, settings_of
-from heatsplat.studies.published import figures, quoted
+from heatsplat.studies.published.figures import quoted
 from heatsplat.studies.sweeps import collect, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = str(ROOT / "src" / "train.py")
-ABLATIONS = sorted((ROOT / "conf" / "ablation").glob("*.yaml"))
 
 
 def job(folder: Path, number: int, overrides: list[str], psnr: float | None, **costs: float) -> Path:
@@ -274,77 +270,6 @@ def test_no_job_starts_before_those_that_come_first_have_ended(size, expected):
     starts = [0, *itertools.accumulate(len(jobs) for _, jobs in launcher.batches)]
     assert [start for start, _ in launcher.batches] == starts[:-1]
     assert [job.overrides for job in returned] == [["seed=0"], ["a"], ["b"], ["c"], ["d"]]
-
-
-@pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
-def test_rows_of_an_ablation_are_different_recipes_that_compose(path):
-    rows = yaml.safe_load(path.read_text())["hydra"]["sweeper"]["rows"]
-    method, recipes = path.stem.partition("_")[0], []
-    for name, row in rows.items():
-        config = compose_run(f"method={method}", *row.get("set", []), f"row='{name}'")
-        recipes.append({key: value for key, value in config.items() if key != "row"})
-    texts = [str(recipe) for recipe in recipes]
-    assert len(set(texts)) == len(rows) > 1
-
-
-@pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
-def test_rows_stand_beside_what_the_paper_prints_for_them(path):
-    """Every setting of the paper's table is printed for one row; of ETGS's terms no figure can be read.
-
-    An ablation of ours stands beside no paper.
-    """
-    sweeper = yaml.safe_load(path.read_text())["hydra"]["sweeper"]
-    printed = [row["printed"] for row in sweeper["rows"].values() if "printed" in row]
-    if "paper" not in sweeper:
-        assert not printed
-        return
-    of, table, scenes = (sweeper["paper"][key] for key in ("of", "table", "scenes"))
-    assert sorted(printed) == sorted({figure.setting for figure in figures(of, table)})
-    texts = [quoted(of, table, setting, scenes) for setting in printed]
-    assert [len(text) > 1 for text in texts] == [path.stem != "etgs_terms"] * len(printed)
-
-
-def test_what_is_quoted_of_several_scenes_stands_side_by_side():
-    found = quoted("ti3dgs", "IV", "no_tif", ["ti_nsd_indoor", "ti_nsd_outdoor"])
-    assert found == {"psnr": "32.12 / 28.09", "ssim": "0.951 / 0.897"}
-    assert quoted("ti3dgs", "IV", "no_tif", ["ti_nsd_indoor", "nowhere"]) == {}
-
-
-def test_an_ablation_refuses_another_method_before_any_job(tmp_path):
-    """Rows such as thermal=static compose with it, and are not what they are called."""
-    short = ("data.size=tiny", "debug=fast", "seed=0")
-    command = [TRAIN, "ablation=ti3dgs_medium", "method=3dgs", *short, f"hydra.sweep.dir={tmp_path}/sweep"]
-    told = succeeds(command, code=1)
-    assert "parts of method=ti3dgs, not of method=3dgs: leave method out" in told and "Traceback" not in told
-    assert not (tmp_path / "sweep").exists()
-
-
-@pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)
-def test_an_ablation_brings_the_method_that_it_is_of(path):
-    own = compose_run(f"ablation={path.stem}").name
-    of = HydraConfig.get().sweeper.of
-    assert own == path.stem.partition("_")[0] == (of if isinstance(of, str) else of[0])
-    from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
-
-    def jobs(*arguments: str) -> list[list[str]]:
-        sweeper = RowSweeper(rows={"a": {"set": ["max_steps=5"]}}, of=of)
-        sweeper.config = OmegaConf.create({"hydra": {"runtime": {"choices": {"method": own}}}})
-        (found,) = sweeper.split_arguments(OverridesParser.create().parse_overrides(list(arguments)), None)
-        return found
-
-    assert jobs("seed=0") == [["seed=0", "max_steps=5", "row='a'"]] and jobs(f"method={own}")
-    for others in ("method=3dgs", f"method={own},3dgs"):
-        with pytest.raises(ValueError, match=rf"parts of method={own}.*, not of method=3dgs"):
-            jobs(others)
-
-
-def test_an_ablation_may_be_of_several_methods():
-    """The authors' code of ETGS has numbers of frequencies too."""
-    compose_run("ablation=etgs_frequencies", "method=etgs_released")
-    sweeper = HydraConfig.get().sweeper
-    assert "etgs_released" in sweeper.of
-    for row in sweeper.rows.values():
-        assert compose_run("method=etgs_released", *row.set).name == "etgs_released"
 
 
 def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(tmp_path):

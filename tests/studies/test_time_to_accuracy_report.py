@@ -3,7 +3,7 @@
 import pytest
 from test_time_to_accuracy_runs import a_panel, outcome
 
-from heatsplat.studies.time_to_accuracy_report import ends, markdown, named, picture, records, times
+from heatsplat.studies.time_to_accuracy.report import ends, markdown, named, picture, records, times
 
 
 def test_the_standard_schedule_stands_below_each_recipe_that_lies_between_its_runs():

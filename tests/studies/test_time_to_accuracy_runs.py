@@ -2,7 +2,7 @@
 
 import pytest
 
-from heatsplat.studies.time_to_accuracy_runs import Outcome, Panel, without_length
+from heatsplat.studies.time_to_accuracy.runs import Outcome, Panel, without_length
 
 MARGINS = {"psnr": 0.2, "mae_c": 0.02}
 

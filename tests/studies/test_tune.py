@@ -55,7 +55,7 @@ def world(monkeypatch):
         results.write(place / METRICS_FILE)
         return results
 
-    monkeypatch.setattr(tune, "trained", trained)
+    monkeypatch.setattr(tune, "train_or_read", trained)
     return started
 
 
@@ -88,21 +88,21 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(world, tmp_path):
 
 
 def test_trials_of_other_settings_are_refused_and_not_taken_for_failed_ones(world, tmp_path, monkeypatch):
-    train = tune.trained
+    train = tune.train_or_read
 
     def refusing(place, *more):
         if "trial1" in place.name:
             raise OtherSettingsError("of other settings")
         return train(place, *more)
 
-    monkeypatch.setattr(tune, "trained", refusing)
+    monkeypatch.setattr(tune, "train_or_read", refusing)
     with pytest.raises(OtherSettingsError, match="of other settings"):
         tune.run(tmp_path, CASES, trials=3)
 
 
 @pytest.mark.parametrize("which", ["default", "trial"])
 def test_a_run_without_the_score_gives_no_verdict(world, tmp_path, monkeypatch, which):
-    train = tune.trained
+    train = tune.train_or_read
 
     def blind(place, *more):
         results = train(place, *more)
@@ -110,7 +110,7 @@ def test_a_run_without_the_score_gives_no_verdict(world, tmp_path, monkeypatch, 
             results.put("test", "psnr", None, "infinite")
         return results
 
-    monkeypatch.setattr(tune, "trained", blind)
+    monkeypatch.setattr(tune, "train_or_read", blind)
     (check,) = tune.run(tmp_path, CASES, trials=8)
     assert check.gains == [] and check.verdict == "failed: a run has no psnr"
     assert "| failed: a run has no psnr |" in (tmp_path / "tune.md").read_text()

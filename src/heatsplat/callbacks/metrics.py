@@ -21,7 +21,6 @@ from heatsplat.metrics.scores import Scorer, mean_of_images
 log = logging.getLogger("heatsplat")
 
 TEST_FILE = "test_per_image.csv"
-CURVE_COLUMNS = ("step", "train_seconds", "cpu_seconds", "gaussians", "loss", *DEFINITIONS)
 
 
 class QualityMetrics(pl.Callback):

@@ -16,6 +16,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, time_unit, write_png
 from heatsplat.io.tables import write_csv
 
+PROBES_PICTURE = "renders/probes.png"
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
 OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
 NEAR_PIXELS = 0.02  # "close": of the image's width
@@ -86,7 +87,7 @@ class TemperatureCurves(pl.Callback):
         title = f"{scene.name}, step {step}"
         record = min(scene.train.times_s), max(scene.train.times_s)
         picture = figure_picture(_figure(times.numpy(), record, names, model, truth, dots, unit, title))
-        png = write_png(module.output_dir / "renders" / "probes.png", picture)
+        png = write_png(module.output_dir / PROBES_PICTURE, picture)
         self._write(module, times.tolist(), model, truth)
         add_picture(module, tag, picture, png, step)
 

@@ -38,6 +38,7 @@ FONT = 13
 GAP = 14
 BAR = 14
 PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
+MARKS = "os^Dv<>P"
 FIGURE_PANEL = 1.8  # inches of height of an image in print
 
 
@@ -270,6 +271,11 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
                 figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit)
         date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
         figure.savefig(path, metadata={date: None})
+
+
+def series_look(i: int) -> tuple[str, str]:
+    """Colour and mark of the i-th of many series in a figure of matplotlib: ten colours, then the same with another mark."""
+    return f"C{i % 10}", MARKS[i // 10 % len(MARKS)]
 
 
 def literal(text: str) -> str:

@@ -11,27 +11,13 @@ from typing import Any
 
 from heatsplat.errors import is_number
 from heatsplat.io.files import write_atomically
-from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 
 # What a run leaves in its folder, beside checkpoints and pictures.
 METRICS_FILE = "metrics.json"
 CURVE_FILE = "curve.csv"  # its validations
 FAILED = "FAILED"  # why it has no results
 
-# Keys that every metrics.json has, null with a reason where a run could not measure them.
-TEST = tuple(DEFINITIONS)
-COST = (
-    "choosing_seconds",
-    "train_seconds",
-    "cpu_seconds",
-    "steps_per_second",
-    "render_fps",
-    "peak_memory_mb",
-    "gaussians",
-    "warmup_seconds",
-    "evaluation_seconds",
-    "wall_seconds",
-)
 SECTIONS = ("run", "test", "cost", "effects", "data", "versions", "definitions")
 
 
@@ -82,7 +68,7 @@ class RunResults:
         """All sections as plain JSON values; missing and infinite numbers are null and listed in ``reasons``."""
         reasons = dict(self.reasons)
         plain = {section: _plain(getattr(self, section), section, reasons) for section in SECTIONS}
-        for section, names in (("test", TEST), ("cost", COST)):
+        for section, names in (("test", DEFINITIONS), ("cost", COSTS)):
             found = plain[section]
             plain[section] = {name: found.pop(name, None) for name in names} | found  # always in one order
             for name, value in plain[section].items():

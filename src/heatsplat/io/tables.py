@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import re
+import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,13 @@ def number(value: float | None, digits: int, spread: float | None = None) -> str
         return NONE
     text = f"{value:,.{digits}f}"
     return text if spread is None or math.isnan(spread) else f"{text} ± {spread:,.{digits}f}"
+
+
+def over_seeds(values: Sequence[float], digits: int) -> str:
+    """The mean of values and, of several, their standard deviation (n - 1); a dash for none."""
+    if not values:
+        return NONE
+    return number(statistics.fmean(values), digits, statistics.stdev(values) if len(values) > 1 else None)
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: str = "") -> list[str]:

@@ -25,7 +25,7 @@ class OtherSettingsError(SceneError):
     """A folder of the study holds what was made with other settings than are asked for."""
 
 
-def trained(place: Path, train: str | None, overrides: Sequence[str], study: Path) -> RunResults:
+def train_or_read(place: Path, train: str | None, overrides: Sequence[str], study: Path) -> RunResults:
     """The results of the run in ``place``, which is trained unless it has some.
 
     Args:

@@ -15,7 +15,7 @@ def listed(value: Any) -> list[Any]:
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
 
 
-def filled(key: str, value: Any) -> list[Any]:
+def non_empty(key: str, value: Any) -> list[Any]:
     """``listed``, where nothing can be done without a value.
 
     Args:
@@ -30,17 +30,17 @@ def filled(key: str, value: Any) -> list[Any]:
     return found
 
 
-def named(key: str, value: Any, known: Iterable[Any]) -> list[Any]:
-    """``filled``, where every value is one of those that are known. Raises SceneError where one is not."""
-    found, known = filled(key, value), list(known)
+def subset_of(key: str, value: Any, known: Iterable[Any]) -> list[Any]:
+    """``non_empty``, where every value is one of those that are known. Raises SceneError where one is not."""
+    found, known = non_empty(key, value), list(known)
     for one in found:
         check_option(f"each of {key}", one, known, SceneError)
     return found
 
 
-def counted(key: str, value: Any, least: int = 1) -> list[int]:
-    """``filled``, where every value is a whole number, ``least`` or more. Raises SceneError where one is not."""
-    found = filled(key, value)
+def whole_numbers(key: str, value: Any, least: int = 1) -> list[int]:
+    """``non_empty``, where every value is a whole number, ``least`` or more. Raises SceneError where one is not."""
+    found = non_empty(key, value)
     for one in found:
         check_count(key, one, least)
     return found

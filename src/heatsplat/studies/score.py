@@ -26,7 +26,6 @@ log = logging.getLogger("heatsplat")
 META, SCENES, TRUTH = "meta.json", "scenes", "truth"
 ENDINGS = (".tiff", ".tif", ".npy")
 COSTS = ("seconds", "memory_mb", "gaussians")  # of a scene, in a submission's metrics.json
-DIGITS = {"psnr": 2, "ssim": 4, "mae_c": 3}
 ABSOLUTE_ZERO_C = -273.15
 
 
@@ -214,7 +213,7 @@ def run(
     for scene, score in found.items():
         for part in (None, *score.parts):
             count = sum(part in (None, row["part"]) for row in score.views)
-            cells = [number(score.mean(name, part), DIGITS.get(name, 3)) for name in scores]
+            cells = [number(score.mean(name, part), DEFINITIONS[name].digits) for name in scores]
             costs = [number(score.cost.get(key), 0) if part is None else "" for key in COSTS]
             rows.append([scene, part or "all", count, *cells, *costs])
     lines = [f"# {told['method']}", "", *markdown_table(head, rows, "ll" + "r" * (len(head) - 2)), ""]

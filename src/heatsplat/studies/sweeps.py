@@ -10,8 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from heatsplat.io.files import write_atomically
-from heatsplat.io.pictures import figure_picture, literal, write_png
-from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.io.pictures import figure_picture, literal, series_look, write_png
+from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
+from heatsplat.metrics.definitions import described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
 from heatsplat.studies.recorded import OVERRIDES
@@ -19,22 +20,11 @@ from heatsplat.studies.recorded import OVERRIDES
 log = logging.getLogger(__name__)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
-# Scores and costs in the table, where any job has them, with heading and digits.
-SCORES = {
-    "psnr": ("PSNR (dB)", 2),
-    "ssim": ("SSIM", 4),
-    "lpips": ("LPIPS", 4),
-    "mae_c": ("MAE (°C)", 3),
-    "clean_psnr": ("clean PSNR (dB)", 2),
-    "clean_mae_c": ("clean MAE (°C)", 3),
-    "rgb_psnr": ("RGB PSNR (dB)", 2),
-}
-COSTS = {
-    "train_seconds": ("train (s)", 1),
-    "peak_memory_mb": ("memory (MB)", 0),
-    "gaussians": ("Gaussians", 0),
-    "render_fps": ("frames/s", 0),
-}
+# Scores and costs in the table, where any job has them.
+COLUMNS = (
+    "psnr", "ssim", "lpips", "mae_c", "clean_psnr", "clean_mae_c", "rgb_psnr",
+    "train_seconds", "peak_memory_mb", "gaussians", "render_fps",
+)  # fmt: skip
 
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
 
@@ -85,12 +75,12 @@ def _number(job: Path) -> tuple[int, str]:
     return (numbers[-1] if numbers else 0, job.name)
 
 
-def _columns(rows: Iterable[Runs]) -> dict[str, tuple[str, int]]:
-    return {name: shown for name, shown in (SCORES | COSTS).items() if any(row.values(name) for row in rows)}
+def _columns(rows: Iterable[Runs]) -> list[str]:
+    return [name for name in COLUMNS if any(row.values(name) for row in rows)]
 
 
-def _printed(paper: Printed) -> dict[str, tuple[str, int]]:
-    return {name: shown for name, shown in (SCORES | COSTS).items() if any(name in texts for texts in paper.values())}
+def _printed(paper: Printed) -> list[str]:
+    return [name for name in COLUMNS if any(name in texts for texts in paper.values())]
 
 
 def markdown(rows: Sequence[Runs], paper: Printed) -> str:
@@ -98,14 +88,14 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     columns = _columns(rows)
     printed = _printed(paper)
     several = len({row.scene for row in rows}) > 1
-    head = [*(["scene"] if several else []), "row", "runs", *(title for title, _ in columns.values())]
-    head += [f"paper: {title}" for title, _ in printed.values()]
+    head = [*(["scene"] if several else []), "row", "runs", *(described(name).heading for name in columns)]
+    head += [f"paper: {described(name).heading}" for name in printed]
     cells = [
         [
             *([row.scene] if several else []),
             row.label,
             row.count,
-            *(number(row.mean(name), digits, row.spread(name)) for name, (_, digits) in columns.items()),
+            *(over_seeds(row.values(name), described(name).digits) for name in columns),
             *(paper.get(row.name, {}).get(name, NONE) for name in printed),
         ]
         for row in rows
@@ -146,11 +136,12 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
             x, y = row.mean("train_seconds"), row.mean(name)
             if x is not None and y is not None:
                 label = literal(f"{row.label}, {row.scene}" if several else row.label)
+                color, mark = series_look(j)
                 axes.errorbar(
-                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, "os^Dv"[j // 10 % 5], color=f"C{j % 10}",
-                    capsize=2, markersize=6, label=label,
+                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, mark, color=color, capsize=2, markersize=6,
+                    label=label,
                 )  # fmt: skip
-        axes.set(xlabel="seconds of training", ylabel=f"{SCORES[name][0]}, test")
+        axes.set(xlabel="seconds of training", ylabel=f"{described(name).heading}, test")
         axes.grid(alpha=0.25)
         if i == 0:
             axes.legend(fontsize=7)

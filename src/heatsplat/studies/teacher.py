@@ -21,7 +21,7 @@ from heatsplat.io.pictures import Panel, colorize, compose, write_png
 from heatsplat.io.tables import markdown_table
 from heatsplat.losses.swinir import SwinIR
 from heatsplat.metrics.psnr import psnr
-from heatsplat.studies.options import check_count, filled
+from heatsplat.studies.options import check_count, non_empty
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")
@@ -63,7 +63,7 @@ def run(
             the network cannot be.
     """
     output_dir = Path(output_dir)
-    scenes, held_out = filled("study.scenes", scenes), filled("study.held_out", held_out)
+    scenes, held_out = non_empty("study.scenes", scenes), non_empty("study.held_out", held_out)
     for key, value in {"factor": factor, "steps": steps, "batch": batch, "patch": patch}.items():
         check_count(f"study.{key}", value)
     check_numbers("study.rate", rate, error=SceneError, above=0)
@@ -120,7 +120,7 @@ def check_network(network: dict[str, Any]) -> None:
     sizes = {key: network[key] for key in ("dim", "heads", "window") if key in network}
     for key, value in sizes.items():
         check_count(f"study.network.{key}", value)
-    for depth in filled("study.network.depths", network["depths"]) if "depths" in network else ():
+    for depth in non_empty("study.network.depths", network["depths"]) if "depths" in network else ():
         check_count("study.network.depths", depth)
     dim, heads = sizes.get("dim"), sizes.get("heads")
     if None not in (dim, heads) and dim % heads:

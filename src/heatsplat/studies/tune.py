@@ -17,14 +17,16 @@ from typing import Any
 from heatsplat.contracts import SceneError, check_numbers, check_option, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
-from heatsplat.io.tables import markdown_table, number, write_csv
-from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, trained
+from heatsplat.io.tables import markdown_table, number, over_seeds, write_csv
+from heatsplat.metrics.definitions import DEFINITIONS, described
+from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, train_or_read
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.options import check_count, counted, listed
+from heatsplat.studies.options import check_count, listed, whole_numbers
 
 log = logging.getLogger("heatsplat")
 
-SCORES = {"psnr": "maximize", "mae_c": "minimize"}
+SCORES = ("psnr", "mae_c")  # by which settings may be compared
+COLUMNS = ("psnr", "mae_c", "gaussians", "cpu_seconds")
 DIGITS = 3  # to which values of a range are rounded, so that they can be read and typed
 CASE = {"scene", "knobs"}
 SEARCH_SEED = 0
@@ -68,7 +70,7 @@ class MethodRuns:
     def result(self, name: str, settings: Mapping[str, Any], steps: int, seed: int) -> RunResults:
         """Of a run, which is trained unless it is there. Raises SceneError where it fails."""
         wanted = [*self.common, f"max_steps={steps}", f"seed={seed}", *_words(settings)]
-        return trained(self._place(name, steps, seed), self.train, wanted, self.folder)
+        return train_or_read(self._place(name, steps, seed), self.train, wanted, self.folder)
 
     def attempt(self, name: str, settings: Mapping[str, Any], steps: int, seed: int = SEARCH_SEED) -> Trial:
         """A run that may fail: a rate may be too high to train with. Raises OtherSettingsError as ``result`` does."""
@@ -108,7 +110,7 @@ class Check:
         """How much better the best is than the default with each seed; negative where it is worse, none where it failed."""
         if self.failed:
             return []
-        sign = 1.0 if SCORES[self.score] == "maximize" else -1.0
+        sign = DEFINITIONS[self.score].sign
         return [
             sign * (now.test[self.score] - before.test[self.score])
             for before, now in zip(self.default, self.best, strict=True)
@@ -123,7 +125,8 @@ class Check:
         if self.failed:
             return f"failed: {self.failed}"
         gains, mean = self.gains, statistics.fmean(self.gains)
-        spread = _spread([one.test[self.score] for one in self.default]) or 0.0
+        scores = [results.test[self.score] for results in self.default]
+        spread = statistics.stdev(scores) if len(scores) > 1 else 0.0
         if len(gains) < 2 or abs(mean) <= spread or min(gains) <= 0 <= max(gains):
             return "within the spread"
         return "better" if mean > 0 else "worse"
@@ -209,7 +212,7 @@ def _checked(
     """The cases asked for."""
     check_option("study.score", score, SCORES, SceneError)
     check_count("study.trials", trials)
-    counted("study.seeds", seeds, least=0)
+    whole_numbers("study.seeds", seeds, least=0)
     if SEARCH_SEED in seeds or len({*seeds}) < len(seeds):
         raise SceneError(
             f"study.seeds={seeds}: give every seed once, and not {SEARCH_SEED}, with which the settings were found"
@@ -260,7 +263,8 @@ def _search(
     """The trials of a method, each as soon as it has ended."""
     optuna = _optuna()
     space = {key: _distribution(runs.method, key, values) for key, values in knobs.items()}
-    study = optuna.create_study(direction=SCORES[score], sampler=optuna.samplers.TPESampler(seed=0))
+    direction = "maximize" if DEFINITIONS[score].higher else "minimize"
+    study = optuna.create_study(direction=direction, sampler=optuna.samplers.TPESampler(seed=0))
     spent = 0.0
     for count in range(trials):
         if seconds is not None and spent >= seconds:
@@ -288,7 +292,7 @@ def _words(settings: Mapping[str, Any]) -> list[str]:
 
 def _best(tried: Sequence[Trial], score: str) -> Trial:
     """The trial with the best score, the default where none is better."""
-    sign = 1.0 if SCORES[score] == "maximize" else -1.0
+    sign = DEFINITIONS[score].sign
     measured = [trial for trial in tried if trial.results is not None and trial.results.test[score] is not None]
     if not measured:
         raise SceneError(f"no run of method={tried[0].method} has the score {score}: choose another with study.score")
@@ -335,22 +339,12 @@ def markdown(
     about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
     which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
     lines = ["# Tuning", "", about, "", f"## The best settings of each search beside the default, {which}", ""]
-    head = [
-        "method",
-        "steps",
-        "settings",
-        "seeds",
-        "PSNR (dB)",
-        "MAE (°C)",
-        "Gaussians",
-        "cpu s",
-        f"gain ({score})",
-        "verdict",
-    ]
+    columns = [described(name).heading for name in COLUMNS]
+    head = ["method", "steps", "settings", "seeds", *columns, f"gain ({score})", "verdict"]
     rows = []
     for check in checks:
         best = _best([trial for trial in tried if trial.method == check.method], score)
-        gain = number(statistics.fmean(check.gains), 3, _spread(check.gains)) if check.gains else ""
+        gain = over_seeds(check.gains, 3) if check.gains else ""
         rows.append([check.method, check.steps, "default", *_cells(check.default), "", ""])
         rows.append(["", "", ", ".join(_words(best.settings)), *_cells(check.best), gain, check.verdict])
     lines += markdown_table(head, rows, "lrlrrrrrrl")
@@ -362,9 +356,9 @@ def markdown(
         own, knobs = [trial for trial in tried if trial.method == method], list(cases[method]["knobs"])
         lines += ["", f"## {method}: {' '.join(cases[method]['scene'])}, {steps} steps, seed 0", ""]
         lines += markdown_table(
-            [*knobs, "PSNR (dB)", "MAE (°C)", "Gaussians", "cpu s"],
+            [*knobs, *columns],
             [[*(spelled(trial.settings.get(key, "default")) for key in knobs), *_scores(trial)] for trial in own],
-            "r" * (len(knobs) + 4),
+            "r" * (len(knobs) + len(columns)),
         )
     return "\n".join(lines) + "\n"
 
@@ -378,14 +372,9 @@ def _scores(trial: Trial) -> list[str]:
 def _cells(several: Sequence[RunResults]) -> list[str]:
     """Number of runs, then means and spreads of their scores and costs."""
 
-    def cell(section: str, name: str, digits: int) -> str:
-        values = [getattr(one, section)[name] for one in several]
+    def cell(name: str) -> str:
+        values = [(results.test | results.cost)[name] for results in several]
         known = [value for value in values if value is not None]
-        return number(statistics.fmean(known) if known else None, digits, _spread(known))
+        return over_seeds(known, described(name).digits)
 
-    kinds = (("test", "psnr", 2), ("test", "mae_c", 3), ("cost", "gaussians", 0), ("cost", "cpu_seconds", 1))
-    return [str(len(several)), *(cell(*kind) for kind in kinds)]
-
-
-def _spread(values: Sequence[float]) -> float | None:
-    return statistics.stdev(values) if len(values) > 1 else None
+    return [str(len(several)), *(cell(name) for name in COLUMNS)]

@@ -19,12 +19,11 @@ from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.errors import SceneError
-from heatsplat.io.command_lines import as_dict, keys_of
+from heatsplat.io.command_lines import keys_of
 from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
 
 if TYPE_CHECKING:
-    from heatsplat.studies.leaderboard.plan import Board
-    from heatsplat.studies.published import Reproduction
+    from heatsplat.studies.sweep_plan import SweepPlan
 
 log = logging.getLogger("heatsplat")
 
@@ -74,7 +73,10 @@ class Batches:
 
 
 class RowSweeper(BasicSweeper):
-    """Runs every row with every combination of the grid; when the last job has ended it writes the table of results.
+    """Runs what a plan says (``studies.sweep_plan``); when the last job has ended, the plan writes the table of results.
+
+    The configuration chooses the plan: a published table (``table``), the leaderboard (``leaderboard``), or the rows and the grid
+    that are given here.
 
     A job that fails leaves FAILED in its folder, the others go on, and the table names it. A sweep that is started again
     in the same folder (``hydra.sweep.dir=...``) skips the jobs that have results; the others go on from their checkpoints.
@@ -103,8 +105,7 @@ class RowSweeper(BasicSweeper):
         self.paper = paper
         self.rows = rows
         self.of = of
-        self.reproduction: Reproduction | None = None
-        self.board: Board | None = None
+        self.plan: SweepPlan | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         super().setup(hydra_context=hydra_context, task_function=task_function, config=config)
@@ -112,63 +113,29 @@ class RowSweeper(BasicSweeper):
             self.launcher = Batches(self.launcher, self.batch)
 
     def split_arguments(self, overrides: list[Override], max_batch_size: int | None) -> list[list[list[str]]]:
-        """All jobs as one batch, each the list of its overrides; all rows come with one seed before the next seed begins.
+        """All jobs of the plan as one batch, each the list of its overrides. Raises SceneError as the plan does."""
 
-        Raises:
-            SceneError: rows are parts of another method than a job's.
-        """
-        (jobs,) = BasicSweeper.split_arguments(overrides, None)
-        if self.reproduction is not None:
-            jobs = self._of_table(self.reproduction, jobs)
-        elif self.board is not None:
-            jobs = [run for given in jobs for run in self.board.jobs(given)]
-        elif self.rows:
-            self._check_methods(jobs)
-            jobs = [[*job, *row.get("set", ()), f"row='{name}'"] for job in jobs for name, row in self.rows.items()]
+        def folder_of(number: int, job: Sequence[str]) -> Path:
+            return planned(self.hydra_context, self.config, number, job).folder.absolute()
+
+        (grid,) = BasicSweeper.split_arguments(overrides, None)
+        jobs, first = self.plan.jobs(grid, folder_of)
+        if first:
+            self.launcher = Batches(self.launcher, self.batch, first)
         return [jobs]
 
-    def _check_methods(self, jobs: Sequence[Sequence[str]]) -> None:
-        """Raises SceneError where the rows would not be what they are called, for they are parts of another method."""
-        from heatsplat.studies.options import listed
-
-        if not (own := listed(self.of)):
-            return
-        chosen = self.config.hydra.runtime.choices.method
-        asked = {as_dict(job).get("method", chosen).strip("'\"") for job in jobs}
-        if others := sorted(asked - {*own}):
-            raise SceneError(
-                f"the rows of this ablation are parts of method={' or '.join(own)}, not of method={', '.join(others)}: leave "
-                "method out, or choose an ablation of that method"
-            )
-
-    def _of_table(self, reproduction: Reproduction, grid: Sequence[Sequence[str]]) -> list[list[str]]:
-        """The jobs of a table: those that others come after stand at the beginning, once each, and end before these start."""
-        first: dict[tuple[str, ...], Path] = {}
-        jobs = []
-        for given in grid:
-            for run in reproduction.runs:
-                after = []
-                if run.after is not None:
-                    before = tuple(run.after.job(given))
-                    if before not in first:
-                        first[before] = planned(self.hydra_context, self.config, len(first), before).folder.absolute()
-                    after = [f"table.after='{first[before]}/checkpoints/last.ckpt'"]
-                jobs.append([*run.job(given), *after])
-        if first:
-            self.launcher = Batches(self.launcher, self.batch, len(first))
-        return [*map(list, first), *jobs]
-
     def sweep(self, arguments: Sequence[str]) -> Any:
-        from heatsplat.studies.sweeps import write_sweep
-
+        """Exit code 1 where the command asks for what there is not."""
         folder = Path(self.config.hydra.sweep.dir)
-        if self.config.get("table") is not None and not self._plan(list(arguments)):
-            return None
-        if self.config.get("leaderboard") is not None:
-            self._plan_board(list(arguments))
-        idle = (self.reproduction is not None and not self.reproduction.runs) or (self.board and not self.board.jobs())
         try:
-            return None if idle else super().sweep(list(arguments))
+            self.plan = self._plan_of(arguments)
+        except SceneError as error:
+            log.error("%s", error)
+            sys.exit(1)
+        if summary := self.plan.summary():
+            log.info("%s", summary)
+        try:
+            return None if self.plan.idle else super().sweep(list(arguments))
         except BaseException:
             if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
                 log.warning(
@@ -176,76 +143,43 @@ class RowSweeper(BasicSweeper):
                 )
             raise
         finally:
-            written = [] if self.board else write_sweep(folder, list(self.rows or ()), self._printed())
-            if self.board is not None:
-                from heatsplat.studies.leaderboard.report import write_leaderboard
-
-                written += write_leaderboard(folder, self.board)
-            if self.reproduction is not None:
-                from heatsplat.studies.published import write_comparison
-
-                written += write_comparison(folder, self.reproduction)
-                log.info("%s", written[-2].read_text(encoding="utf-8"))
-            for path in written:
+            for path in self.plan.write(folder):
                 log.info("%s", path)
-
-    def _printed(self) -> dict[str, dict[str, str]]:
-        """What the paper prints for the rows: name of row -> score or cost -> text."""
-        from heatsplat.studies.published import quoted
-
-        if self.paper is None:
-            return {}
-        of, table, scenes = (self.paper[key] for key in ("of", "table", "scenes"))
-        settings = {name: row["printed"] for name, row in (self.rows or {}).items() if "printed" in row}
-        return {name: quoted(of, table, setting, scenes) for name, setting in settings.items()}
 
     def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
         """Composes every job before any starts, unless the launcher does so by itself: a hundred take a minute."""
         if not isinstance(self.launcher, JobLauncher):
-            # Of a leaderboard one job per method and track: scenes and seeds make no other configuration.
-            alike = ("data.scene=", "seed=", "callbacks.temperatures.image=")
-            told = {tuple(text for text in job if not text.startswith(alike)): job for job in batch}
-            super().validate_batch_is_legal(list(told.values()) if self.board else batch)
+            super().validate_batch_is_legal(self.plan.to_compose(batch))
 
-    def _plan(self, arguments: list[str]) -> bool:
-        """Plans the runs of a published table and tells them, with what is missing; False where nothing is to be done.
+    def _plan_of(self, arguments: Sequence[str]) -> SweepPlan:
+        """What the configuration asks for. Raises SceneError where there is no such thing, or nothing of it is on disk."""
+        if self.config.get("table") is not None:
+            return self._table(keys_of(arguments))
+        if self.config.get("leaderboard") is not None:
+            from heatsplat.studies.leaderboard.plan import board_of
+            from heatsplat.studies.leaderboard.sweep import Leaderboard
 
-        Exit code 1 where the table asks for what there is not, or none of its scenes is on disk.
-        """
-        from heatsplat.studies.published import reproduction_of
+            asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
+            return Leaderboard(board_of(asked, self._methods(), keys_of(arguments)))
+        from heatsplat.studies.rows import Rows
 
-        table = OmegaConf.to_container(self.config.table)
+        chosen = OmegaConf.select(self.config, "hydra.runtime.choices.method")
+        return Rows(self.rows or {}, self.paper, self.of, chosen)
+
+    def _table(self, given: set[str]) -> SweepPlan:
+        """The plan of a published table."""
+        from heatsplat.studies.published.reproduction import reproduction_of
+        from heatsplat.studies.published.table import Table
+
+        asked = OmegaConf.to_container(self.config.table)
         metrics = self.config.callbacks.get("metrics") or {}
-        try:
-            self.reproduction = reproduction_of(
-                table,
-                self.config.data.root,
-                self.hydra_context.config_loader.get_group_options("method"),
-                self._ablation(table["ablation"]),
-                keys_of(arguments),
-            )
-        except SceneError as error:
-            log.error("%s", error)
-            sys.exit(1)
-        nothing = bool(self.reproduction.missing) and not self.reproduction.runs
-        told = self.reproduction.summary(metrics.get("lpips_net"), metrics.get("lpips_weights"))
-        log.log(logging.ERROR if nothing else logging.INFO, "%s", told)
-        if nothing:
-            sys.exit(1)
-        return not table["dry"]
+        rows = self._ablation(asked["ablation"])
+        reproduction = reproduction_of(asked, self.config.data.root, self._methods(), rows, given)
+        return Table(reproduction, asked["dry"], metrics.get("lpips_net"), metrics.get("lpips_weights"))
 
-    def _plan_board(self, arguments: list[str]) -> None:
-        """Plans the runs of the leaderboard and tells how many; exit code 1 where it asks for what there is not."""
-        from heatsplat.studies.leaderboard.plan import board_of
-
-        asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
-        try:
-            methods = self.hydra_context.config_loader.get_group_options("method")
-            self.board = board_of(asked, methods, keys_of(arguments))
-        except SceneError as error:
-            log.error("%s", error)
-            sys.exit(1)
-        log.info("%s", self.board.summary())
+    def _methods(self) -> list[str]:
+        """Options of conf/method."""
+        return self.hydra_context.config_loader.get_group_options("method")
 
     def _ablation(self, name: str | None) -> Mapping[str, Mapping[str, Any]]:
         """Rows of a ready-made ablation (conf/ablation); none without a name."""

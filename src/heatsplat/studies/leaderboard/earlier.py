@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +18,58 @@ if TYPE_CHECKING:
 
 MARK = "const board = "  # before the JSON of a page
 
+Place = tuple[str, str, str]  # method, scene and track
 
-def read_page(path: Path, board: Board) -> dict[str, Any]:
-    """The contents of a page that a leaderboard wrote.
+
+@dataclass(frozen=True)
+class EarlierSeeds:
+    """What a page says of the seeds of a method on a scene in a track; nothing without arguments.
+
+    Args:
+        numbers: the seeds.
+        scores, cost: name -> mean over them.
+        parts: what views are held out by -> mean of the score that ranks.
+        spread: standard deviation of the score that ranks; None for one seed.
+        command: what the first was run with, or where the code of a submission is.
+    """
+
+    numbers: Sequence[int] = ()
+    scores: Mapping[str, float | None] = field(default_factory=dict)
+    cost: Mapping[str, float | None] = field(default_factory=dict)
+    parts: Mapping[str, float | None] = field(default_factory=dict)
+    spread: float | None = None
+    command: str = ""
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> EarlierSeeds:
+        """Those of an entry of a page; pages that do not tell the seeds have the first ones."""
+        numbers = entry.get("numbers", range(entry["seeds"]))
+        names = ("scores", "cost", "parts", "spread", "command")
+        return cls(list(numbers), **{name: entry[name] for name in names})
+
+    @property
+    def handed_in(self) -> bool:
+        """Whether they are of a submission: heatsplat's own were run by overrides."""
+        return not self.command.startswith("method=")
+
+
+@dataclass(frozen=True)
+class EarlierPage:
+    """What a page that a leaderboard wrote says.
+
+    Args:
+        reference: the method beside which it has the others.
+        seeds: of every method on a scene in a track that has results.
+        pictures: (scene, view) -> renders and errors, as the page shows them.
+    """
+
+    reference: str
+    seeds: Mapping[Place, EarlierSeeds]
+    pictures: Mapping[tuple[str, str], Mapping[str, Any]]
+
+
+def read_page(path: Path, board: Board) -> EarlierPage:
+    """What a page that a leaderboard wrote says.
 
     Raises:
         SceneError: there is no such page, it is cut off, or it has scenes of another size, another score, reference or clock,
@@ -35,7 +85,7 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
         content, _ = json.JSONDecoder().raw_decode(text, text.index(MARK) + len(MARK))
     except ValueError as error:
         raise SceneError(f"leaderboard.earlier: {path} is damaged ({error}); take another copy of the page") from error
-    wanted = {"sizes": board.sizes, "score": board.protocol["scores"][0], "reference": board.protocol["reference"]}
+    wanted = {"sizes": board.sizes, "score": board.score, "reference": board.reference}
     for key, value in wanted.items():
         if content[key] != value:
             raise SceneError(f"leaderboard.earlier: {path} has {key} {content[key]}, this board {value}; leave it out")
@@ -53,60 +103,41 @@ def read_page(path: Path, board: Board) -> dict[str, Any]:
                 f"leaderboard.earlier: the track {track} of {path} is {before}, that of this board {settings}; leave the page "
                 f'out, or give the track its settings: "leaderboard.protocol.tracks.{track}=[{quoted}]"'
             )
-    return content
+    return EarlierPage(
+        reference=content["reference"],
+        seeds={
+            (entry["method"], entry["scene"], entry["track"]): EarlierSeeds.of(entry)
+            for entry in content["entries"]
+            if entry.get("scores")
+        },
+        pictures={(scene["name"], shown["view"]): shown for scene in content["scenes"] for shown in scene["pictures"]},
+    )
 
 
-def add_earlier(places: Mapping[tuple[str, str, str], Entry], content: Mapping[str, Any]) -> dict[str, float]:
+def add_earlier(entries: Mapping[Place, Entry], page: EarlierPage) -> dict[str, float]:
     """Adds the seeds of a page that a board's folders lack; track -> the factor that makes their seconds its.
 
     Machines differ. Where runs of the reference in a track are in the folders and on the page, the seconds of all the folders'
     runs in it are multiplied by what the reference took there over what it took here (geometric mean over scenes). Without such
     a pair they stay as they are.
     """
-    told = {place_of(one): one for one in told_by(content)}
     factors = {}
-    for track in dict.fromkeys(key[2] for key in told):
-        own = [entry for key, entry in places.items() if key[2] == track]
+    for track in dict.fromkeys(track for _, _, track in page.seeds):
+        in_track = [entry for entry in entries.values() if entry.track == track]
         pairs = [
-            (told[entry.place]["cost"]["seconds"], entry.cost("seconds"))
-            for entry in own
-            if entry.method == content["reference"] and entry.place in told
+            (page.seeds[entry.place].cost["seconds"], entry.cost("seconds"))
+            for entry in in_track
+            if entry.method == page.reference and entry.place in page.seeds
         ]
-        logs = [math.log(there / here) for there, here in pairs if there and here]
+        logs = [math.log(then / now) for then, now in pairs if then and now]
         if logs:
             factors[track] = math.exp(statistics.fmean(logs))
-            for entry in own:
+            for entry in in_track:
                 entry.scale_seconds(factors[track])
-    for key, one in told.items():
-        if key in places:
-            places[key].join(one)
+    for place, seeds in page.seeds.items():
+        if place in entries:
+            entries[place].join(seeds)
     return factors
-
-
-def told_by(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Entries of a page that have results."""
-    return [one for one in content["entries"] if one.get("scores")]
-
-
-def place_of(one: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Method, scene and track of an entry of a page."""
-    return one["method"], one["scene"], one["track"]
-
-
-def numbers_of(one: Mapping[str, Any]) -> list[int]:
-    """Seeds of an entry of a page; pages that do not tell them have the first ones."""
-    return one.get("numbers", list(range(one["seeds"])))
-
-
-def handed_in(one: Mapping[str, Any]) -> bool:
-    """Whether an entry of a page is a submission: heatsplat's own were run by overrides."""
-    return not one["command"].startswith("method=")
-
-
-def pictures_of(content: Mapping[str, Any] | None, scene: str, view: str) -> Mapping[str, Any] | None:
-    """Renders and errors of a view that a page shows, as it has them; None where it does not, or there is none."""
-    scenes = [one for one in content["scenes"] if one["name"] == scene] if content else []
-    return next((shown for one in scenes for shown in one["pictures"] if shown["view"] == view), None)
 
 
 def sentence(factors: Mapping[str, float]) -> str:

@@ -14,16 +14,8 @@ from heatsplat.geometry.resampling import resampled
 from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.leaderboard.earlier import pictures_of
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import (
-    SUBMISSION,
-    Entry,
-    Standings,
-    beside_reference,
-    spread_of,
-    summary,
-)
+from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, Standings, beside_reference, spread_of, summary
 from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -40,15 +32,15 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
         board: what was asked for.
         folder: where the page lies, for links to the settings of runs; None leaves links out.
     """
-    entries, score = found.entries, board.protocol["scores"][0]
+    entries = found.entries
     beside = beside_reference(entries, board)
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     content = {
-        "score": score,
+        "score": board.score,
         "higher": board.higher,
-        "reference": board.protocol["reference"],
-        "unit": DEFINITIONS[score].unit,
-        "definitions": {name: DEFINITIONS[name].sentence for name in board.protocol["scores"]},
+        "reference": board.reference,
+        "unit": DEFINITIONS[board.score].unit,
+        "definitions": {name: DEFINITIONS[name].sentence for name in board.scores},
         "tracks": board.settings,
         "summary": summary(entries, board),
         "seeds": list(board.seeds),
@@ -77,17 +69,16 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
     about: dict[str, Any] = {"method": entry.method, "scene": entry.scene, "track": entry.track}
     if not entry.seeds:
         return {**about, "reason": entry.reason}
-    first = board.protocol["scores"][0]
     links = (
         [] if folder is None else [os.path.relpath(run.folder / ".hydra" / "config.yaml", folder) for run in entry.runs]
     )
     return {
         **about,
-        "scores": {name: entry.mean(name) for name in board.protocol["scores"]},
-        "spread": entry.deviation(first),
+        "scores": {name: entry.mean(name) for name in board.scores},
+        "spread": entry.deviation(board.score),
         "seeds": entry.seeds,
         "numbers": sorted(entry.all_numbers),
-        "parts": {part: entry.mean(first, part) for part in entry.parts},
+        "parts": {part: entry.mean(board.score, part) for part in entry.parts},
         "rank": entry.rank,
         "cost": {name: entry.cost(name) for name in ("seconds", "memory_mb", "gaussians", "steps")},
         "command": entry.command,
@@ -102,6 +93,7 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
     """
     own = [entry for entry in found.entries if entry.scene == scene and entry.track == board.tracks[0] and entry.seeds]
     truth = board.root / TRUTH / scene
+    pictures_before = board.earlier.pictures if board.earlier is not None else {}
     shown = []
     for part in SHOWN:
         names = sorted(path.stem for path in truth.glob(f"{part}_*.tiff"))
@@ -110,8 +102,8 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
         name = names[len(names) // 2]
         exact = read_temperature(truth / f"{name}.tiff")
         low, high = (float(value) for value in np.nanpercentile(exact, (0.1, 99.9)))
-        earlier = pictures_of(found.page, scene, name) or {"renders": {}, "errors": {}}
-        kept = [entry.method for entry in own if entry.told is not None and entry.method in earlier["renders"]]
+        earlier = pictures_before.get((scene, name), {"renders": {}, "errors": {}})
+        kept = [entry.method for entry in own if entry.earlier.numbers and entry.method in earlier["renders"]]
         others = [entry for entry in own if entry.method not in kept]
         renders = {entry.method: image for entry in others if (image := _render(entry, name)) is not None}
         errors = {method: image - exact for method, image in renders.items()}

@@ -12,7 +12,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import setting
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.leaderboard.earlier import read_page
+from heatsplat.studies.leaderboard.earlier import EarlierPage, read_page
 from heatsplat.studies.options import listed
 from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission
 
@@ -51,7 +51,7 @@ class Board:
         methods, scenes, tracks, seeds: names, in the order of the table.
         clock: the cost that counts as seconds, of ``metrics.json``.
         submissions: renders of other code, which count beside.
-        earlier: contents of a leaderboard's page, whose entries stand where the folder has fewer seeds; None for none.
+        earlier: a leaderboard's page, whose entries stand where the folder has fewer seeds; None for none.
         document, page: where the table and the page go besides the folder of the sweep; None for nowhere.
         train: False to write what is there and run nothing.
         note: on the conditions of the runs, for the table and the page.
@@ -65,16 +65,31 @@ class Board:
     seeds: Sequence[int]
     clock: str = "train_seconds"
     submissions: Sequence[Submission] = ()
-    earlier: Mapping[str, Any] | None = None
+    earlier: EarlierPage | None = None
     document: Path | None = None
     page: Path | None = None
     train: bool = True
     note: str = ""
 
     @property
+    def scores(self) -> list[str]:
+        """Names of the scores that are told."""
+        return list(self.protocol["scores"])
+
+    @property
+    def score(self) -> str:
+        """The one that ranks, the first."""
+        return self.scores[0]
+
+    @property
     def higher(self) -> bool:
-        """Whether more of the score that ranks is better."""
-        return DEFINITIONS[self.protocol["scores"][0]].better == "higher"
+        """Whether more of it is better."""
+        return DEFINITIONS[self.score].higher
+
+    @property
+    def reference(self) -> str:
+        """The method beside which the others stand."""
+        return self.protocol["reference"]
 
     @property
     def sizes(self) -> list[str]:
@@ -180,7 +195,7 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[s
 
 def _submission(folder: Path, board: Board, known: Collection[str]) -> Submission:
     """What a folder hands in. Raises SceneError as ``board_of`` does."""
-    told, scores = score_submission(folder, board.root, board.protocol["scores"])
+    told, scores = score_submission(folder, board.root, board.scores)
     method, track, where = told["method"], told.get("track", board.tracks[0]), folder / METRICS_FILE
     if method in known:
         raise SceneError(

@@ -18,7 +18,6 @@ log = logging.getLogger("heatsplat")
 
 TABLE_FILE, CSV_FILE, PAGE_FILE = "leaderboard.md", "leaderboard.csv", "leaderboard.html"
 TIES = "methods are tied and share ranks if they differ by less than two standard errors of the difference."
-DIGITS = {"psnr": 2, "ssim": 4, "mae_c": 3}
 
 
 def write_leaderboard(folder: Path, board: Board) -> list[Path]:
@@ -41,8 +40,7 @@ def write_leaderboard(folder: Path, board: Board) -> list[Path]:
 def markdown(found: Standings, board: Board) -> str:
     """The table: a part for each track, with ranks over all scenes and the error on each."""
     entries = found.entries
-    told, score = summary(entries, board), board.protocol["scores"][0]
-    unit = DEFINITIONS[score].unit
+    told = summary(entries, board)
     lines = [
         "# Leaderboard",
         "",
@@ -53,7 +51,8 @@ def markdown(found: Standings, board: Board) -> str:
         f"The interactive [page]({PAGE_FILE}) sorts the table, plots error against time, and "
         "compares renders with the ground truth.",
         "",
-        f"Cells: {score} ({unit}) on held-out views, mean over seeds, and the range of ranks in parentheses: {TIES} "
+        f"Cells: {board.score} ({DEFINITIONS[board.score].unit}) on held-out views, mean over seeds, and the range of ranks in "
+        f"parentheses: {TIES} "
         f"{spread_of(entries, board)} `{_beside(board)}` is {_what_is_beside(board)}, over the scenes on which both ran.",
         "",
     ]
@@ -68,7 +67,7 @@ def markdown(found: Standings, board: Board) -> str:
         lines += [f"### By held-out part, equal {track}", "", *_parts(own, board), ""]
         if reasons := _reasons(own):
             lines += ["### Methods that were not run", "", *(f"- {text}" for text in reasons), ""]
-    lines += ["## Scores", "", *(f"- {name}: {DEFINITIONS[name].sentence}" for name in board.protocol["scores"]), ""]
+    lines += ["## Scores", "", *(f"- {name}: {DEFINITIONS[name].sentence}" for name in board.scores), ""]
     return "\n".join(lines)
 
 
@@ -78,12 +77,12 @@ def _clock(board: Board) -> str:
 
 def _beside(board: Board) -> str:
     """Heading of the column of ``beside_reference``."""
-    return f"{'above' if board.higher else 'x'} {board.protocol['reference']}"
+    return f"{'above' if board.higher else 'x'} {board.reference}"
 
 
 def _what_is_beside(board: Board) -> str:
     if board.higher:
-        return f"the mean difference of a method's {board.protocol['scores'][0]} to that method's"
+        return f"the mean difference of a method's {board.score} to that method's"
     return "the geometric mean of a method's error relative to that method"
 
 
@@ -98,7 +97,6 @@ def order(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
 
 
 def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
-    score = board.protocol["scores"][0]
     beside = beside_reference(entries, board)
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     places = {(entry.method, entry.scene): entry for entry in entries}
@@ -110,7 +108,7 @@ def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
         value, count = beside.get((method, track), (None, 0))
         seconds = [one.cost("seconds") for one in own if one and one.cost("seconds") is not None]
         told = number(sum(seconds) / len(seconds) if seconds else None, 0)
-        rows.append([f"`{method}`", number(value, 2), count, told, *(_cell(one, score) for one in own)])
+        rows.append([f"`{method}`", number(value, 2), count, told, *(_cell(one, board.score) for one in own)])
     head = ["method", _beside(board), "scenes", f"s ({_clock(board)})", *scenes]
     return markdown_table(head, rows, "lrrr" + "r" * len(scenes))
 
@@ -124,19 +122,19 @@ def rank_text(entry: Entry) -> str:
 def _cell(entry: Entry | None, score: str) -> str:
     if entry is None or entry.mean(score) is None:
         return NONE
-    text = f"{number(entry.mean(score), DIGITS.get(score, 3))} ({rank_text(entry)})"
+    text = f"{number(entry.mean(score), DEFINITIONS[score].digits)} ({rank_text(entry)})"
     return f"**{text}**" if entry.rank[0] == 1 else text
 
 
 def _parts(entries: Sequence[Entry], board: Board) -> list[str]:
     """The three best of each part of each scene."""
-    score = board.protocol["scores"][0]
     parts = list(dict.fromkeys(part for entry in entries for part in entry.parts))
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
     rows = []
     for scene in scenes:
         for part in parts:
-            found = {entry.method: entry.mean(score, part) for entry in entries if entry.scene == scene and entry.seeds}
+            in_scene = [entry for entry in entries if entry.scene == scene and entry.seeds]
+            found = {entry.method: entry.mean(board.score, part) for entry in in_scene}
             found = {method: value for method, value in found.items() if value is not None}
             if found:
                 best = sorted(found, key=found.get, reverse=board.higher)[:3]
@@ -165,15 +163,13 @@ def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object
     rows: list[Mapping[str, object]] = []
     for entry in entries:
         about = {"method": entry.method, "scene": entry.scene, "track": entry.track}
-        if entry.told is not None:
-            rows.append({**about, **entry.told["scores"], **entry.told["cost"], "seeds": entry.told["seeds"]})
+        if entry.earlier.numbers:
+            rows.append({**about, **entry.earlier.scores, **entry.earlier.cost, "seeds": len(entry.earlier.numbers)})
         elif not entry.runs:
             rows.append({**about, "reason": entry.reason})
         for run in entry.runs:
             score = run.score
-            values = {name: score.mean(name) for name in board.protocol["scores"]}
-            by_part = {
-                f"{name}_{part}": score.mean(name, part) for part in score.parts for name in board.protocol["scores"]
-            }
+            values = {name: score.mean(name) for name in board.scores}
+            by_part = {f"{name}_{part}": score.mean(name, part) for part in score.parts for name in board.scores}
             rows.append({**about, **values, **by_part, **run.cost, "folder": os.path.basename(run.folder)})
     return rows

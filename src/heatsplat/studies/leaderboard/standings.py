@@ -16,14 +16,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.leaderboard.earlier import (
-    add_earlier,
-    handed_in,
-    numbers_of,
-    place_of,
-    sentence,
-    told_by,
-)
+from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene
@@ -60,7 +53,7 @@ class Entry:
     Args:
         method, scene, track: what it is.
         runs: those that have results, each of a seed of its own.
-        told: what an earlier page says of other seeds, which counts beside the runs; None without.
+        earlier: what an earlier page says of other seeds, which counts beside the runs.
         reason: why there are none.
         rank: best and worst rank that the seeds allow, in its scene and track; None without results.
     """
@@ -69,20 +62,19 @@ class Entry:
     scene: str
     track: str
     runs: list[Result] = field(default_factory=list)
-    told: Mapping[str, Any] | None = None
+    earlier: EarlierSeeds = field(default_factory=EarlierSeeds)
     reason: str = "not run yet"
     rank: tuple[int, int] | None = None
 
     @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> Place:
         """Method, scene and track."""
         return self.method, self.scene, self.track
 
     @property
     def all_numbers(self) -> list[int]:
         """Seeds of all results, those of an earlier page first."""
-        told = numbers_of(self.told) if self.told is not None else ()
-        return [*told, *(run.seed for run in self.runs)]
+        return [*self.earlier.numbers, *(run.seed for run in self.runs)]
 
     @property
     def seeds(self) -> int:
@@ -92,19 +84,17 @@ class Entry:
     @property
     def parts(self) -> list[str]:
         """What views are held out by; empty without results."""
-        told = self.told["parts"] if self.told is not None else ()
-        return list(dict.fromkeys((*told, *(part for run in self.runs for part in run.score.parts))))
+        return list(dict.fromkeys((*self.earlier.parts, *(part for run in self.runs for part in run.score.parts))))
 
     @property
     def command(self) -> str:
         """What the first seed was run with."""
-        return str(self.told["command"]) if self.told is not None else self.runs[0].command
+        return self.earlier.command if self.earlier.numbers else self.runs[0].command
 
-    def join(self, told: Mapping[str, Any]) -> None:
+    def join(self, earlier: EarlierSeeds) -> None:
         """Adds what an earlier page says, unless there are runs of all its seeds; runs of some of them then do not count."""
-        known = set(numbers_of(told))
-        if not known <= {run.seed for run in self.runs}:
-            self.told, self.runs = told, [run for run in self.runs if run.seed not in known]
+        if not set(earlier.numbers) <= {run.seed for run in self.runs}:
+            self.earlier, self.runs = earlier, [run for run in self.runs if run.seed not in earlier.numbers]
 
     def scale_seconds(self, factor: float) -> None:
         """Makes the seconds of the runs those of another machine."""
@@ -119,30 +109,28 @@ class Entry:
 
     def mean(self, score: str, part: str | None = None) -> float | None:
         """Mean over the seeds; of a part, earlier pages have the score that ranks alone."""
-        told = None
-        if self.told is not None:
-            told = self.told["scores"].get(score) if part is None else self.told["parts"].get(part)
-        return self._mean(self.values(score, part), told)
+        earlier = self.earlier.scores.get(score) if part is None else self.earlier.parts.get(part)
+        return self._mean(self.values(score, part), earlier)
 
     def deviation(self, score: str) -> float | None:
         """Standard deviation over the seeds of the score that ranks; None for one seed."""
-        values = self.values(score)
-        if self.told is None:
-            return statistics.stdev(values) if len(values) > 1 else None
-        count, mean = int(self.told["seeds"]), self.mean(score)
+        values, count = self.values(score), len(self.earlier.numbers)
         if count + len(values) < 2:
             return None
-        squares = (count - 1) * (self.told["spread"] or 0.0) ** 2 + count * (self.told["scores"][score] - mean) ** 2
+        if not count:
+            return statistics.stdev(values)
+        mean = self.mean(score)
+        squares = (count - 1) * (self.earlier.spread or 0.0) ** 2 + count * (self.earlier.scores[score] - mean) ** 2
         return math.sqrt((squares + sum((value - mean) ** 2 for value in values)) / (count + len(values) - 1))
 
     def cost(self, name: str) -> float | None:
         """Mean of a cost over the seeds that tell it."""
         values = [run.cost[name] for run in self.runs if run.cost.get(name) is not None]
-        return self._mean(values, self.told["cost"].get(name) if self.told is not None else None)
+        return self._mean(values, self.earlier.cost.get(name))
 
-    def _mean(self, values: Sequence[float], told: float | None) -> float | None:
+    def _mean(self, values: Sequence[float], earlier: float | None) -> float | None:
         """Mean of a number of each run and of that which an earlier page tells of its seeds."""
-        every = [*values, *([told] * int(self.told["seeds"]) if told is not None else ())]
+        every = [*values, *([earlier] * len(self.earlier.numbers) if earlier is not None else ())]
         return statistics.fmean(every) if every else None
 
 
@@ -152,12 +140,10 @@ class Standings:
 
     Args:
         entries: in the order of its scenes and methods, submissions last; ranked within scene and track.
-        page: contents of the earlier page whose results count beside the runs; None without one.
-        note: what was taken from them.
+        note: what was taken from an earlier page.
     """
 
     entries: list[Entry]
-    page: Mapping[str, Any] | None = None
     note: str = ""
 
 
@@ -171,24 +157,24 @@ def standings(folder: Path, board: Board) -> Standings:
             key = (submission.method, scene, submission.track)
             entry = places.setdefault(key, Entry(*key))
             entry.runs.append(Result(entry.seeds, score, score.cost, submission.folder, submission.command))
-    page, note = board.earlier, ""
-    if page is not None:
-        for key in (place_of(one) for one in told_by(page) if handed_in(one)):
-            if key[1] in board.scenes and key[2] in board.tracks:
-                places.setdefault(key, Entry(*key))
-        note = sentence(add_earlier(places, page))
+    note = ""
+    if board.earlier is not None:
+        for place, seeds in board.earlier.seeds.items():
+            if seeds.handed_in and place[1] in board.scenes and place[2] in board.tracks:
+                places.setdefault(place, Entry(*place))
+        note = sentence(add_earlier(places, board.earlier))
     entries = list(places.values())
-    first = board.protocol["scores"][0]
-    usual = usual_spread(entries, first)
+    usual = usual_spread(entries, board.score)
     for scene in dict.fromkeys(entry.scene for entry in entries):
         for track in board.tracks:
             ranked = [
-                one for one in entries if (one.scene, one.track) == (scene, track) and one.mean(first) is not None
+                one for one in entries if (one.scene, one.track) == (scene, track) and one.mean(board.score) is not None
             ]
-            means, errors = [one.mean(first) for one in ranked], [standard_error(one, first, usual) for one in ranked]
+            means = [one.mean(board.score) for one in ranked]
+            errors = [standard_error(one, board.score, usual) for one in ranked]
             for entry, rank in zip(ranked, ranks(means, errors, board.higher), strict=True):
                 entry.rank = rank
-    return Standings(entries, page, note)
+    return Standings(entries, note)
 
 
 def _entries(board: Board) -> list[Entry]:
@@ -200,7 +186,7 @@ def _entries(board: Board) -> list[Entry]:
     ]
 
 
-def _add_run(places: Mapping[tuple[str, str, str], Entry], folder: Path, board: Board) -> None:
+def _add_run(places: Mapping[Place, Entry], folder: Path, board: Board) -> None:
     """Adds what is in the folder of a run to its entry; runs of what the board does not ask for, or of a seed that the entry
     has, are passed over."""
     overrides = overrides_of(folder)
@@ -236,13 +222,12 @@ def _of_the_board(name: str) -> bool:
 def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
     """The score of the renders of a run, which is written beside them and taken from there the next time."""
     path, metrics = folder / SCORE_FILE, folder / METRICS_FILE
-    names = list(board.protocol["scores"])
     if path.exists() and path.stat().st_mtime >= metrics.stat().st_mtime:
         known = json.loads(path.read_text(encoding="utf-8"))
-        if known["scores"] == names:
+        if known["scores"] == board.scores:
             return SceneScore(known["views"])
-    score = score_scene(folder / SUBMISSION, board.root / SCENES / scene, board.root / TRUTH / scene, names)
-    write_atomically(path, json.dumps({"scores": names, "views": score.views}))
+    score = score_scene(folder / SUBMISSION, board.root / SCENES / scene, board.root / TRUTH / scene, board.scores)
+    write_atomically(path, json.dumps({"scores": board.scores, "views": score.views}))
     return score
 
 
@@ -260,7 +245,7 @@ def spread_of(entries: Sequence[Entry], board: Board) -> str:
     """A sentence on what is taken for the spread of what ran with one seed."""
     if not any(one.seeds == 1 for one in entries):
         return ""
-    usual = usual_spread(entries, board.protocol["scores"][0])
+    usual = usual_spread(entries, board.score)
     if usual is None:
         return "All methods ran with one seed, so the spread is unknown and ranks follow the means."
     return f"Methods with one seed are assumed to vary by {100 * usual:.1f} %, the average of the others."
@@ -301,14 +286,14 @@ def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, 
 
     Of errors that is the geometric mean of the ratios; of a score of which more is better, the mean of the differences.
     """
-    score, reference = board.protocol["scores"][0], board.protocol["reference"]
     found: dict[tuple[str, str], list[float]] = {}
     for scene, track in dict.fromkeys((entry.scene, entry.track) for entry in entries):
-        means = {e.method: e.mean(score) for e in entries if (e.scene, e.track) == (scene, track)}
+        means = {e.method: e.mean(board.score) for e in entries if (e.scene, e.track) == (scene, track)}
         own = {method: mean for method, mean in means.items() if mean is not None and (board.higher or mean > 0)}
         for method, mean in own.items():
-            if reference in own:
-                beside = mean - own[reference] if board.higher else math.log(mean / own[reference])
+            if board.reference in own:
+                reference = own[board.reference]
+                beside = mean - reference if board.higher else math.log(mean / reference)
                 found.setdefault((method, track), []).append(beside)
     means = {key: (statistics.fmean(values), len(values)) for key, values in found.items()}
     return means if board.higher else {key: (math.exp(mean), count) for key, (mean, count) in means.items()}

@@ -11,10 +11,11 @@ from typing import Any
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, write_csv
+from heatsplat.metrics.definitions import COSTS
 from heatsplat.studies.finished import Runs
 from heatsplat.studies.published.figures import METRICS, Figure
 from heatsplat.studies.published.reproduction import Reproduction, row_name
-from heatsplat.studies.sweeps import COSTS, collect
+from heatsplat.studies.sweeps import collect
 
 COMPARISON_FILE, COMPARISON_CSV = "comparison.md", "comparison.csv"
 BESIDE = ("train_seconds", "peak_memory_mb", "gaussians")  # costs that stand beside every row
@@ -203,13 +204,13 @@ def markdown(
     costs = [name for name in costs if any(name in line.cost for line in lines)]
     several = any(setting for _, setting in reproduction.rows)
     head = ["scene", "method", *(["setting"] if several else []), *(METRICS[metric].title for metric in metrics)]
-    head += [f"ours: {COSTS[name][0]}" for name in costs]
+    head += [f"ours: {COSTS[name].heading}" for name in costs]
     rows = []
     for line in lines:
         method = ", ".join(filter(None, [line.method, line.other])) or NONE
         cells = [line.label, method, *([line.setting or NONE] if several else [])]
         cells += [_cell(line, metric) for metric in metrics]
-        rows.append(cells + [number(line.cost.get(name), COSTS[name][1]) for name in costs])
+        rows.append(cells + [number(line.cost.get(name), COSTS[name].digits) for name in costs])
     text = [
         f"# {reproduction.title}: ours beside the paper's",
         "",

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from heatsplat.contracts import SceneError
+from heatsplat.metrics.definitions import described
 
 FOLDER = Path(__file__).parent
 TITLES = {"etgs": "ETGS", "thermogs": "ThermoGS", "ti3dgs": "TI-3DGS", "ravigs": "RaViGS", "supirgs": "SupIR-GS"}
@@ -55,7 +56,6 @@ class Metric:
         digits: that are shown of our values and of differences.
         ours: score or cost in metrics.json, None where heatsplat measures none.
         convert: our value in the table's unit.
-        higher: True where more is better, False where less is, None for facts.
         why_not: why there is no value of ours.
     """
 
@@ -63,43 +63,39 @@ class Metric:
     digits: int
     ours: str | None = None
     convert: Callable[[float], float] = float
-    higher: bool | None = None
     why_not: str = "heatsplat does not measure it"
+
+
+def _as_ours(name: str) -> Metric:
+    """A printed score that is called, measured and rounded as heatsplat's."""
+    return Metric(described(name).heading, described(name).digits, name)
 
 
 _TRUTH = "the error needs the true materials of the scene, which no data set on disk has"
 _FACT = "a fact about the data, not a result"
 METRICS = {
-    "psnr": Metric("PSNR dB", 2, "psnr", higher=True),
-    "ssim": Metric("SSIM", 4, "ssim", higher=True),
-    "lpips": Metric("LPIPS", 4, "lpips", higher=False),
-    "mae_c": Metric("MAE °C", 3, "mae_c", higher=False),
-    "mae_roi_c": Metric("MAE ROI °C", 3, "mae_roi_c", higher=False),
-    "rgb_psnr": Metric("RGB PSNR dB", 2, "rgb_psnr", higher=True),
-    "rgb_ssim": Metric("RGB SSIM", 4, "rgb_ssim", higher=True),
-    "rgb_lpips": Metric("RGB LPIPS", 4, "rgb_lpips", higher=False),
-    "train_s": Metric("train s", 1, "train_seconds", higher=False),
-    "train_min": Metric("train min", 2, "train_seconds", lambda s: s / 60, higher=False),
-    "train_h": Metric("train h", 2, "train_seconds", lambda s: s / 3600, higher=False),
-    "memory_mb": Metric("memory MB", 0, "peak_memory_mb", higher=False),
-    "memory_gb": Metric("memory GB", 2, "peak_memory_mb", lambda mb: mb / 1000, higher=False),
-    "fps": Metric("frames/s", 1, "render_fps", higher=True),
-    "infer_s": Metric(
-        "inference s", 2, higher=False, why_not="the paper does not say what is inferred in these seconds"
-    ),
-    "mae_emissivity": Metric("error of emissivity", 3, higher=False, why_not=_TRUTH),
-    "mae_absorptivity": Metric("error of absorptivity", 3, higher=False, why_not=_TRUTH),
-    "mae_h_w_m2k": Metric("error of h W/(m² K)", 3, higher=False, why_not=_TRUTH),
-    "mae_c_kj_m3k": Metric("error of c kJ/(m³ K)", 1, higher=False, why_not=_TRUTH),
+    **{name: _as_ours(name) for name in ("psnr", "ssim", "lpips", "mae_c", "mae_roi_c")},
+    **{name: _as_ours(name) for name in ("rgb_psnr", "rgb_ssim", "rgb_lpips")},
+    "train_s": Metric("train (s)", 1, "train_seconds"),
+    "train_min": Metric("train (min)", 2, "train_seconds", lambda s: s / 60),
+    "train_h": Metric("train (h)", 2, "train_seconds", lambda s: s / 3600),
+    "memory_mb": Metric("memory (MB)", 0, "peak_memory_mb"),
+    "memory_gb": Metric("memory (GB)", 2, "peak_memory_mb", lambda mb: mb / 1000),
+    "fps": Metric("frames/s", 1, "render_fps"),
+    "infer_s": Metric("inference (s)", 2, why_not="the paper does not say what is inferred in these seconds"),
+    "mae_emissivity": Metric("error of emissivity", 3, why_not=_TRUTH),
+    "mae_absorptivity": Metric("error of absorptivity", 3, why_not=_TRUTH),
+    "mae_h_w_m2k": Metric("error of h (W/(m² K))", 3, why_not=_TRUTH),
+    "mae_c_kj_m3k": Metric("error of c (kJ/(m³ K))", 1, why_not=_TRUTH),
     "emissivity": Metric("emissivity", 2, why_not=_FACT),
     "absorptivity": Metric("absorptivity", 2, why_not=_FACT),
-    "h_w_m2k": Metric("h W/(m² K)", 1, why_not=_FACT),
-    "c_kj_m3k": Metric("c kJ/(m³ K)", 0, why_not=_FACT),
+    "h_w_m2k": Metric("h (W/(m² K))", 1, why_not=_FACT),
+    "c_kj_m3k": Metric("c (kJ/(m³ K))", 0, why_not=_FACT),
     "views": Metric("views", 0, why_not=_FACT),
-    "t_min_c": Metric("min °C", 1, why_not=_FACT),
-    "t_max_c": Metric("max °C", 1, why_not=_FACT),
-    "span_s": Metric("span s", 3, why_not=_FACT),
-    "ambient_c": Metric("ambient °C", 1, why_not=_FACT),
+    "t_min_c": Metric("min (°C)", 1, why_not=_FACT),
+    "t_max_c": Metric("max (°C)", 1, why_not=_FACT),
+    "span_s": Metric("span (s)", 3, why_not=_FACT),
+    "ambient_c": Metric("ambient (°C)", 1, why_not=_FACT),
     "frames_k": Metric("thousand frames", 0, why_not=_FACT),
     "split_train_parts": Metric("parts to train", 0, why_not=_FACT),
     "split_test_parts": Metric("parts to test", 0, why_not=_FACT),

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import literal
+from heatsplat.io.pictures import literal, series_look
 from heatsplat.io.tables import markdown_table, number
+from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import NAMES, SEEDS
-from heatsplat.studies.frontier_runs import Recipe, dominated
+from heatsplat.studies.frontier.runs import SCORES, Recipe, dominated
 
-COLUMNS = {  # digits, and whether the spread stands beside the mean
-    "train_seconds": (1, True), "psnr": (2, True), "ssim": (4, False), "mae_c": (3, True),
-    "peak_memory_mb": (0, False), "render_fps": (0, False), "gaussians": (0, False),
-}  # fmt: skip
+COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
+LEGEND = (
+    "Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto front "
+    "of both; ends with a black edge are those that no other recipe equalled sooner."
+)
+WITH_SPREAD = {"train_seconds", "psnr", "mae_c"}  # beside the mean
 
 
 def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
@@ -49,25 +50,18 @@ def tables(
     found = []
     for scene in dict.fromkeys(recipe.scene for recipe in recipes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
-        head = [
-            "recipe",
-            "runs",
-            "train (s)",
-            "PSNR (dB)",
-            "SSIM",
-            "MAE (°C)",
-            "memory (MB)",
-            "frames/s",
-            "Gaussians",
-            "front",
-        ]
+        head = ["recipe", "runs", *(described(name).heading for name in COLUMNS), "front"]
         rows = []
         for recipe in own:
             cells = [
-                number(recipe.mean(name), digits, (spread and recipe.spread(name)) or None)
-                for name, (digits, spread) in COLUMNS.items()
+                number(
+                    recipe.mean(name),
+                    described(name).digits,
+                    (recipe.spread(name) or None) if name in WITH_SPREAD else None,
+                )
+                for name in COLUMNS
             ]
-            marks = [label for name, label in (("psnr", "PSNR"), ("mae_c", "MAE")) if recipe.on_front.get(name)]
+            marks = [DEFINITIONS[name].title for name in SCORES if recipe.on_front.get(name)]
             rows.append([recipe.name, str(recipe.count), *cells, ", ".join(marks)])
         found.append((f"{scene}: results beside their costs{_views_of(own)}", head, rows))
         psnr, mae = _reached(own, "psnr", levels["psnr"]), _reached(own, "mae_c", levels["mae_c"])
@@ -100,8 +94,8 @@ def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -
     found = {key: [one.results.run.get(key) for one in runs] for key in ("seed", "threads")}
     lines = ["# Accuracy against training time", "", all_rows(sorted(set.intersection(*jobs)), **found), ""]
     for title, head, rows in tables(recipes, levels):
-        lines += [f"## {title}", "", *markdown_table(head, rows), ""]
-    return "\n".join([*lines, "![quality against seconds](frontier.png)", ""])
+        lines += [f"## {title}", "", *markdown_table(head, rows, "l" + "r" * (len(head) - 1)), ""]
+    return "\n".join([*lines, "![quality against seconds](frontier.svg)", "", LEGEND, ""])
 
 
 def records(recipes: Sequence[Recipe]) -> list[dict[str, Any]]:
@@ -133,11 +127,10 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
     for i, scene in enumerate(scenes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
-        for k, (name, label) in enumerate((("psnr", "PSNR (dB)"), ("mae_c", "MAE (°C)"))):
+        for k, name in enumerate(SCORES):
             axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
             for recipe in own:
-                j = places[recipe.name]
-                color, mark = f"C{j % 10}", "os^Dv<>P"[j // 10 % 8]
+                color, mark = series_look(places[recipe.name])
                 for course in recipe.table["course"]:
                     if course[name]:
                         axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
@@ -148,11 +141,12 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
                         x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
                         linestyle="", label=literal(recipe.name),
                     )  # fmt: skip
-            sign = 1.0 if name == "psnr" else -1.0
+            sign = DEFINITIONS[name].sign
             every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
             front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
             if len(front) > 1:
                 axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
+            label = DEFINITIONS[name].heading
             axes.set(xlabel="seconds of training", ylabel=label, title=literal(scene), xscale="log")
             if name == "mae_c":
                 axes.set_yscale("log")
@@ -163,23 +157,3 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
             if k == 0 and own:
                 axes.legend(fontsize=7)
     return figure
-
-
-def page(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]], vector: str) -> str:
-    """A page that needs no other file: the picture and the tables."""
-    picture_data = base64.b64encode(vector.encode()).decode()
-    parts = [
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Accuracy against training time</title>',
-        "<style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:1100px;padding:0 1em}"
-        "table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em .7em;border-bottom:1px solid #ccc;text-align:right}"
-        "td:first-child,th:first-child{text-align:left}img{width:100%}</style>",
-        "<h1>Accuracy against training time</h1>",
-        f'<img alt="quality against seconds" src="data:image/svg+xml;base64,{picture_data}">',
-        "<p>Thin lines: validation views along a run, evaluation time excluded. Marks: test views at its end. Dashed: the Pareto "
-        "front of both; ends with a black edge are those that no other recipe equalled sooner.</p>",
-    ]
-    for title, head, rows in tables(recipes, levels):
-        cells = "".join(f"<th>{html.escape(text)}</th>" for text in head)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows)
-        parts.append(f"<h2>{html.escape(title)}</h2><table><tr>{cells}</tr>{body}</table>")
-    return "\n".join(parts)

@@ -15,11 +15,13 @@ import pandas as pd
 
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import read_csv
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import Runs, read_runs, settings_of, told_apart, unshared
 from heatsplat.studies.recorded import OVERRIDES
 
 log = logging.getLogger("heatsplat")
 
+SCORES = ("psnr", "mae_c")  # whose courses are compared
 # Options of the data that choose what is measured, beside the rule of the split, and those of a rule. What only training
 # sees, such as data.degrade, is not here.
 OF_MEASURED = ("noise_k", "only")
@@ -48,7 +50,7 @@ class Recipe(Runs):
 
     def seconds_to(self, name: str, level: float) -> float | None:
         """Mean seconds until a validation reaches a level of a score; None where a run never does."""
-        found = [seconds_to(course[name], level, higher=name == "psnr") for course in self.table["course"]]
+        found = [seconds_to(course[name], level, DEFINITIONS[name].higher) for course in self.table["course"]]
         return statistics.fmean(found) if found and None not in found else None
 
 
@@ -79,10 +81,10 @@ def find_runs(folders: Iterable[Path], clock: str = "train_seconds") -> pd.DataF
             courses.append(None)
     found["course"] = courses
     found = found[found["course"].notna()]
-    return found.assign(measured=[_measured(one.results.data, one.data) for one in found.itertuples()])
+    return found.assign(measured=[_conditions(one.results.data, one.data) for one in found.itertuples()])
 
 
-def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
+def _conditions(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, str]:
     """What tells the validation and test views of a run from others of a scene of this name; what is not known is left out.
 
     Args:
@@ -106,7 +108,7 @@ def _measured(found: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, 
 
 
 def _courses(path: Path, clock: str) -> dict[str, list[tuple[float, float]]]:
-    courses: dict[str, list[tuple[float, float]]] = {"psnr": [], "mae_c": []}
+    courses: dict[str, list[tuple[float, float]]] = {name: [] for name in SCORES}
     for row in read_csv(path):
         for name, course in courses.items():
             if row.get(name) is not None and row.get(clock) is not None:
@@ -124,7 +126,8 @@ def group(runs: pd.DataFrame) -> list[Recipe]:
     recipes = [Recipe(name, title, own) for (title, name), own in panels]
     for scene in {recipe.scene for recipe in recipes}:
         of_scene = [recipe for recipe in recipes if recipe.scene == scene]
-        for name, sign in (("psnr", 1.0), ("mae_c", -1.0)):
+        for name in SCORES:
+            sign = DEFINITIONS[name].sign
             points = {id(recipe): [(s, sign * value) for s, value in recipe.points(name)] for recipe in of_scene}
             for recipe in of_scene:
                 others = [point for other in of_scene if other is not recipe for point in points[id(other)]]

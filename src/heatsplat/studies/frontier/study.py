@@ -17,13 +17,14 @@ from typing import Any
 
 from heatsplat.contracts import SceneError, is_number
 from heatsplat.io.files import write_atomically
+from heatsplat.io.page import write_page
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import write_csv
-from heatsplat.studies.child_runs import spelled, trained
-from heatsplat.studies.frontier_report import markdown, page, picture, records
-from heatsplat.studies.frontier_runs import Recipe, find_runs, group
-from heatsplat.studies.options import filled, listed
+from heatsplat.studies.child_runs import spelled, train_or_read
+from heatsplat.studies.frontier.report import markdown, picture, records
+from heatsplat.studies.frontier.runs import Recipe, find_runs, group
+from heatsplat.studies.options import listed, non_empty
 
 log = logging.getLogger("heatsplat")
 
@@ -69,7 +70,7 @@ def run(
         runs = [] if methods else outputs
     folders = [Path(text).expanduser() for text in listed(runs)]
     for place, wanted in asked_for(methods, scenes, seeds, knobs):
-        trained(output_dir / "runs" / place, train, [*listed(overrides), *wanted], output_dir)
+        train_or_read(output_dir / "runs" / place, train, [*listed(overrides), *wanted], output_dir)
         folders = [*folders, output_dir / "runs" / place]
     found = find_runs(folders)
     if found.empty:
@@ -89,7 +90,7 @@ def run(
     write_csv(output_dir / "frontier.csv", records(recipes))
     text = markdown(recipes, levels)
     write_atomically(output_dir / "frontier.md", text)
-    write_atomically(output_dir / "frontier.html", page(recipes, levels, vector.getvalue()))
+    write_page(output_dir / "frontier.html", text)
     from torch.utils.tensorboard import SummaryWriter
 
     with SummaryWriter(str(output_dir / "tb")) as writer:
@@ -108,7 +109,7 @@ def asked_for(
     """Folder and overrides of every run that ``run`` trains. Raises SceneError where it is said of nothing."""
     if not methods:
         return []
-    jobs, scenes, seeds = [], filled("study.scenes", scenes), filled("study.seeds", seeds)
+    jobs, scenes, seeds = [], non_empty("study.scenes", scenes), non_empty("study.seeds", seeds)
     own = methods if isinstance(methods, Mapping) else dict.fromkeys(listed(methods))
     for method in own:
         grid = {**_grid("study.knobs", knobs), **_grid(f"study.methods.{method}", own[method])}
@@ -123,7 +124,7 @@ def _grid(key: str, knobs: Any) -> dict[str, list[Any]]:
     """Knobs and their values; none for null. Raises SceneError where one has no value."""
     if not isinstance(knobs, Mapping | None):
         raise SceneError(f"{key}={knobs}: give settings with their values, such as {{max_steps: [1000, 3000]}}")
-    return {name: filled(f"{key}.{name}", values) for name, values in (knobs or {}).items()}
+    return {name: non_empty(f"{key}.{name}", values) for name, values in (knobs or {}).items()}
 
 
 def checked_levels(name: str, levels: Any) -> list[float]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from heatsplat.callbacks.page import page, write_page
-from heatsplat.callbacks.report import _picture
+from heatsplat.callbacks.report_text import _picture
+from heatsplat.io.page import page, write_page
 
 TEXT = """# etgs on <b>
 
@@ -46,3 +46,8 @@ def test_pictures_are_found_whatever_they_are_called(tmp_path, name):
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / name)
     text = page(f"# run\n\n{_picture(tmp_path / name, tmp_path)}\n", tmp_path)
     assert text.count("<img") == 1 and f'alt="{html.escape(name[:-4])}"' in text and 'width="8"' in text
+
+
+def test_drawings_stay_drawings(tmp_path):
+    (tmp_path / "a.svg").write_text("<svg/>")
+    assert '<img src="data:image/svg+xml;base64,PHN2Zy8+" alt="drawn">' in page("# run\n\n![drawn](a.svg)\n", tmp_path)

@@ -18,12 +18,12 @@ from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.tables import write_csv
-from heatsplat.studies.child_runs import trained
+from heatsplat.studies.child_runs import train_or_read
 from heatsplat.studies.finished import settings_of
-from heatsplat.studies.frontier_runs import find_runs
-from heatsplat.studies.options import check_count, filled, listed
-from heatsplat.studies.time_to_accuracy_report import markdown, picture, records
-from heatsplat.studies.time_to_accuracy_runs import Panel, panels_of, without_length
+from heatsplat.studies.frontier.runs import find_runs
+from heatsplat.studies.options import check_count, listed, non_empty
+from heatsplat.studies.time_to_accuracy.report import markdown, picture, records
+from heatsplat.studies.time_to_accuracy.runs import Panel, panels_of, without_length
 
 log = logging.getLogger("heatsplat")
 
@@ -85,7 +85,7 @@ def run(
     there = {_identity(found, common) for found in known["overrides"]} if len(known) else set()
     for place, own in wanted:
         if _identity(as_dict(own), common) not in there:
-            trained(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
+            train_or_read(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
             folders = [*folders, output_dir / "runs" / place]
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
     panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common, (cases or {}).values())
@@ -113,7 +113,7 @@ def asked_for(
     """Folder and overrides of every run that the study needs. Raises SceneError as ``run`` does."""
     if not cases:
         return []
-    lengths, seeds = listed(lengths), filled("study.seeds", seeds)
+    lengths, seeds = listed(lengths), non_empty("study.seeds", seeds)
     for length in lengths:
         check_count("study.lengths", length)
     shorter = {f"standard_{length}": [*without_length(reference), f"max_steps={length}"] for length in lengths}

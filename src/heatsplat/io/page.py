@@ -77,15 +77,21 @@ def plain(text: str) -> str:
 
 
 def _embedded(path: Path, alternative: str) -> str:
-    """A picture with its content in it; stills as WebP, moving ones as they are."""
+    """A picture with its content in it; stills as WebP, moving ones and drawings (SVG) as they are."""
     if not path.exists():
         return ""
     content = path.read_bytes()
+    if path.suffix == ".svg":
+        return f'<img src="data:image/svg+xml;base64,{_base64(content)}" alt="{alternative}">'
     with Image.open(io.BytesIO(content)) as picture:
         width, height = picture.size
         if not getattr(picture, "is_animated", False):
             stored = io.BytesIO()
             picture.convert("RGB").save(stored, "WEBP", quality=QUALITY, method=2)
             content = stored.getvalue()
-    data = base64.b64encode(content).decode("ascii")
-    return f'<img src="data:image/webp;base64,{data}" alt="{alternative}" width="{width}" height="{height}">'
+    size = f'width="{width}" height="{height}"'
+    return f'<img src="data:image/webp;base64,{_base64(content)}" alt="{alternative}" {size}>'
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

@@ -12,8 +12,9 @@ from typing import Any
 import pandas as pd
 
 from heatsplat.io.command_lines import as_dict, key_of
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import PLACES, settings_of
-from heatsplat.studies.frontier_runs import panel_titles, seconds_to
+from heatsplat.studies.frontier.runs import panel_titles, seconds_to
 from heatsplat.studies.options import listed
 
 log = logging.getLogger("heatsplat")
@@ -71,7 +72,7 @@ class Panel:
 
     def level(self, score: str, last: float) -> float:
         """The worst value that is as good as ``last`` of the reference."""
-        return last - self.margins[score] if score == "psnr" else last + self.margins[score]
+        return last - DEFINITIONS[score].sign * self.margins[score]
 
     def standard(self, seed: str) -> list[Outcome]:
         """The standard runs of a seed in order of their seconds."""
@@ -89,7 +90,7 @@ class Panel:
             "time_ratio": one.seconds / reference.seconds, "gaussians_ratio": one.gaussians / reference.gaussians,
         }  # fmt: skip
         for score, value in one.scores.items():
-            higher, course = score == "psnr", reference.course[score]
+            higher, course = DEFINITIONS[score].higher, reference.course[score]
             found[f"{score}_off"] = value - reference.scores[score]
             level = self.level(score, course[-1][1]) if course else None
             way = own = None

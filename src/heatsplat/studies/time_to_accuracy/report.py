@@ -8,11 +8,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from heatsplat.io.pictures import literal
-from heatsplat.io.tables import NONE, markdown_table, number
-from heatsplat.studies.time_to_accuracy_runs import Outcome, Panel
+from heatsplat.io.pictures import literal, series_look
+from heatsplat.io.tables import NONE, markdown_table, over_seeds
+from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.studies.frontier.runs import SCORES
+from heatsplat.studies.time_to_accuracy.runs import Outcome, Panel
 
-LABELS = {"psnr": ("PSNR", "dB", 2), "mae_c": ("MAE", "°C", 3)}
 CLOCK_LABELS = {"train_seconds": "seconds of training", "cpu_seconds": "processor seconds of training"}
 
 
@@ -26,17 +27,15 @@ def named(panel: Panel, one: Outcome) -> str:
     )
 
 
-def _over_seeds(measures: Sequence[dict[str, float | None]], name: str, digits: int) -> str:
-    """Mean and standard deviation (n - 1); a dash where a run has none."""
+def _mean_and_spread(measures: Sequence[dict[str, float | None]], name: str, digits: int) -> str:
+    """Mean and standard deviation of a measure; a dash where a run has none."""
     values = [each.get(name) for each in measures]
-    if not values or None in values:
-        return NONE
-    return number(statistics.fmean(values), digits, statistics.stdev(values) if len(values) > 1 else None)
+    return NONE if None in values else over_seeds(values, digits)
 
 
 def _scores(panel: Panel) -> list[str]:
     """The scores that all runs of a panel have."""
-    return [score for score in LABELS if all(score in one.scores for one in panel.outcomes)]
+    return [score for score in SCORES if all(score in one.scores for one in panel.outcomes)]
 
 
 def ends(panel: Panel) -> list[str]:
@@ -44,8 +43,7 @@ def ends(panel: Panel) -> list[str]:
     scores = _scores(panel)
     head = ["recipe", "runs", "steps", "seconds", "of the reference's"]
     for score in scores:
-        label, unit, _ = LABELS[score]
-        head += [f"{label} ({unit})", "against the reference", "as good"]
+        head += [DEFINITIONS[score].heading, "against the reference", "as good"]
     head += ["Gaussians", "of the reference's"]
     rows = []
     for own in panel.groups():
@@ -59,16 +57,16 @@ def ends(panel: Panel) -> list[str]:
 
 def _end_cells(panel: Panel, own: Sequence[Outcome], scores: Sequence[str]) -> list[str]:
     measures = [panel.measures(one) for one in own]
-    cells = [_over_seeds(measures, "seconds", 1), _over_seeds(measures, "time_ratio", 2)]
+    cells = [_mean_and_spread(measures, "seconds", 1), _mean_and_spread(measures, "time_ratio", 2)]
     for score in scores:
-        digits = LABELS[score][2]
+        digits = DEFINITIONS[score].digits
         good = sum(each[f"end_{score}"] is not None for each in measures)
         cells += [
-            _over_seeds(measures, score, digits),
-            _over_seeds(measures, f"{score}_off", digits),
+            _mean_and_spread(measures, score, digits),
+            _mean_and_spread(measures, f"{score}_off", digits),
             f"{good} of {len(own)}",
         ]
-    return [*cells, _over_seeds(measures, "gaussians", 0), _over_seeds(measures, "gaussians_ratio", 2)]
+    return [*cells, _mean_and_spread(measures, "gaussians", 0), _mean_and_spread(measures, "gaussians_ratio", 2)]
 
 
 def times(panel: Panel, way: str) -> list[str]:
@@ -81,12 +79,16 @@ def times(panel: Panel, way: str) -> list[str]:
     scores = _scores(panel)
     head = ["recipe"]
     for score in scores:
-        head += [f"to its {LABELS[score][0]} (s)", "of the standard's time to it", "of the reference's whole time"]
+        head += [
+            f"to its {DEFINITIONS[score].title} (s)",
+            "of the standard's time to it",
+            "of the reference's whole time",
+        ]
     rows = []
     for own in panel.groups():
         measures = [panel.measures(one) for one in own]
         cells = [
-            _over_seeds(measures, f"{way}_{score}{suffix}", digits)
+            _mean_and_spread(measures, f"{way}_{score}{suffix}", digits)
             for score in scores
             for suffix, digits in (("", 1), ("_of_own", 2), ("_of_all", 2))
         ]
@@ -98,7 +100,7 @@ def markdown(panels: Sequence[Panel], clock: str) -> str:
     """The tables for people."""
     lines = [f"# Time to the reference's accuracy, {CLOCK_LABELS[clock]}", ""]
     for panel in panels:
-        margins = " and ".join(f"{panel.margins[score]:g} {LABELS[score][1]}" for score in _scores(panel))
+        margins = " and ".join(f"{panel.margins[score]:g} {DEFINITIONS[score].unit}" for score in _scores(panel))
         lines += [
             f"## {panel.title}", "", f"As good as the reference: within {margins} of it.", "",
             "Ends of whole runs, test views:", "", *ends(panel), "",
@@ -130,12 +132,14 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
     counts as good as it (means over the seeds).
     """
     names = sorted({one.recipe for panel in panels for one in panel.outcomes if one.recipe is not None})
-    looks = {name: (f"C{i % 10}", "s^Dv<>P"[i // 10 % 7]) for i, name in enumerate(names)} | {None: ("black", "o")}
+    looks = {name: series_look(i + 10) for i, name in enumerate(names)} | {
+        None: ("black", "o")
+    }  # circles: the standard's
     figure = Figure(figsize=(11, 4.4 * len(panels)), dpi=110, layout="constrained")
     for i, panel in enumerate(panels):
         scores = _scores(panel)
         for k, score in enumerate(scores):
-            axes = figure.add_subplot(len(panels), len(LABELS), len(LABELS) * i + k + 1)
+            axes = figure.add_subplot(len(panels), len(SCORES), len(SCORES) * i + k + 1)
             standard = []
             for own in panel.groups():
                 color, mark = looks[own[0].recipe]
@@ -155,8 +159,8 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
             last = statistics.fmean(one.scores[score] for one in panel.references.values())
             axes.axhline(last, color="black", linewidth=0.8, linestyle="--")
             axes.axhline(panel.level(score, last), color="black", linewidth=0.8, linestyle=":")
-            label, unit, _ = LABELS[score]
-            axes.set(xlabel=CLOCK_LABELS[clock], ylabel=f"{label} ({unit})", title=literal(panel.title), xscale="log")
+            label = DEFINITIONS[score].heading
+            axes.set(xlabel=CLOCK_LABELS[clock], ylabel=label, title=literal(panel.title), xscale="log")
             _near(axes, panel, score)
             axes.xaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.25, which="both")
@@ -168,7 +172,7 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
 def _near(axes: Any, panel: Panel, score: str) -> None:
     """Shows what lies near the ends; courses begin far from them, and a reset of opacities throws them back."""
     values = [one.scores[score] for one in panel.outcomes]
-    if score == "psnr":
+    if DEFINITIONS[score].higher:
         axes.set_ylim(min(values) - 6.0, max(values) + 1.0)
     else:
         axes.set_ylim(0.7 * min(values), 3.0 * max(values))

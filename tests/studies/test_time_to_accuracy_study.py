@@ -10,9 +10,9 @@ from heatsplat import cli
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
-from heatsplat.studies import time_to_accuracy
-from heatsplat.studies.time_to_accuracy import run
-from heatsplat.studies.time_to_accuracy_runs import Outcome
+from heatsplat.studies.time_to_accuracy import study as time_to_accuracy
+from heatsplat.studies.time_to_accuracy.runs import Outcome
+from heatsplat.studies.time_to_accuracy.study import run
 
 CONFIG = Path(cli.CONF) / "study" / "time_to_accuracy.yaml"
 REFERENCE, RECIPES = ["max_steps=800"], {"quick": ["preset=fast"]}
@@ -181,7 +181,7 @@ def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monk
         steps = next((int(text[10:]) for text in overrides if text.startswith("max_steps=")), 200)
         made(place, chosen, steps, steps / 10, 40.0)
 
-    monkeypatch.setattr(time_to_accuracy, "trained", train)
+    monkeypatch.setattr(time_to_accuracy, "train_or_read", train)
     (panel,) = run(
         tmp_path / "out", str(runs), REFERENCE, RECIPES | {"other": ["density=proximity", "max_steps=200"]},
         cases={"case": ["method=etgs", "data.scene=heated"]}, lengths=[100, 300, 400], seeds=[0, 2],
@@ -207,7 +207,7 @@ def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp
         steps = 800 if "max_steps=800" in overrides else 200
         made(place, own, steps, steps / 10, 41.0 if "thermal.frequencies=8" in overrides else 40.0)
 
-    monkeypatch.setattr(time_to_accuracy, "trained", train)
+    monkeypatch.setattr(time_to_accuracy, "train_or_read", train)
     scene = ["method=etgs", "data.scene=heated"]
     cases = {
         "plain": scene,

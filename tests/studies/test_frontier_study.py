@@ -14,9 +14,9 @@ from running import compose_run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
-from heatsplat.studies import frontier
-from heatsplat.studies.frontier import asked_for, run
-from heatsplat.studies.frontier_runs import dominated, find_runs, group, seconds_to
+from heatsplat.studies.frontier import study as frontier
+from heatsplat.studies.frontier.runs import dominated, find_runs, group, seconds_to
+from heatsplat.studies.frontier.study import asked_for, run
 
 CONFIG = Path(cli.CONF) / "study" / "frontier.yaml"
 LEVELS = {"psnr_levels_db": [25, 30], "mae_levels_c": [15, 10]}
@@ -97,7 +97,7 @@ def test_tables_pictures_and_a_page_that_needs_nothing_else(runs, tmp_path):
     assert [row["on_front"] for row in ends[:3]] == ["False", "False", ""] and ends[2]["value"] == "700.0"
     assert sum(row["views"] == "validation" for row in rows) == 2 * (3 + 3 + 2 + 2)
     page = (tmp_path / "out" / "frontier.html").read_text()
-    assert "data:image/svg+xml;base64," in page and not re.search(r'(?:src|href)="(?!data:)', page)
+    assert "data:image/svg+xml;base64," in page and not re.search(r'(?:src|href)="(?!data:|#)', page)
     assert (tmp_path / "out" / "frontier.png").stat().st_size > 10_000 and list((tmp_path / "out" / "tb").iterdir())
 
 
@@ -217,7 +217,7 @@ def test_a_word_or_number_is_a_list_of_one():
     ],
 )
 def test_what_would_train_nothing_is_refused(wrong, message, tmp_path, monkeypatch):
-    monkeypatch.setattr(frontier, "trained", None)
+    monkeypatch.setattr(frontier, "train_or_read", None)
     options = {"methods": ["3dgs"], "scenes": ["heated"], "seeds": [0], "knobs": None} | wrong
     with pytest.raises(SceneError, match=message):
         run(tmp_path / "out", None, **LEVELS, **options)
@@ -277,7 +277,7 @@ def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monke
             settings = [text for text in overrides if not text.startswith("method=")]
             made(place, overrides[1].partition("=")[2], settings, [(1, 20), (3, 28)], 5.0, 30.0 + len(asked))
 
-    monkeypatch.setattr(frontier, "trained", trained)
+    monkeypatch.setattr(frontier, "train_or_read", trained)
     options = {
         "methods": {"etgs": {"thermal.frequencies": [8, 24]}, "3dgs": {}},
         "scenes": ["heated", "cooling"],

@@ -1,0 +1,199 @@
+"""report.md: what a run found, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from heatsplat.callbacks.attributes import LEARNED_FILE
+from heatsplat.callbacks.courses import COURSES_PICTURE
+from heatsplat.callbacks.metrics import TEST_FILE
+from heatsplat.callbacks.probes import PROBES_PICTURE
+from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
+from heatsplat.callbacks.turntable import TURNTABLE_FILE
+from heatsplat.io.citations import citations
+from heatsplat.io.page import plain
+from heatsplat.io.results import CURVE_FILE, RunResults
+from heatsplat.io.tables import NONE, markdown_table, read_csv
+from heatsplat.metrics.definitions import described
+from heatsplat.viewer.page import FILE as VIEWER_FILE
+
+
+def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None) -> str:
+    """The whole report: scores beside cost, the course, pictures by relative path, what was found and learned, data, versions.
+
+    What other callbacks did not leave in the folder is left out.
+    """
+    content = results.as_json()
+    run, reasons = content["run"], content["reasons"]
+    lines = [f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}", ""]
+    pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
+    table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
+    lines += ["## Scores and cost", "", *table]
+    missing: dict[str, list[str]] = {}
+    for name in (f"{part}.{score}" for part in ("test", "cost") for score in content[part]):
+        if name in reasons:
+            missing.setdefault(reasons[name], []).append(f"`{name}`")
+    if missing:
+        lines += ["", "Not available:", "", *(f"- {', '.join(names)}: {reason}" for reason, names in missing.items())]
+    if (folder / VIEWER_FILE).exists():
+        lines += ["", f"Interactive 3D view with temperatures: [{VIEWER_FILE}]({VIEWER_FILE})."]
+    if pictures:
+        lines += ["", "## Test views", ""]
+        for path in pictures:
+            lines += [_picture(path, folder), ""]
+        if (folder / TEST_FILE).exists():
+            lines.append(f"Scores of each test image: [{TEST_FILE}]({TEST_FILE}).")
+    lines += _picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning")
+    if curves is not None:
+        lines += ["", "## Quality over training time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
+        lines += ["", f"Values: [{CURVE_FILE}]({CURVE_FILE})."]
+    lines += _picture_section("Temperature over time", folder, PROBES_PICTURE, "probes")
+    lines += _picture_section("What all surfaces or images share over time", folder, COURSES_PICTURE, "learned courses")
+    lines += _surfaces_section(folder)
+    lines += learned_section(folder)
+    lines += ["", "## The run", "", *_bullets(run)]
+    lines += _effects_section(content["effects"])
+    lines += ["", "## Data: findings and assumptions", "", *_bullets(content["data"])]
+    lines += ["", "## Definitions of the scores", "", *_bullets(content["definitions"])]
+    lines += ["", "## Versions", "", *_bullets(content["versions"])]
+    if entries := citations(run.get("method")):
+        lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
+    return "\n".join([*lines, ""])
+
+
+def _picture(path: Path, folder: Path, alternative: str | None = None) -> str:
+    """A picture in Markdown, whatever its file is called: images may be named as a camera or a person liked."""
+    words = plain(path.stem) if alternative is None else alternative
+    return f"![{words}]({quote(path.relative_to(folder).as_posix())})"
+
+
+def _picture_section(title: str, folder: Path, name: str, alternative: str) -> list[str]:
+    return ["", f"## {title}", "", f"![{alternative}]({name})"] if (folder / name).exists() else []
+
+
+def _surfaces_section(folder: Path) -> list[str]:
+    """Hottest and coldest surfaces (``callbacks.surfaces``)."""
+    if not (folder / SURFACES_FILE).exists():
+        return []
+    found = read_csv(folder / SURFACES_FILE)
+    rows = [
+        (
+            f"{row['kind'][0].upper()}{row['number']:.0f}",
+            f"{row['mean_c']:.1f} °C",
+            f"{row['most_c']:.1f} °C",
+            f"{row['area']:g} {row['unit']}",
+            ", ".join(f"{row[axis]:.2f}" for axis in "xyz"),
+        )
+        for row in found
+    ]
+    moment = found[0]["time_s"]
+    when = "" if moment is None else f", {moment:.6g} s after the first training frame"
+    note = (
+        f"Connected surfaces seen by training views, as rendered by the model{when}: H the hottest, C the coldest. "
+        "Centres are in scene coordinates. What has no texture and is seen at a flat angle, such as bare ground, may lie less "
+        f"deep than it is shown. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
+    )
+    table = markdown_table(("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z"), rows, "lrrrr")
+    picture = [f"![numbered surfaces]({SURFACES_PICTURE})", ""] if (folder / SURFACES_PICTURE).exists() else []
+    return ["", "## Hottest and coldest surfaces", "", *picture, *table, "", note]
+
+
+def learned_section(folder: Path) -> list[str]:
+    """What the Gaussians have beside their temperature (``callbacks.attributes``)."""
+    found = read_csv(folder / LEARNED_FILE) if (folder / LEARNED_FILE).exists() else []
+    if not found:
+        return []
+    known = any(row["deviation"] for row in found)
+    rows = []
+    for row in found:
+        told = [row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}"]
+        told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
+        rows.append((*told, row["unit"] or ""))
+    note = (
+        "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
+        "uncertainty of a "
+        + ("value, which is the median standard deviation of one Gaussian. " if known else
+           "value, which `evaluate.py callbacks=uncertainty` estimates. ")
+        + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
+    )  # fmt: skip
+    pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
+    maps = [_picture(path, folder, "maps of learned quantities") for path in pictures]
+    heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit")
+    table = markdown_table(heads, rows, "l" + "r" * (len(heads) - 2) + "l")
+    return ["", "## Learned quantities", "", *table, "", note, "", *maps]
+
+
+EFFECTS_NOTE = (
+    "An effect is simulated if its statistic exceeds the threshold and the images can show it. There is no number if the effect "
+    "was set by hand or the data are not sufficient. dB: gain on held-out observations. An effect that is off is absent: no "
+    "parameter, no operation. Parameters: of the Gaussians at the end. ms per step: difference of whole training steps on the "
+    "initial Gaussians with all effects and without this one (and those that depend on it), alternating, fastest of each; a few "
+    "hundredths are noise."
+)
+
+
+def _effects_section(effects: Mapping[str, Any]) -> list[str]:
+    """A table where a scene chose the effects, a list where the method did."""
+    if not any("reason" in effect for effect in effects.values()):
+        simulated = {
+            name: {key: value for key, value in effect.items() if key != "on"} for name, effect in effects.items()
+        }
+        return ["", "## Simulated effects", "", *(_bullets(simulated) or ["None."])]
+    settings = {name: effect["settings"] for name, effect in effects.items() if effect.get("settings")}
+    return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_bullets(settings)]
+
+
+def effects_table(effects: Mapping[str, Any]) -> list[str]:
+    """Lines of a Markdown table of ``describe_effects``: what is simulated, why, and what it costs."""
+    rows = []
+    for name, effect in effects.items():
+        statistic, threshold, parameters, milliseconds = (
+            NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
+            for key in ("statistic", "threshold", "parameters", "ms_per_step")
+        )
+        sure = "**yes**" if effect["on"] else "no"
+        on = sure if effect["told"] else "yes, but cannot be told" if effect["on"] else "cannot be told"
+        gain, cost = effect["gain_db"], effect["ms_per_step"]
+        gains = (NONE if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else NONE)
+        rows.append((name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds))
+    head = ("effect", "simulated", "statistic", "threshold", "dB", "dB per ms", "reason", "parameters", "ms per step")
+    return markdown_table(head, rows, align="llrrrrlrr")
+
+
+def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
+    """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
+    cells = []
+    for name, value in content[section].items():
+        unit = quantity.unit if (quantity := described(name)) is not None else ""
+        cells.append((name, NONE if value is None else f"{_number(value)} {unit}".rstrip()))
+    return cells
+
+
+def _number(value: float) -> str:
+    """Four significant digits, and whole numbers as they are."""
+    if float(value).is_integer() or abs(value) >= 1e4:
+        return f"{value:,.0f}"
+    return f"{value:.4g}"
+
+
+def _bullets(values: Mapping[str, Any]) -> list[str]:
+    """A list of names and values for Markdown, one level of nesting in line."""
+    lines = []
+    for name, value in values.items():
+        nested = isinstance(value, Mapping)
+        words = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on" if nested else _words(value)
+        lines.append(f"- {name}: {words}")
+    return lines
+
+
+def _words(value: Any) -> str:
+    """A value for people, in Markdown: lists with commas, floats with six digits, a dash for nothing."""
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_words(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return NONE if value is None else plain(str(value))

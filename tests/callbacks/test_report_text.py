@@ -1,0 +1,23 @@
+"""What the report says, as text and on the screen."""
+
+import html
+
+from heatsplat.callbacks.report import show
+from heatsplat.callbacks.report_text import markdown
+from heatsplat.io.page import page
+from heatsplat.io.results import RunResults
+
+
+def test_names_are_shown_as_they_are(tmp_path, capsys):
+    name = "*hall* [new](x) __b__ outdoor_true <b>q<b> &amp; :fire: #"
+    results = RunResults(run={"method": "etgs", "scene": name}, data={"images": {"first": "[z](y)_1"}})
+    (tmp_path / "[old]").mkdir()
+    text = markdown(results, tmp_path, [], None)
+    shown = html.escape(name)
+    written = page(text, tmp_path)
+    assert f"<title>etgs on {shown}</title>" in written and f"<h1>etgs on {shown}</h1>" in written
+    assert f"<li>scene: {shown}</li>" in written and "<li>images: first [z](y)_1</li>" in written
+    assert "outdoor_true" in text  # no backslash where none is needed
+    show(results, tmp_path / "[old]", tmp_path / "[old]" / "a [b].png")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "[new](x)" in said and ":fire:" in said and "[old]/report.md" in said and "a [b].png" in said
