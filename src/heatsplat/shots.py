@@ -17,7 +17,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_coun
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, compose, image_panel, write_figure, write_png
-from heatsplat.io.quantities import moment
+from heatsplat.io.quantities import Clock, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
 
@@ -101,9 +101,13 @@ def checked_unseen(name: str, value: str | float) -> str:
     return word
 
 
-def utc_at_zero_of(scene: SceneData) -> float | None:
-    """Seconds since 1970 UTC at the scene's second 0, where its record of the weather knows; else None."""
-    return None if scene.weather is None else scene.weather.notes.get("utc_at_zero_s")
+def clock_of(scene: SceneData) -> Clock | None:
+    """The clock of the record: that of the weather, or of the camera (``notes["clock_at_zero_s"]``); None where none is known."""
+    if scene.weather is not None:
+        known = scene.weather.notes.get("utc_at_zero_s")
+        return None if known is None else Clock(known)
+    known = scene.notes.get("clock_at_zero_s")
+    return None if known is None else Clock(known, zone="")
 
 
 def first_free_id(scene: SceneData) -> int:
@@ -284,14 +288,14 @@ def write_shot(
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     bar = Bar(low, high, "°C" if bounds else "")
     stems = _stems([frame.name for frame in frames])
-    utc_at_zero = utc_at_zero_of(scene)
+    clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []
     with files.videos:
         for frame, (shown, seen) in zip(frames, images, strict=True):
             stem, share = stems[frame.name], 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
-            title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s, utc_at_zero)}"
+            title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s, clock)}"
             limits = [f"prediction, {moment(beyond)} beyond the record"] if beyond else []
             limits += [f"{100 * share:.0f} % seen"] if share < 0.995 else []
             panels = []

@@ -262,7 +262,7 @@ def test_the_table_of_probes_has_the_clock_and_places(tmp_path):
         trainer(tmp_path, [TemperatureCurves(times=4)], logger=False),
     )
     rows = read_csv(tmp_path / "renders" / "probes.csv")
-    assert [row["utc"] for row in rows[:2]] == ["2024-08-06 17:34:49 UTC", "2024-08-06 17:38:09 UTC"]
+    assert [row["clock"] for row in rows[:2]] == ["2024-08-06 17:34:49 UTC", "2024-08-06 17:38:09 UTC"]
     places = read_csv(tmp_path / "renders" / "probe_positions.csv")
     assert [[row[axis] for axis in "xyz"] for row in places] == [[-0.5, 0.0, 4.0], [0.5, pytest.approx(0.2), 4.0]]
     assert [row["name"] for row in places] == ["probe 1", "probe 2"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heatsplat.io.quantities import clock, impossible, moment, words_and_unit
+from heatsplat.io.quantities import Clock, impossible, moment, words_and_unit
 
 
 def test_the_longest_suffix_is_the_unit():
@@ -18,8 +18,8 @@ def test_times_are_told_in_the_unit_that_suits_them():
 
 
 def test_the_clock_stands_beside_a_time_where_it_is_known():
-    assert moment(39743.4, 1722965689.0) == "11.04 h (2024-08-07 04:37 UTC)"
-    assert clock(1722965689.0, "seconds") == "2024-08-06 17:34:49 UTC"
+    assert moment(39743.4, Clock(1722965689.0)) == "11.04 h (2024-08-07 04:37 UTC)"
+    assert Clock(1722965689.0, zone="").at(0.0, "seconds") == "2024-08-06 17:34:49"
 
 
 def test_shares_beyond_what_is_possible_are_told():

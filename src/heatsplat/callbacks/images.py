@@ -25,7 +25,7 @@ from heatsplat.io.pictures import (
 from heatsplat.io.quantities import moment
 from heatsplat.metrics.mae import mae_c
 from heatsplat.metrics.psnr import psnr
-from heatsplat.shots import utc_at_zero_of
+from heatsplat.shots import clock_of
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
 RANGE_PIXELS = 20_000  # of each of them, at most, and of each test view for the ends of the errors
@@ -140,7 +140,7 @@ def panels(
     thermal_range = scene.range_of(modality)
     title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
     if view.frame.time_s is not None:
-        title.append(f"t = {moment(view.frame.time_s, utc_at_zero_of(scene))}")
+        title.append(f"t = {moment(view.frame.time_s, clock_of(scene))}")
     scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
     if thermal_range is not None and target.shape[-1] == 1:
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))

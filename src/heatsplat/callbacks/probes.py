@@ -14,9 +14,9 @@ from torch import Tensor
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, write_png
-from heatsplat.io.quantities import clock, time_unit
+from heatsplat.io.quantities import time_unit
 from heatsplat.io.tables import write_csv
-from heatsplat.shots import utc_at_zero_of
+from heatsplat.shots import clock_of
 
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
 OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
@@ -44,7 +44,7 @@ class TemperatureCurves(pl.Callback):
     all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
     of the probe, each from its own camera. Probes are the scene's, or points of its cloud spread over the image. Models
     that know no time, and scenes without times, have no curves. Moments beyond the training record, of test views, are
-    shaded and counted in the table's column "beyond_record_s"; where the weather's record knows the clock, so does the table.
+    shaded and counted in the table's column "beyond_record_s"; where the clock of the record is known, the table has it.
 
     Args:
         count: how many probes to draw at most.
@@ -87,8 +87,8 @@ class TemperatureCurves(pl.Callback):
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
         names = [probe.name for probe in self._probes]
         title = f"{scene.name}, step {step}"
-        utc = utc_at_zero_of(scene)
-        title += "" if utc is None else f", 0 is {clock(utc)}"
+        clock = clock_of(scene)
+        title += "" if clock is None else f", 0 is {clock.at(0.0)}"
         record = min(scene.train.times_s), max(scene.train.times_s)
         picture = figure_picture(_figure(times.numpy(), record, names, model, truth, dots, unit, title))
         png = write_png(module.output_dir / "renders" / "probes.png", picture)
@@ -117,10 +117,10 @@ class TemperatureCurves(pl.Callback):
         columns += [] if truth is None else [f"truth of {name}" for name in names]
         stacked = np.concatenate([[times, beyond], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
-        utc = utc_at_zero_of(module.scene)
-        if utc is not None:
-            columns.insert(1, "utc")
-            rows = [row | {"utc": clock(utc + row["time_s"], "seconds")} for row in rows]
+        clock = clock_of(module.scene)
+        if clock is not None:
+            columns.insert(1, "clock")
+            rows = [row | {"clock": clock.at(row["time_s"], "seconds")} for row in rows]
         write_csv(module.output_dir / "renders" / "probes.csv", rows, columns)
 
     def _write_positions(self, module: pl.LightningModule) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
@@ -63,18 +64,26 @@ def time_unit(span_s: float) -> tuple[float, str]:
     return next((unit_s, sign) for least, unit_s, sign in TIME_UNITS if span_s >= least)
 
 
-def moment(time_s: float, utc_at_zero_s: float | None = None) -> str:
-    """A time of a record for people, such as "90.0 s" or "24.14 h (2024-08-07 09:12 UTC)".
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a record.
 
     Args:
-        time_s: seconds since the record's second 0.
-        utc_at_zero_s: seconds since 1970 UTC at that second, where they are known.
+        at_zero_s: what it shows at the record's second 0, in seconds since 1970.
+        zone: "UTC", or empty for a camera's own clock, whose zone is not known.
     """
+
+    at_zero_s: float
+    zone: str = "UTC"
+
+    def at(self, time_s: float, to: str = "minutes") -> str:
+        """What it shows at a time of the record, such as "2024-08-07 09:12 UTC"; with ``to`` "seconds", to these."""
+        shown = datetime.fromtimestamp(self.at_zero_s + time_s, UTC).replace(tzinfo=None)
+        return f"{shown.isoformat(' ', to)} {self.zone}".rstrip()
+
+
+def moment(time_s: float, clock: Clock | None = None) -> str:
+    """A time of a record for people, such as "90.0 s", or "24.14 h (2024-08-07 09:12 UTC)" where its clock is known."""
     unit_s, sign = time_unit(abs(time_s))
     told = f"{time_s / unit_s:.{1 if unit_s < 3600.0 else 2}f} {sign}"
-    return told if utc_at_zero_s is None else f"{told} ({clock(utc_at_zero_s + time_s)})"
-
-
-def clock(utc_s: float, to: str = "minutes") -> str:
-    """Seconds since 1970 UTC as "2024-08-07 09:12 UTC", or to seconds."""
-    return f"{datetime.fromtimestamp(utc_s, UTC).replace(tzinfo=None).isoformat(' ', to)} UTC"
+    return told if clock is None else f"{told} ({clock.at(time_s)})"
