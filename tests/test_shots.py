@@ -11,8 +11,9 @@ import torch
 from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import SceneError, View, ViewSet
+from heatsplat.io.quantities import Clock
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import ShotFiles, checked_unseen, shot_frames, sightings, warn_beyond_record, write_shot
+from heatsplat.shots import ShotFiles, checked_unseen, clock_of, shot_frames, sightings, warn_beyond_record, write_shot
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
@@ -65,10 +66,42 @@ def test_every_image_of_a_frame_has_files_of_its_own_and_one_range(tmp_path):
     assert all(path.stat().st_size for path in written)
     clean = [read_temperature(path) for path in sorted(tmp_path.glob("tiff_clean/*"))]
     assert np.allclose(clean[1] - clean[0], scene.thermal_range.span_k / 10, atol=1e-4)
-    one, other = (cv2.imread(str(tmp_path / f"{kind}/view_0001.png")) for kind in ("png", "png_clean"))
-    assert (one[40:] == other[40:]).all()  # 0.5 has one colour in both; the titles differ
-    first, second = (cv2.imread(str(tmp_path / f"png_clean/view_000{i}.png")) for i in range(2))
-    assert not (first[40:] == second[40:]).all()
+    one, other = (cv2.imread(str(tmp_path / f"{kind}/0_0001.png")) for kind in ("png", "png_clean"))
+    assert (one[60:] == other[60:]).all()  # 0.5 has one colour in both; the titles differ
+    first, second = (cv2.imread(str(tmp_path / f"png_clean/0_000{i}.png")) for i in range(2))
+    assert not (first[60:] == second[60:]).all()
+
+
+def test_a_still_shows_the_moment_of_its_view_and_a_film_the_record():
+    scene = make_scene()
+    taken = scene.train.frames[1]
+    (still,) = shot_frames(scene, "view", None, 1, 1)
+    assert still.time_s == taken.time_s == 7200.0
+    film = shot_frames(scene, "view", None, 1, 3)
+    assert [film[0].time_s, film[-1].time_s] == [min(scene.train.times_s), max(scene.train.times_s)]
+    assert [frame.name for frame in film] == [taken.name.replace(".", f"_000{i}.") for i in range(3)]
+    assert shot_frames(scene, "view", 5.0, 1, 1)[0].time_s == 5.0
+
+
+def test_the_clock_is_that_of_the_weather_or_of_the_camera():
+    scene = replace(make_scene(), notes={"clock_at_zero_s": 5.0})
+    assert clock_of(scene) is None  # whose weather counts from some zero of its own
+    assert clock_of(replace(scene, weather=None)) == Clock(5.0, zone="")
+    assert clock_of(replace(scene, weather=replace(scene.weather, notes={"utc_at_zero_s": 7.0}))) == Clock(7.0)
+
+
+def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
+    scene = make_scene()
+    weather = replace(scene.weather, notes={"utc_at_zero_s": 1722965689.0})
+    scene = replace(scene, weather=weather)
+    frames = shot_frames(scene, "view", 3600.0, 0, 1)
+    camera = frames[0].camera
+    images = [({"recorded": torch.full((camera.height, camera.width, 1), 0.5)}, None)]
+    write_shot(images, frames, scene, ShotFiles(tmp_path, video=False, figures="svg"), range_c=[-5.0, 5.0])
+    (figure,) = tmp_path.glob("figures/*.svg")
+    svg = figure.read_text()
+    assert "0_0000   60.0 min (2024-08-06 18:34 UTC)" in svg
+    assert "recorded · 100 % above 5 °C" in svg
 
 
 def test_moments_beyond_the_record_are_told_apart():

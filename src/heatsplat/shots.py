@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_coun
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, compose, image_panel, write_figure, write_png
-from heatsplat.io.quantities import moment
+from heatsplat.io.quantities import Clock, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
 
@@ -43,7 +43,8 @@ def shot_frames(
         trajectory: "orbit" around the scene, "path" smoothly through the training cameras, "test" or "train" as taken,
             or "view", one camera that stands still.
         time: seconds since the first training frame; [start, end] lets time pass over the shot; None takes the time of
-            each view (test, train), the whole record (view) or its middle (orbit, path).
+            each view (test, train), the whole record (view; for a single frame when the view was taken) or its middle (orbit,
+            path).
         view: for "view": position among the training frames, or file name.
         count: frames of "orbit", "path" and "view".
 
@@ -51,19 +52,24 @@ def shot_frames(
         SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
     """
     check_shot(trajectory, time, view, count)
+    first_free = first_free_id(scene)
     if trajectory in ("test", "train"):
         taken = getattr(scene, trajectory).frames
         moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
         return [at_time(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
-    cameras = _cameras(scene, trajectory, view, count)
-    if time is None:
+    name = PurePosixPath(trajectory)
+    if trajectory == "view":
+        still = viewed(scene, view)
+        cameras, name = trajectories.fixed_view(still.camera, count), PurePosixPath(still.name)
         record = [t for t in scene.train.times_s if t is not None]
-        if record:
-            time = (min(record), max(record)) if trajectory == "view" else scene.middle_s
+        if time is None and record:
+            time = still.time_s if count == 1 else (min(record), max(record))
+    else:
+        cameras = _moving(scene, trajectory, count)
+        time = scene.middle_s if time is None else time
     moments = [None] * count if time is None else _moments(time, count)
-    first_free = first_free_id(scene)
     return [
-        at_time(scene, Frame(f"{trajectory}_{i:04d}", first_free + i, camera), moment)
+        at_time(scene, Frame(str(name.with_stem(f"{name.stem}_{i:04d}")), first_free + i, camera), moment)
         for i, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
     ]
 
@@ -95,6 +101,15 @@ def checked_unseen(name: str, value: str | float) -> str:
     return word
 
 
+def clock_of(scene: SceneData) -> Clock | None:
+    """The clock of the record: that of the weather, or of the camera (``notes["clock_at_zero_s"]``); None where none is known."""
+    if scene.weather is not None:
+        known = scene.weather.notes.get("utc_at_zero_s")
+        return None if known is None else Clock(known)
+    known = scene.notes.get("clock_at_zero_s")
+    return None if known is None else Clock(known, zone="")
+
+
 def first_free_id(scene: SceneData) -> int:
     """The first ``frame_id`` that no frame of the scene has."""
     return 1 + max(frame.frame_id for frame in scene.frames)
@@ -107,27 +122,31 @@ def at_time(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
     return replace(frame, time_s=moment, environment=None if moment is None else scene.weather.at(moment))
 
 
-def _cameras(scene: SceneData, trajectory: str, view: int | str, count: int) -> list[Camera]:
+def _moving(scene: SceneData, trajectory: str, count: int) -> list[Camera]:
     taken = [frame.camera for frame in scene.train.frames]
-    if trajectory == "orbit":
-        try:
-            return trajectories.orbit(taken, count)
-        except ValueError as error:
-            raise SceneError(str(error)) from error
     if trajectory == "path":
         return trajectories.interpolate(taken, count)
+    try:
+        return trajectories.orbit(taken, count)
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+
+
+def viewed(scene: SceneData, view: int | str) -> Frame:
+    """A training frame by its position or file name. Raises SceneError where there is none, or several have the name."""
+    taken = scene.train.frames
     if isinstance(view, str) and not view.lstrip("-").isdigit():
-        names = [frame.name for frame in scene.train.frames]
+        names = [frame.name for frame in taken]
         alike = [i for i, name in enumerate(names) if Path(name).name == Path(view).name]
         found = [names.index(view)] if view in names else alike
         if not found:
             raise SceneError(f"view '{view}' is no training frame; there are {', '.join(names[:8])} ...")
         if len(found) > 1:
             raise SceneError(f"view '{view}' may be {', '.join(names[i] for i in found)}: name it with its folder")
-        return trajectories.fixed_view(taken[found[0]], count)
+        return taken[found[0]]
     if not -len(taken) <= int(view) < len(taken):
         raise SceneError(f"view {view} does not exist: scene '{scene.name}' has training frames 0 to {len(taken) - 1}")
-    return trajectories.fixed_view(taken[int(view)], count)
+    return taken[int(view)]
 
 
 def _moments(time: float | Sequence[float], count: int) -> list[float]:
@@ -211,12 +230,12 @@ class ShotFiles:
         if self.tiff:
             write_temperature(self.add(f"tiff{suffix}/{stem}.tiff"), values)
 
-    def add_picture(self, suffix: str, stem: str, panel: Panel, moving: bool = True) -> None:
-        """Writes a picture of a frame, and adds it to its video where it is ``moving``."""
+    def add_picture(self, suffix: str, stem: str, panel: Panel, title: str, moving: bool = True) -> None:
+        """Writes a picture of a frame under a title, and adds it to its video where it is ``moving``."""
         filmed = self.video and moving
         if not (self.png or filmed):
             return
-        picture = compose([panel])
+        picture = compose([panel], title)
         if self.png:
             write_png(self.add(f"png{suffix}/{stem}.png"), picture)
         if filmed:
@@ -269,15 +288,16 @@ def write_shot(
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     bar = Bar(low, high, "°C" if bounds else "")
     stems = _stems([frame.name for frame in frames])
+    clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []
     with files.videos:
         for frame, (shown, seen) in zip(frames, images, strict=True):
             stem, share = stems[frame.name], 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
-            title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s)}"
-            title += f"   {share:.0%} seen" if share < 0.995 else ""
-            title += f"   prediction, {beyond:.0f} s beyond the record" if beyond else ""
+            title = stem if frame.time_s is None else f"{stem}   {moment(frame.time_s, clock)}"
+            limits = [f"prediction, {moment(beyond)} beyond the record"] if beyond else []
+            limits += [f"{100 * share:.0f} % seen"] if share < 0.995 else []
             panels = []
             for number, (name, image) in enumerate(shown.items()):
                 suffix = f"_{name}" if number else ""
@@ -285,17 +305,20 @@ def write_shot(
                 panels.append(image_panel(values, name, bar, bounds))
                 if image.shape[-1] == 1:
                     files.add_values(suffix, stem, (bounds.to_celsius(values) if bounds else values)[..., 0])
-                titled = replace(panels[-1], title=f"{title}   {name}" if number else title)
-                files.add_picture(suffix, stem, titled)
+                files.add_picture(suffix, stem, _with(panels[-1], limits), title)
             if deviation is not None:
                 spread = deviation(frame)
                 panels.append(image_panel(spread[..., None], "uncertainty", Bar(0.0, widest, bar.unit, DEVIATION)))
                 files.add_values("_uncertainty", stem, spread)
-                titled = replace(panels[-1], title=f"{title}   uncertainty")
-                files.add_picture("_uncertainty", stem, titled, moving=False)
-            files.add_figure(stem, panels, title)
+                files.add_picture("_uncertainty", stem, _with(panels[-1], limits), title, moving=False)
+            files.add_figure(stem, panels, "   ".join([title, *limits]))
     _write_table(files.add("frames.csv"), rows)
     return files.written
+
+
+def _with(panel: Panel, limits: Sequence[str]) -> Panel:
+    """A panel whose title says after its own words what limits what it shows."""
+    return replace(panel, title=" · ".join([panel.title, *limits]))
 
 
 def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, float]]) -> None:

@@ -18,7 +18,7 @@ from heatsplat.callbacks.attributes import (
 )
 from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.callbacks.report_text import learned_section
-from heatsplat.contracts import ViewSet
+from heatsplat.contracts import Environment, ViewSet
 from heatsplat.io.pictures import UNKNOWN
 from heatsplat.io.tables import read_csv
 
@@ -52,6 +52,37 @@ def test_the_picture_shows_each_map_beside_its_bar(tmp_path):
     assert grey.sum() >= 5 * factor * WIDTH * factor  # what is not known
     colors = np.unique(picture.reshape(-1, 3), axis=0)
     assert len(colors) > 200  # the ramp runs through the whole map
+
+
+def drawn(monkeypatch, maps):
+    """Panels and columns of the picture of some maps."""
+    found = []
+    monkeypatch.setattr(attributes, "compose", lambda panels, title, columns: found.append((panels, columns)))
+    attribute_picture(SimpleNamespace(attribute_maps=lambda frame: maps), wall().test.frames[0])
+    return found[0]
+
+
+def test_a_constant_is_a_number_and_names_are_words(tmp_path, monkeypatch):
+    flat = 0.4312936 + 2e-7 * torch.rand(HEIGHT, WIDTH)
+    ramp = torch.linspace(5.0, 9.0, WIDTH).expand(HEIGHT, WIDTH)
+    maps = {"core_coupling": flat, "convection_w_m2_k": ramp, "mean_surface_c": flat + 11, "sun": torch.nan * flat}
+    shown, columns = drawn(monkeypatch, maps)
+    assert [panel.title for panel in shown] == ["core coupling", "convection", "mean surface", "sun"]
+    texts = ["0.4313 everywhere", "", "11.43 °C everywhere", "known nowhere"]
+    assert [panel.text for panel in shown] == texts
+    assert [panel.bar and panel.bar.unit for panel in shown] == [None, "W/(m² K)", None, None]
+    assert columns == 4
+    monkeypatch.undo()
+    module = Telling(wall(), tmp_path)
+    module.attribute_maps = lambda frame: {f"map {i}": ramp * (1 + i) for i in range(13)}
+    height, width = attribute_picture(module, module.scene.test.frames[0]).shape[:2]
+    assert 0.5 < height / width < 2
+
+
+def test_what_is_impossible_stands_in_the_title_of_a_map(monkeypatch):
+    maps = {name: torch.linspace(0.0, 2.0, 101)[None] for name in ("absorptivity", "core_coupling")}
+    shown, _ = drawn(monkeypatch, maps)
+    assert [panel.title for panel in shown] == ["absorptivity: 50 % above 1, which is impossible", "core coupling"]
 
 
 def test_models_without_attributes_or_companions_leave_nothing(tmp_path):
@@ -124,13 +155,13 @@ def test_scenes_without_true_attributes_have_no_errors(tmp_path):
     assert "attribute_errors" not in module.results.data
 
 
-def learned(folder, monkeypatch, **options):
+def learned(folder, monkeypatch, scene=None, times=1.0, **options):
     """What is written of a model of two Gaussians of one metre and a hundred of a millimetre."""
-    scene = wall()
+    scene = scene or wall()
     scales = torch.cat([torch.ones(2, 3), torch.full((100, 3), 1e-3)])
     splats = SimpleNamespace(scales=scales, opacities=torch.ones(1, 102))
     told = {
-        "emissivity": torch.cat([torch.tensor([0.4, 0.8]), torch.full((100,), 0.1)]),
+        "emissivity": times * torch.cat([torch.tensor([0.4, 0.8]), torch.full((100,), 0.1)]),
         "absent": torch.full((102,), torch.nan),
     }
     off = {"emissivity": torch.cat([torch.tensor([0.05, 0.05]), torch.full((100,), 9.0)])}
@@ -152,3 +183,16 @@ def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_aske
     assert row["deviation"] == 0.05
     text = "\n".join(learned_section(tmp_path))
     assert "± 0.05" in text and "median standard deviation" in text
+
+
+def test_what_no_surface_can_have_is_remarked(tmp_path, monkeypatch):
+    (row,) = learned(tmp_path, monkeypatch)
+    assert row["remark"] is None and "remark" not in "".join(learned_section(tmp_path))
+    (row,) = learned(tmp_path, monkeypatch, times=2.0)
+    told = "not told by these images: 50 % above 1, which is impossible"
+    assert row["remark"] == told and told in "".join(learned_section(tmp_path))
+    scene = wall()
+    frames = [replace(frame, environment=Environment(irradiance_w_m2=0.0)) for frame in scene.train.frames]
+    night = replace(scene, train=ViewSet(frames, scene.train._decode))
+    (row,) = learned(tmp_path, monkeypatch, night, times=2.0)
+    assert row["remark"] == f"{told}; none was taken in daylight"

@@ -13,7 +13,7 @@ from heatsplat.callbacks.metrics import QualityMetrics
 from heatsplat.callbacks.probes import TemperatureCurves, find_probes, recorded, seen_by
 from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report
-from heatsplat.contracts import SceneError, ViewSet
+from heatsplat.contracts import SceneError, ViewSet, Weather
 from heatsplat.io.tables import read_csv
 
 
@@ -169,6 +169,14 @@ def test_a_clean_image_is_compared_with_what_it_is_compared_with():
     ]
 
 
+def test_images_of_a_real_camera_are_not_called_the_truth():
+    scene = wall(truth=False)
+    shown, _ = panels(scene.test[0], "thermal", scene.test[0].thermal, scene)
+    assert [panel.title for panel in shown] == ["recorded", "render", "render − recorded"]
+    shown, _ = panels(scene.test[0], "thermal", scene.test[0].thermal, wall())
+    assert shown[0].title == "ground truth"
+
+
 @pytest.mark.parametrize(("known", "told"), [(True, "known to be without it"), (False, "the recorded image")])
 def test_scores_of_a_clean_image_say_what_it_is_scored_against(tmp_path, known, told):
     scene = wall()
@@ -244,6 +252,21 @@ def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
     columns = list(read_csv(tmp_path / "renders" / "probes.csv")[0])
     assert columns == ["time_s", "beyond_record_s", *(f"probe {i}" for i in range(1, 7))]
     assert "test/probes" in events(tmp_path).Tags()["images"]
+
+
+def test_the_table_of_probes_has_the_clock_and_places(tmp_path):
+    times = torch.tensor([-100.0, 2 * SECONDS], dtype=torch.float64)
+    weather = Weather(times, air_c=torch.tensor([5.0, 6.0], dtype=torch.float64), notes={"utc_at_zero_s": 1722965689.0})
+    evaluate(
+        FakeModule(replace(wall(), weather=weather), tmp_path),
+        trainer(tmp_path, [TemperatureCurves(times=4)], logger=False),
+    )
+    rows = read_csv(tmp_path / "renders" / "probes.csv")
+    assert [row["clock"] for row in rows[:2]] == ["2024-08-06 17:34:49 UTC", "2024-08-06 17:38:09 UTC"]
+    places = read_csv(tmp_path / "renders" / "probe_positions.csv")
+    assert [[row[axis] for axis in "xyz"] for row in places] == [[-0.5, 0.0, 4.0], [0.5, pytest.approx(0.2), 4.0]]
+    assert [row["name"] for row in places] == ["probe 1", "probe 2"]
+    assert {row["view"] for row in places} <= {frame.name for frame in wall().val.frames}
 
 
 def test_dollar_signs_of_names_are_no_formulae(tmp_path):

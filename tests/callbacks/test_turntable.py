@@ -4,7 +4,9 @@ import torch
 from fake_run import FakeModule, wall
 from PIL import Image
 
+from heatsplat.callbacks import turntable
 from heatsplat.callbacks.turntable import TURNTABLE_FILE, Turntable
+from heatsplat.io.pictures import compose
 
 
 def test_it_turns(tmp_path):
@@ -15,3 +17,20 @@ def test_it_turns(tmp_path):
     with Image.open(tmp_path / TURNTABLE_FILE) as picture:
         assert picture.n_frames == 5 and picture.is_animated and picture.info["loop"] == 0
         assert picture.convert("RGB").getcolors(maxcolors=100_000) is not None and min(picture.size) > 100
+
+
+def test_what_is_hotter_than_the_bar_is_told(tmp_path, monkeypatch):
+    """As in a gap of the record, which no training image has shown."""
+    shown = []
+
+    def keep(panels, title):
+        shown.append((panels[0], title))
+        return compose(panels, title)
+
+    monkeypatch.setattr(turntable, "compose", keep)
+    module = FakeModule(wall(), tmp_path)
+    module.predict = lambda frame: torch.full((frame.camera.height, frame.camera.width, 1), 0.95)
+    Turntable(frames=1, size=48).on_test_epoch_end(None, module)
+    panel, title = shown[0]
+    assert panel.bar.above and not panel.bar.below
+    assert panel.title.startswith("100 % above 4") and title == "5.0 min"

@@ -1,6 +1,8 @@
 """Names of quantities as people read them."""
 
-from heatsplat.io.quantities import moment, words_and_unit
+import numpy as np
+
+from heatsplat.io.quantities import Clock, impossible, moment, words_and_unit
 
 
 def test_the_longest_suffix_is_the_unit():
@@ -10,6 +12,23 @@ def test_the_longest_suffix_is_the_unit():
     assert words_and_unit("emissivity") == ("emissivity", "")
 
 
-def test_long_records_are_told_in_hours():
-    assert (moment(90.04), moment(-5.0), moment(86902.0)) == ("90.0 s", "-5.0 s", "24.14 h")
+def test_times_are_told_in_the_unit_that_suits_them():
+    assert (moment(90.04), moment(-5.0), moment(-3600.0)) == ("90.0 s", "-5.0 s", "-60.0 min")
+    assert (moment(39743.4), moment(86902.0), moment(6 * 86400.0)) == ("11.04 h", "24.14 h", "6.00 d")
+
+
+def test_the_clock_stands_beside_a_time_where_it_is_known():
+    assert moment(39743.4, Clock(1722965689.0)) == "11.04 h (2024-08-07 04:37 UTC)"
+    assert Clock(1722965689.0, zone="").at(0.0, "seconds") == "2024-08-06 17:34:49"
+
+
+def test_shares_beyond_what_is_possible_are_told():
+    values = np.array([0.5, 1.5, 2.0, np.nan])
+    assert impossible("absorptivity", values) == "67 % above 1, which is impossible"
+    assert impossible("absorptivity", values, np.array([98.0, 1.0, 1.0, 9.0])) == ""
+    assert impossible("u_value_w_m2_k", -values) == "100 % below 0, which is impossible"
+    assert impossible("core_coupling", values) == ""
+
+
+def test_suffixes_of_massive_walls():
     assert words_and_unit("effusivity_j_m2_k_s05") == ("effusivity", "J/(m² K √s)")

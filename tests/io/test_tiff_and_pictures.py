@@ -1,6 +1,7 @@
 """Temperature files are bit-exact; pictures show the right colours at the right places."""
 
 import sys
+from dataclasses import replace
 
 import cv2
 import matplotlib
@@ -20,6 +21,7 @@ from heatsplat.io.pictures import (
     comparison_panels,
     compose,
     error_limit_of,
+    image_panel,
     visible,
     write_figure,
     write_png,
@@ -111,6 +113,26 @@ def test_comparison_shows_signed_errors_in_celsius():
     assert tuple(blue) in {tuple(c) for c in picture[middle + 80].tolist()}
     assert tuple(picture[middle, GAP + 155]) in UNKNOWN  # masked in the ground truth
     assert tuple(picture[middle, step + GAP + 155]) not in UNKNOWN  # and shown in the render
+
+
+def test_a_bar_has_arrows_where_values_lie_beyond_its_ends():
+    bar = Bar(-5.0, 5.0, "°C")
+    values = np.linspace(7.0, 12.0, 600).reshape(20, 30)
+    told = image_panel(torch.from_numpy(values)[..., None], "after 17.55 h", bar)
+    assert (told.bar.below, told.bar.above, told.title) == (False, True, "after 17.55 h · 100 % above 5 °C")
+    inside = image_panel(torch.from_numpy(values - 10)[..., None], "x", bar)
+    assert inside.bar == bar and inside.title == "x"
+    assert bar.of(values - 12, np.array([-5.2, np.nan])) == replace(bar, above=False, below=True)
+    plain, arrowed = (compose([Panel(told.image, "x", one)]) for one in (bar, told.bar))
+    assert plain.shape == arrowed.shape and (plain != arrowed).any()  # frames of a video keep their size
+    middle = len(plain) // 2
+    assert (plain[middle:] == arrowed[middle:]).all()  # the lower end is as it was
+
+
+def test_panels_are_laid_out_in_rows():
+    panel = Panel(np.zeros((65, 40, 3), np.uint8), "x")
+    one, rows = compose([panel] * 4), compose([panel] * 13, columns=4)
+    assert rows.shape[1] == one.shape[1] and rows.shape[0] > 3.5 * (one.shape[0] - GAP)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

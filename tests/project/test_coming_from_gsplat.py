@@ -1,4 +1,5 @@
-"""docs/coming_from_gsplat.md: every key that it names is in the composed configuration, with the published value beside it."""
+"""docs/coming_from_gsplat.md: every key that it names is in the composed configuration, with the published value beside it, and
+its examples run."""
 
 import re
 from functools import reduce
@@ -6,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+import heatsplat
 from heatsplat.composition import compose
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "coming_from_gsplat.md").read_text(encoding="utf-8")
 CONFIG = compose(["method=3dgs", "recipe=published"])  # published length, density control and rates
-NAMED = re.findall(r"`([^`]+)`", TEXT)
+NAMED = re.findall(r"`([^`]+)`", re.sub(r"^```python\n.*?^```", "", TEXT, flags=re.M | re.S))
+EXAMPLES = re.findall(r"^```python\n(.*?)^```", TEXT, re.M | re.S)
 KEYS = sorted({name for name in NAMED if re.fullmatch(r"[a-z]+(\.\w+)+", name) and name.split(".")[0] in CONFIG})
 ROWS = re.findall(r"^\| (`\w+`|opacity|[\d.]+ extents) ?([\d.e-]*) \|.*`([a-z]+(?:\.\w+)+)`[^`|]* \|$", TEXT, re.M)
 PUBLISHED = {key: float(value or 0.1) for name, value, key in ROWS if value or "extents" in name}
@@ -31,7 +34,7 @@ def test_settings_in_commands_are_keys_of_a_command():
     keys = {*CONFIG, *compose([], "render"), "method", "preset", "recipe", "hydra"}
     given = {word.partition("=")[0] for name in NAMED for word in name.split() if re.match(r"[a-z_.]+=[^\"]", word)}
     wrong = {key for key in given if key.split(".")[0] not in keys}
-    assert wrong == {"antialiased", "depth", "modality_channels"}  # arguments of rasterization, in Python
+    assert wrong == {"antialiased", "camera", "depth", "modality_channels"}  # arguments in Python
 
 
 @pytest.mark.parametrize("key", PUBLISHED)
@@ -42,3 +45,17 @@ def test_published_values_are_those_of_the_configuration(key):
 def test_the_page_has_the_keys_of_density_control_that_it_is_looked_up_for():
     assert {"density.start", "density.stop", "density.every", "density.duplicate_scale", "renderer.eps2d"} <= set(KEYS)
     assert len(PUBLISHED) >= 9
+
+
+def test_the_renderer_alone_learns_an_image():
+    found = {}
+    exec(EXAMPLES[0], found)
+    assert found["loss"].item() < 0.1 and tuple(found["output"].alpha.shape) == (1, 48, 64)
+
+
+def test_a_camera_is_led_back_to_its_image(tmp_path):
+    quick = ["data.scene=cooling", "data.size=tiny", "max_steps=200", "threads=1", "test=false", "doctor=false"]
+    heatsplat.train(compose(["method=etgs", *quick]), tmp_path)
+    found = {"CHECKPOINT": tmp_path / "checkpoints" / "last.ckpt"}
+    exec(EXAMPLES[1], found)
+    assert found["offset"].norm().item() < 0.02

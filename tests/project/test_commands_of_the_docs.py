@@ -23,6 +23,9 @@ MADE_ON_A_PAGE = (
     "sensor=camera_gain",
     "density=unseen",
     "loss=charbonnier",
+    "renderer=cropped",
+    "callbacks=warmest",
+    "callbacks=rmse",
     "thermal=my_drift",
     "data=my_flight",
 )

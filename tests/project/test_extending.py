@@ -1,5 +1,6 @@
 """docs/extending.md, followed literally in a copy of the repository."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -29,21 +30,31 @@ def copy(tmp_path_factory) -> Path:
 
 def run(copy: Path, command: str) -> str:
     size = [] if "data=" in command else ["data.size=tiny"]
-    printed = succeeds([*command.split()[1:], *size, f"hydra.run.dir={copy}/run"], copy)
     shutil.rmtree(copy / "run", ignore_errors=True)
-    return printed
+    return succeeds([*command.split()[1:], *size, f"hydra.run.dir={copy}/run"], copy)
 
 
 def test_the_page_adds_one_of_each_kind():
     kinds = {path.rsplit("/", 1)[0] for path, _ in FILES}
     assert kinds >= {"datamodules", "conf/data"}
-    assert kinds >= {f"src/heatsplat/{package}" for package in ("thermal", "sensors", "density", "losses")}
+    packages = ("thermal", "sensors", "density", "losses", "renderers", "callbacks", "metrics")
+    assert kinds >= {f"src/heatsplat/{package}" for package in packages}
     assert not any((ROOT / path).exists() for path, _ in FILES), "the page must add files, not replace them"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_its_commands_run(command, copy):
     assert "psnr" in run(copy, command)
+
+
+def test_what_callbacks_of_the_page_find_stands_in_the_results(copy):
+    def results(callbacks):
+        run(copy, f"python src/train.py method=3dgs callbacks={callbacks} debug=fast")
+        return json.loads((copy / "run" / "metrics.json").read_text())
+
+    assert 0 < results("warmest")["data"]["warmest_c"] < 100
+    scored = results("rmse")
+    assert scored["test"]["rmse_c"] >= scored["test"]["mae_c"] > 0 and "root" in scored["definitions"]["rmse_c"]
 
 
 def test_parts_outside_of_the_repository_are_trained_and_loaded(tmp_path, monkeypatch):

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
 from heatsplat.callbacks.images import file_stem
-from heatsplat.contracts import Frame, evenly_spread
-from heatsplat.io.pictures import Bar, Panel, colorize, compose, write_png
-from heatsplat.io.quantities import words_and_unit
+from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.io.pictures import Bar, Panel, colorize, compose, text_panel, write_png
+from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
 from heatsplat.shots import at_time
@@ -19,10 +19,12 @@ from heatsplat.uncertainty import Uncertainty
 
 LEARNED_FILE = "learned.csv"
 COLORMAP = "viridis"  # not that of temperatures
+COLUMNS = 4  # maps in a row
+CONSTANT = 1e-4  # relative spread below which a map would show how float32 rounds
 
 
 class AttributeMaps(pl.Callback):
-    """Draws the attributes of the thermal model (``module.attribute_maps``) as images, side by side.
+    """Draws the attributes of the thermal model (``module.attribute_maps``) as images, four in a row; constants are numbers.
 
     The same validation views every time (renders/attributes/val), and test views at the end (renders/attributes/test);
     TensorBoard holds all of them. Models without attributes have no such pictures.
@@ -79,7 +81,8 @@ class AttributeErrors(pl.Callback):
 class LearnedValues(pl.Callback):
     """Writes learned.csv at the end of the test: of each attribute its unit, and what the median Gaussian and nine in ten have.
 
-    Gaussians count by their opacity and the area of their largest section, and at one moment, the middle of the record.
+    Gaussians count by their opacity and the area of their largest section, and at one moment, the middle of the record. Where a
+    part of them has what no surface can have, such as an absorptivity above 1, the column "remark" says how large it is.
 
     Args:
         deviations: whether how far the value of a single Gaussian is likely off stands beside, in the median
@@ -112,9 +115,27 @@ class LearnedValues(pl.Callback):
                 usual = _quantiles(off[name].double().cpu().numpy(), weights, (0.5,)) if name in off else None
                 deviation = None if usual is None else float(f"{usual[0]:.3g}")
                 rows.append(
-                    {"name": words, "unit": unit, "median": median, "low": low, "high": high, "deviation": deviation}
+                    {
+                        "name": words,
+                        "unit": unit,
+                        "median": median,
+                        "low": low,
+                        "high": high,
+                        "deviation": deviation,
+                        "remark": _remark(impossible(name, values.double().cpu().numpy(), weights), scene) or None,
+                    }
                 )
-        write_csv(module.output_dir / LEARNED_FILE, rows, ("name", "unit", "median", "low", "high", "deviation"))
+        columns = ("name", "unit", "median", "low", "high", "deviation", "remark")
+        write_csv(module.output_dir / LEARNED_FILE, rows, columns)
+
+
+def _remark(found: str, scene: SceneData) -> str:
+    """What is said of a quantity of which ``found`` is impossible; where nothing is, nothing."""
+    if not found:
+        return ""
+    weathers = [frame.environment for frame in scene.train.frames if frame.environment is not None]
+    dark = weathers and not any(weather.irradiance_w_m2 for weather in weathers)
+    return f"not told by these images: {found}" + ("; none was taken in daylight" if dark else "")
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray | None:
@@ -129,11 +150,24 @@ def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...
 
 
 def attribute_picture(module: pl.LightningModule, frame: Frame) -> np.ndarray | None:
-    """The attribute maps of a view side by side, each with its bar, uint8 RGB; None for models without attributes."""
+    """The attribute maps of a view, each with its bar, uint8 RGB; None for models without attributes.
+
+    What has one value everywhere is a number in place of a map. Titles say what part of a map is impossible.
+    """
     panels = []
     for name, image in module.attribute_maps(frame).items():
         values = image.double().cpu().numpy()
+        words, unit = words_and_unit(name)
+        found = impossible(name, values)
+        title = f"{words}: {found}" if found else words
         known = values[np.isfinite(values)]
-        low, high = (float(x) for x in np.percentile(known, (0.1, 99.9))) if known.size else (0.0, 1.0)
-        panels.append(Panel(colorize(values, low, high, COLORMAP), name, Bar(low, high, "", COLORMAP)))
-    return compose(panels, frame.name) if panels else None
+        if not known.size:
+            panels.append(text_panel(values.shape, title, "known nowhere"))
+            continue
+        low, high = (float(x) for x in np.percentile(known, (0.1, 99.9)))
+        if high - low <= CONSTANT * max(abs(low), abs(high)):
+            panels.append(text_panel(values.shape, title, f"{np.median(known):.4g} {unit}".rstrip() + " everywhere"))
+        else:
+            bar = Bar(low, high, unit, COLORMAP)
+            panels.append(Panel(colorize(values, low, high, COLORMAP), title, bar.of(values)))
+    return compose(panels, frame.name, COLUMNS) if panels else None

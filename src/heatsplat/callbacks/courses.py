@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import SHARE_OF_RANGE, Course
-from heatsplat.io.pictures import figure_picture, time_unit, write_png
+from heatsplat.io.pictures import figure_picture, write_png
+from heatsplat.io.quantities import time_unit
 from heatsplat.io.tables import write_csv
 
 COURSES_PICTURE, COURSES_FILE = "renders/courses.png", "renders/courses.csv"

@@ -1,4 +1,4 @@
-"""Panels that people look at: ground truth, render and error."""
+"""Panels that people look at: ground truth or what was recorded, render and error."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from heatsplat.io.pictures import (
 from heatsplat.io.quantities import moment
 from heatsplat.metrics.mae import mae_c
 from heatsplat.metrics.psnr import psnr
+from heatsplat.shots import clock_of
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
 RANGE_PIXELS = 20_000  # of each of them, at most, and of each test view for the ends of the errors
@@ -33,6 +34,8 @@ KEPT = 12  # test views that wait in memory for the errors of all; what is beyon
 
 class ImagePanels(pl.Callback):
     """Draws ground truth | render | error in °C of a few views into TensorBoard and as PNG into renders/.
+
+    In place of the ground truth, of which a real scene has none, stands what was recorded.
 
     So too, with "_rgb" and the like after the name, the images that a model explains besides (its companions). The same
     validation views every time (renders/val holds their latest state, TensorBoard all of them), and test views
@@ -131,19 +134,20 @@ def panels(
     bounds: tuple[float, float] | None = None,
     error_limit: float | None = None,
 ) -> tuple[list[Panel], str]:
-    """Ground truth, render and error of one image of a view, and a title with its scores."""
+    """Ground truth or what was recorded, render and error of one image of a view, and a title with its scores."""
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
     thermal_range = scene.range_of(modality)
     title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
     if view.frame.time_s is not None:
-        title.append(f"t = {moment(view.frame.time_s)}")
+        title.append(f"t = {moment(view.frame.time_s, clock_of(scene))}")
     scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
     if thermal_range is not None and target.shape[-1] == 1:
         scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
     title += [text.format(value) for value, text in scores if value is not None]
-    # Nobody knows what a real camera without its drift and blur would have recorded.
-    against = "recorded" if modality == "clean" and view.clean is None else "ground truth"
+    # The image of a real camera has its drift and blur, and nobody knows what it would have recorded without them.
+    true = scene.truth is not None if modality != "clean" else view.clean is not None
+    against = "ground truth" if true else "recorded"
     return comparison_panels(target, prediction, thermal_range, mask, bounds, error_limit, against), "   ·   ".join(
         title
     )

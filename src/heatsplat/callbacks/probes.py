@@ -13,8 +13,10 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
-from heatsplat.io.pictures import figure_picture, literal, time_unit, write_png
+from heatsplat.io.pictures import figure_picture, literal, write_png
+from heatsplat.io.quantities import time_unit
 from heatsplat.io.tables import write_csv
+from heatsplat.shots import clock_of
 
 PROBES_PICTURE = "renders/probes.png"
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
@@ -36,13 +38,14 @@ class Probe:
 
 
 class TemperatureCurves(pl.Callback):
-    """Draws the temperature of probe points over time into TensorBoard and renders/probes.png, the numbers into .csv.
+    """Draws the temperature of probe points over time into TensorBoard and renders/probes.png, the numbers into .csv and the
+    places of the points into renders/probe_positions.csv.
 
     The model's curve is the value of the rendered pixel on which the probe falls, seen from one validation camera at
     all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
     of the probe, each from its own camera. Probes are the scene's, or points of its cloud spread over the image. Models
     that know no time, and scenes without times, have no curves. Moments beyond the training record, of test views, are
-    shaded and counted in the table's column "beyond_record_s".
+    shaded and counted in the table's column "beyond_record_s"; where the clock of the record is known, the table has it.
 
     Args:
         count: how many probes to draw at most.
@@ -85,10 +88,13 @@ class TemperatureCurves(pl.Callback):
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
         names = [probe.name for probe in self._probes]
         title = f"{scene.name}, step {step}"
+        clock = clock_of(scene)
+        title += "" if clock is None else f", 0 is {clock.at(0.0)}"
         record = min(scene.train.times_s), max(scene.train.times_s)
         picture = figure_picture(_figure(times.numpy(), record, names, model, truth, dots, unit, title))
         png = write_png(module.output_dir / PROBES_PICTURE, picture)
         self._write(module, times.tolist(), model, truth)
+        self._write_positions(module)
         add_picture(module, tag, picture, png, step)
 
     def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
@@ -112,7 +118,21 @@ class TemperatureCurves(pl.Callback):
         columns += [] if truth is None else [f"truth of {name}" for name in names]
         stacked = np.concatenate([[times, beyond], model, *([] if truth is None else [truth])])
         rows = [dict(zip(columns, values, strict=True)) for values in stacked.T.tolist()]
-        write_csv(module.output_dir / "renders" / "probes.csv", rows)
+        clock = clock_of(module.scene)
+        if clock is not None:
+            columns.insert(1, "clock")
+            rows = [row | {"clock": clock.at(row["time_s"], "seconds")} for row in rows]
+        write_csv(module.output_dir / "renders" / "probes.csv", rows, columns)
+
+    def _write_positions(self, module: pl.LightningModule) -> None:
+        """Where each probe lies in scene coordinates, and the image and the pixel that its curve is of."""
+        rows = []
+        for probe in self._probes:
+            place = dict(zip("xyz", (round(value, 6) for value in probe.point.tolist()), strict=True))
+            rows.append(
+                {"name": probe.name, **place, "view": probe.frame.name, "row": probe.row, "column": probe.column}
+            )
+        write_csv(module.output_dir / "renders" / "probe_positions.csv", rows)
 
 
 def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:

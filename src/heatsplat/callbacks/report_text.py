@@ -16,6 +16,7 @@ from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.io.citations import citations
 from heatsplat.io.page import plain
+from heatsplat.io.quantities import moment
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics.definitions import described
@@ -90,8 +91,8 @@ def _surfaces_section(folder: Path) -> list[str]:
         )
         for row in found
     ]
-    moment = found[0]["time_s"]
-    when = "" if moment is None else f", {moment:.6g} s after the first training frame"
+    time_s = found[0]["time_s"]
+    when = "" if time_s is None else f", {moment(time_s)} after the first training frame"
     note = (
         f"Connected surfaces seen by training views, as rendered by the model{when}: H the hottest, C the coldest. "
         "Centres are in scene coordinates. What has no texture and is seen at a flat angle, such as bare ground, may lie less "
@@ -108,11 +109,12 @@ def learned_section(folder: Path) -> list[str]:
     if not found:
         return []
     known = any(row["deviation"] for row in found)
+    remarked = any(row.get("remark") for row in found)
     rows = []
     for row in found:
         told = [row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}"]
         told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
-        rows.append((*told, row["unit"] or ""))
+        rows.append((*told, row["unit"] or "", *[row.get("remark") or ""] * remarked))
     note = (
         "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
         "uncertainty of a "
@@ -122,8 +124,8 @@ def learned_section(folder: Path) -> list[str]:
     )  # fmt: skip
     pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
     maps = [_picture(path, folder, "maps of learned quantities") for path in pictures]
-    heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit")
-    table = markdown_table(heads, rows, "l" + "r" * (len(heads) - 2) + "l")
+    heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit", *["remark"] * remarked)
+    table = markdown_table(heads, rows, "lrr" + "r" * known + "l" + "l" * remarked)
     return ["", "## Learned quantities", "", *table, "", note, "", *maps]
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.io.pictures import Bar, compose, image_panel
 from heatsplat.io.quantities import moment
-from heatsplat.shots import shot_frames
+from heatsplat.shots import clock_of, shot_frames
 
 TURNTABLE_FILE = "renders/turntable.webp"
 QUALITY = 70  # of WebP, of 100
@@ -40,8 +40,8 @@ class Turntable(pl.Callback):
         shown = []
         for frame in frames:
             image = module.predict(replace(frame, camera=frame.camera.within(self.size))).cpu()
-            title = "" if frame.time_s is None else moment(frame.time_s)
-            shown.append(Image.fromarray(compose([image_panel(image, title, bar, known)])))
+            title = "" if frame.time_s is None else moment(frame.time_s, clock_of(scene))
+            shown.append(Image.fromarray(compose([image_panel(image, "", bar, known)], title)))
         path = module.output_dir / TURNTABLE_FILE
         path.parent.mkdir(parents=True, exist_ok=True)
         options = {"quality": QUALITY, "method": 2, "duration": self.milliseconds, "loop": 0}

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import base64
 import logging
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -37,8 +36,11 @@ INK = (45, 45, 45)
 FONT = 13
 GAP = 14
 BAR = 14
+ARROW = 9  # pixels of the triangle at an end of a bar beyond which there are values
+BLANK = 236  # grey of a cell without an image
 PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
 MARKS = "os^Dv<>P"
+TOLD_BEYOND = 0.05  # share of an image beyond an end of its bar from which the title says so
 FIGURE_PANEL = 1.8  # inches of height of an image in print
 
 
@@ -56,21 +58,38 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 @dataclass(frozen=True)
 class Bar:
-    """What colours mean: the values at the lower and upper end of a colour map, with their unit."""
+    """What colours mean: the values at the lower and upper end of a colour map, with their unit.
+
+    Arrows at the ends say that some of what is shown lies below, or above.
+    """
 
     low: float
     high: float
     unit: str
     colormap: str = THERMAL
+    below: bool = False
+    above: bool = False
+
+    def of(self, *images: Any) -> Bar:
+        """The bar with arrows where values of these images lie beyond its ends by more than a hundredth of their distance."""
+        lowest, highest = (self.low, self.high) if self.high > self.low else (-np.inf, np.inf)
+        slack = 0.01 * (self.high - self.low)
+        known = [np.asarray(image)[np.isfinite(image)] for image in images]
+        return replace(
+            self,
+            below=any(bool((values < lowest - slack).any()) for values in known),
+            above=any(bool((values > highest + slack).any()) for values in known),
+        )
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One image [H, W, 3] uint8 under a title, with a bar at its right or without."""
+    """One image [H, W, 3] uint8 under a title, with a bar at its right or without, or a text over a cell without an image."""
 
     image: np.ndarray
     title: str
     bar: Bar | None = None
+    text: str = ""
 
 
 def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> np.ndarray:
@@ -106,8 +125,24 @@ def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | 
     """
     if image.shape[-1] == 3:
         return Panel(visible(image), title)
-    values = (image if thermal_range is None else thermal_range.to_celsius(image))[..., 0]
-    return Panel(colorize(values, bar.low, bar.high, bar.colormap), title, bar)
+    values = np.asarray((image if thermal_range is None else thermal_range.to_celsius(image))[..., 0])
+    told = " · ".join(part for part in (title, beyond(values, bar)) if part)
+    return Panel(colorize(values, bar.low, bar.high, bar.colormap), told, bar.of(values))
+
+
+def beyond(values: Any, bar: Bar) -> str:
+    """Such as "82 % above 5 °C", where a good part of an image takes the colour of an end of its bar; else empty."""
+    known = np.asarray(values)[np.isfinite(values)]
+    if not known.size:
+        return ""
+    shares = (("below", bar.low, (known < bar.low).mean()), ("above", bar.high, (known > bar.high).mean()))
+    told = (f"{share:.0%} {side} {end:.3g} {bar.unit}".rstrip() for side, end, share in shares if share >= TOLD_BEYOND)
+    return ", ".join(told).replace("%", " %")
+
+
+def text_panel(shape: tuple[int, int], title: str, text: str) -> Panel:
+    """A cell of the size of an image [H, W] with a text in its middle, for what is no map."""
+    return Panel(np.full((*shape, 3), BLANK, dtype=np.uint8), title, text=text)
 
 
 def comparison_panels(
@@ -146,12 +181,12 @@ def comparison_panels(
         low, high = bounds or bounds_of(images[0][counted] if counted.any() else images[1])
         images[0] = np.where(counted, images[0], np.nan)
         pictures = [colorize(image, low, high) for image in images]
-        bar = Bar(low, high, unit)
+        bar = Bar(low, high, unit).of(*images)
     else:
         pictures = [visible(image) for image in (target, prediction)]
         pictures[0][~counted] = _hatching(counted.shape)[~counted]
         bar = None
-    error_bar = Bar(-error_limit, error_limit, unit, ERROR)
+    error_bar = Bar(-error_limit, error_limit, unit, ERROR).of(error)
     return [
         Panel(pictures[0], against),
         Panel(pictures[1], "render", bar),
@@ -204,13 +239,35 @@ def visible(image: Any) -> np.ndarray:
     return colors
 
 
-def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
-    """Panels in a row on white paper, each with its title and bar, under a common title, uint8 RGB with even sides.
+def compose(panels: Sequence[Panel], title: str = "", columns: int | None = None) -> np.ndarray:
+    """Panels on white paper, each with its title and bar, under a common title, uint8 RGB with even sides.
 
     Small images are enlarged by a whole factor without smoothing, so that their pixels can be counted.
+
+    Args:
+        panels: all of the size of the first.
+        title: above all of them.
+        columns: panels in a row; None has all in one.
     """
+    columns = columns or len(panels)
+    rows = [_row(panels[i : i + columns]) for i in range(0, len(panels), columns)]
     line = FONT + 9
     top = GAP + (line if title else 0)
+    shape = (top + sum(map(len, rows)), 2 * GAP + max(row.shape[1] for row in rows))
+    canvas = np.full((shape[0] + shape[0] % 2, shape[1] + shape[1] % 2, 3), PAPER, dtype=np.uint8)  # even: video codecs
+    for row in rows:
+        canvas[top : top + len(row), GAP : GAP + row.shape[1]] = row
+        top += len(row)
+    if not title:
+        return canvas
+    page = Image.fromarray(canvas)
+    ImageDraw.Draw(page).text((GAP, GAP), _fit(title, shape[1] - 2 * GAP), font=_font(FONT), fill=INK)
+    return np.asarray(page)
+
+
+def _row(panels: Sequence[Panel]) -> np.ndarray:
+    """Panels beside each other, each under its title, with a margin below only, uint8 RGB."""
+    line = FONT + 9
     factor = max(1, round(PANEL_HEIGHT / panels[0].image.shape[0]))
     height, width = (side * factor for side in panels[0].image.shape[:2])
     ticks = [_ticks(panel.bar) if panel.bar else [] for panel in panels]
@@ -219,18 +276,15 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
         width + (BAR + 14 + int(np.ceil(label)) if panel.bar else 0)
         for panel, label in zip(panels, labels, strict=True)
     ]
-    shape = (top + line + height + GAP, GAP + sum(w + GAP for w in widths))
-    canvas = np.full((shape[0] + shape[0] % 2, shape[1] + shape[1] % 2, 3), PAPER, dtype=np.uint8)  # even: video codecs
-
-    page = Image.fromarray(canvas)
+    page = Image.new("RGB", (sum(widths) + GAP * (len(widths) - 1), line + height + GAP), (PAPER,) * 3)
     draw = ImageDraw.Draw(page)
-    if title:
-        draw.text((GAP, GAP), _fit(title, shape[1] - 2 * GAP), font=_font(FONT), fill=INK)
-    x, y = GAP, top + line
+    x, y = 0, line
     for panel, marks, step in zip(panels, ticks, widths, strict=True):
-        draw.text((x, top), _fit(panel.title, step), font=_font(FONT), fill=INK)
+        draw.text((x, 0), _fit(panel.title, step), font=_font(FONT), fill=INK)
         image = np.repeat(np.repeat(panel.image, factor, axis=0), factor, axis=1)
         page.paste(Image.fromarray(np.ascontiguousarray(image)), (x, y))
+        if panel.text:
+            draw.text((x + width / 2, y + height / 2), _fit(panel.text, width), font=_font(FONT), fill=INK, anchor="mm")
         if panel.bar:
             left = x + width + 6
             ramp = np.broadcast_to(
@@ -243,8 +297,23 @@ def compose(panels: Sequence[Panel], title: str = "") -> np.ndarray:
                 row = y + (height - 1) * (1 - ((value - panel.bar.low) / span if span > 0 else 0.5))
                 draw.line((left + BAR, row, left + BAR + 3, row), fill=INK)
                 draw.text((left + BAR + 6, row), text, font=_font(FONT), fill=INK, anchor="lm")
+            _arrows(draw, panel.bar, left, y, height)
         x += step + GAP
     return np.asarray(page)
+
+
+def _arrows(draw: ImageDraw.ImageDraw, bar: Bar, left: int, top: int, height: int) -> None:
+    """Draws triangles in the colours of the ends of a bar beyond which there are values, in place of its last pixels."""
+    colours = lut(bar.colormap)
+    for there, tip, way, colour in (
+        (bar.above, top, 1, colours[-1]),
+        (bar.below, top + height - 1, -1, colours[0]),
+    ):
+        if there:
+            base = tip + way * ARROW
+            draw.rectangle((left - 1, min(tip, base) - 1, left + BAR, max(tip, base) + 1), fill=(PAPER,) * 3)
+            corners = ((left - 1, base), (left + BAR, base), (left + (BAR - 1) / 2, tip))
+            draw.polygon(corners, fill=tuple(colour.tolist()), outline=INK)
 
 
 def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> None:
@@ -266,9 +335,13 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
             axes.imshow(panel.image, interpolation="none")
             axes.set_title(literal(panel.title), fontsize=8)
             axes.set_axis_off()
+            if panel.text:
+                axes.text(0.5, 0.5, literal(panel.text), ha="center", va="center", transform=axes.transAxes)
             if (bar := panel.bar) is not None:
                 colours = ScalarMappable(Normalize(bar.low, bar.high), bar.colormap)
-                figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit)
+                extend = {(True, True): "both", (True, False): "min", (False, True): "max"}
+                ends = extend.get((bar.below, bar.above), "neither")
+                figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit, extend=ends)
         date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
         figure.savefig(path, metadata={date: None})
 
@@ -286,15 +359,6 @@ def literal(text: str) -> str:
 def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
     """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
     draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
-
-
-def time_unit(span_s: float) -> tuple[float, str]:
-    """Seconds in the unit that suits an axis of so many seconds, and its sign: s, min or h."""
-    return next(
-        (unit_s, sign)
-        for least, unit_s, sign in ((10800, 3600, "h"), (300, 60, "min"), (-math.inf, 1, "s"))
-        if span_s >= least
-    )
 
 
 def figure_picture(figure: Figure) -> np.ndarray:

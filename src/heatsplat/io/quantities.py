@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
-IN_HOURS_S = 3 * 3600.0
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+# From how many seconds on which unit is read best.
+TIME_UNITS = ((3 * 86400.0, 86400.0, "d"), (3 * 3600.0, 3600.0, "h"), (300.0, 60.0, "min"), (-math.inf, 1.0, "s"))
+TOLD_IMPOSSIBLE = 0.05  # share of a quantity beyond what is possible that people are told of
+# What no surface can have less or more of.
+POSSIBLE = {
+    "absorptivity": (0.0, 1.0),
+    "emissivity": (0.0, 1.0),
+    "reflectance": (0.0, 1.0),
+    "sky_reflectance": (0.0, 1.0),
+    "convection": (0.0, math.inf),
+    "convection_w_m2_k": (0.0, math.inf),
+    "u_value_w_m2_k": (0.0, math.inf),
+}
 SUFFIXES = {
     "_c_per_h": "°C/h",
     "_k_per_kw_m2": "K m²/kW",
@@ -23,6 +41,49 @@ def words_and_unit(name: str) -> tuple[str, str]:
     return name.removesuffix(suffix).replace("_", " "), SUFFIXES.get(suffix, "")
 
 
-def moment(time_s: float) -> str:
-    """A time of a record for people: seconds, or hours where there are many."""
-    return f"{time_s:.1f} s" if abs(time_s) < IN_HOURS_S else f"{time_s / 3600.0:.2f} h"
+def impossible(name: str, values: np.ndarray, weights: np.ndarray | None = None) -> str:
+    """Such as "93 % above 1, which is impossible", where that is a twentieth of a quantity or more; else empty.
+
+    Args:
+        name: of the quantity, as of ``ThermalModel.attributes``.
+        values: of any shape; NaN where there is none.
+        weights: as many, how much each value counts; None has all count alike.
+    """
+    low, high = POSSIBLE.get(name, (-math.inf, math.inf))
+    counted = np.isfinite(values) * (np.ones_like(values) if weights is None else weights)
+    told = []
+    for side, end, there in (("below", low, values < low), ("above", high, values > high)):
+        share = counted[there].sum() / max(counted.sum(), 1e-300)
+        if share >= TOLD_IMPOSSIBLE:
+            told.append(f"{100 * share:.0f} % {side} {end:g}")
+    return f"{' and '.join(told)}, which is impossible" if told else ""
+
+
+def time_unit(span_s: float) -> tuple[float, str]:
+    """Seconds in the unit that suits so many seconds, and its sign: s, min, h or d."""
+    return next((unit_s, sign) for least, unit_s, sign in TIME_UNITS if span_s >= least)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a record.
+
+    Args:
+        at_zero_s: what it shows at the record's second 0, in seconds since 1970.
+        zone: "UTC", or empty for a camera's own clock, whose zone is not known.
+    """
+
+    at_zero_s: float
+    zone: str = "UTC"
+
+    def at(self, time_s: float, to: str = "minutes") -> str:
+        """What it shows at a time of the record, such as "2024-08-07 09:12 UTC"; with ``to`` "seconds", to these."""
+        shown = datetime.fromtimestamp(self.at_zero_s + time_s, UTC).replace(tzinfo=None)
+        return f"{shown.isoformat(' ', to)} {self.zone}".rstrip()
+
+
+def moment(time_s: float, clock: Clock | None = None) -> str:
+    """A time of a record for people, such as "90.0 s", or "24.14 h (2024-08-07 09:12 UTC)" where its clock is known."""
+    unit_s, sign = time_unit(abs(time_s))
+    told = f"{time_s / unit_s:.{1 if unit_s < 3600.0 else 2}f} {sign}"
+    return told if clock is None else f"{told} ({clock.at(time_s)})"

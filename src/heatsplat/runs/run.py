@@ -160,7 +160,8 @@ class Trained:
     def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
         """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
 
-        The first moment beyond the training record is warned of: it is a prediction.
+        Without gradients; ``module.render`` has them. The first moment beyond the training record is warned of: it is a
+        prediction.
 
         Args:
             camera: where from; a frame of the scene (``scene.test.frames[0]``) has a camera and a time of its own.
