@@ -117,7 +117,7 @@ def _moments(scene: SceneData) -> list[tuple[str, float]]:
 
 
 def _clock(scene: SceneData) -> dict[str, Any]:
-    """The moment of second 0 in seconds since 1970, None where no clock tells it, and whether it is known to be in UTC: a camera's
+    """The moment of second 0 in seconds since 1970, None where no clock tells it, and whether that is known to be UTC: a camera's
     own clock may count in any zone."""
     utc = scene.weather.notes.get("utc_at_zero_s") if scene.weather else None
     return {"start": scene.notes.get("clock_at_zero_s") if utc is None else utc, "utc": utc is not None}

@@ -23,8 +23,10 @@ class Areas {
   // Drawing one, between pixels of the camera's image -----------------------------------------------------------------
 
   begin(px, py) {
-    if (this.tool !== "point") this.draft = { kind: this.tool, from: this.share(px, py), to: this.share(px, py) };
-    return this.draft !== null;
+    if (this.tool === "point") return false;
+    this.draft = { kind: this.tool, from: this.share(px, py), to: this.share(px, py) };
+    $("readout").hidden = true;
+    return true;
   }
 
   extend(px, py) {
