@@ -431,7 +431,7 @@ def test_a_second_run_is_itself_whatever_its_clock(page, folder, tmp_path):
     wait_until(page, "viewer.run && viewer.run.scene.ready")
     assert page.execute_script("return viewer.run.later") == pytest.approx(431.0)
     run_note = "return $('runNote').textContent"
-    assert page.execute_script("return $('other').selectedOptions[0].text") == "run: etgs, cooling"
+    wait_until(page, "$('other').selectedOptions[0].text === 'run: etgs, cooling'")
     assert page.execute_script(run_note) == "Second run: etgs, cooling."
     old, none, disagreeing = page.execute_script("""const {cameras, moments} = viewer.run.told;
       const apart = moments.map(([name, time], i) => [name, time + i]);
@@ -474,7 +474,7 @@ def test_a_second_run_of_another_day_scene_or_place_says_so(page, folder, tmp_pa
         "day": ({"start": 1.7e9 + week}, ["7.0 days later", "counts from its own first"], 0),
         "hour": ({"start": 1.7e9 - 60.0}, [], 60),
         "zone": ({"start": 1.7e9 + week, "utc": False}, [], 0),  # a camera's clock is not UTC: images tell
-        "scene": ({"scene": "glass"}, ["another scene, glass; this one is cooling"], 0),
+        "scene": ({"scene": "glass"}, ["Second run: etgs, glass. It is of another scene than this one, cooling."], 0),
         "place": ({"cameras": moved}, ["Cameras of the same names stand elsewhere"], 0),
         "extent": ({"cameras": unnamed, "centre": far}, ["It lies elsewhere"], 0),
     }
@@ -586,6 +586,12 @@ def test_a_line_shows_its_profile_and_delete_takes_the_last_thing_away(page):
     assert (
         page.execute_script("return document.querySelectorAll('#marks .area').length") == 4
     )  # twice the line, both ends
+    kept = page.execute_script("""const kept = viewer.picturePage(), ratio = $('canvas').width / $('canvas').clientWidth;
+      const {x, y} = viewer.areas.list[0].profile[30], size = 6 * ratio;
+      const around = kept.getContext('2d').getImageData(x - size / 2, y - size / 2, size, size);
+      return [[...around.data], viewer.areas.list[0].colour];""")
+    colour = [int(kept[1][i : i + 2], 16) for i in (1, 3, 5)]
+    assert colour in np.array(kept[0]).reshape(-1, 4)[:, :3].tolist()  # the picture that is saved shows the line
     count = "return [viewer.probes.list.length, viewer.areas.list.length]"
     keys(page, "\ue017")
     assert page.execute_script(count) == [1, 0]

@@ -19,7 +19,7 @@ function laterIn(own, told) {
 // the same one where runs are of the same scene; where no names agree, extents tell.
 function doubts(own, told) {
   const found = [], known = new Map(own.cameras.map((one) => [one.name, Camera.of(one)]));
-  if (told.scene !== own.scene) found.push(`The second run is of another scene, ${told.scene}; this one is ${own.scene}.`);
+  if (told.scene !== own.scene) found.push(`It is of another scene than this one, ${own.scene}.`);
   const away = told.cameras.filter(({ name }) => known.has(name)).map((entry) => {
     const here = known.get(entry.name), there = Camera.of(entry);
     const apart = (a, b) => length(plus(a, b, -1));
