@@ -165,7 +165,7 @@ class Controls {
     const { viewer } = this, { target, key } = event;
     if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
     const moves = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"], presses = ["Enter", " "];
-    const own = target.matches("[type=range]") ? moves : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
+    const own = target.matches("[type=range]") ? moves : target.matches("[name=tool]") ? [...moves, " "] : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
     if (target.matches("input[type=number], select") || own.includes(key)) return;
     const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
     const actions = {
