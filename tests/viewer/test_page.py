@@ -609,6 +609,7 @@ def test_a_tool_can_be_left_and_a_click_draws_nothing(page):
     assert page.execute_script(found) == [0, 0, "point"]
     keys(page, "l", "l")
     assert page.execute_script(found) == [0, 0, "point"]
+    wait_until(page, "!viewer.pending")  # the button shows the tool that holds
     page.execute_script("const tool = document.querySelector('[name=tool][value=line]'); tool.click(); tool.focus()")
     ActionChains(page).send_keys("\ue007").perform()  # Enter, beside the picture
     assert page.execute_script(found) == [1, 0, "point"]
