@@ -36,6 +36,7 @@ from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene,
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import weather_at_frame
+from heatsplat.datamodules.weather_table import FIRST_EPOCH_S
 
 log = logging.getLogger(__name__)
 
@@ -94,6 +95,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     first_s = times[train[0]] if times else None
     raw = _with_finite_points(raw, notes)
     raw = _with_weather_since(raw, first_s, notes)
+    if raw.weather is None and first_s is not None and first_s >= FIRST_EPOCH_S:
+        notes["clock_at_zero_s"] = first_s
     origin = _origin_of(frames, raw.points)
     if origin.any():
         notes["origin"] = origin.tolist()

@@ -46,14 +46,14 @@ def test_time_starts_at_the_first_training_frame_and_frames_are_in_time_order():
     assert scene.train.times_s == [0.0, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0]
     assert scene.test.times_s == [0.125, 1.125]
     assert [f.frame_id for f in scene.test.frames] == [1, 9]
-    assert scene.notes["duration_s"] == 1.125
+    assert scene.notes["duration_s"] == 1.125 and scene.notes["clock_at_zero_s"] == times[9]
     assert "time" in scene.metadata
 
 
 def test_a_test_frame_before_the_first_training_frame_has_negative_time():
     scene = scene_of([grey(i) for i in range(9)], times=[10.0 + i for i in range(9)])
     assert scene.test.times_s == [-1.0, 7.0]
-    assert scene.train.times_s[0] == 0.0
+    assert scene.train.times_s[0] == 0.0 and "clock_at_zero_s" not in scene.notes  # no seconds since 1970
 
 
 def test_without_times_there_are_none():

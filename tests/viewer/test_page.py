@@ -285,8 +285,12 @@ def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
 def test_curves_and_the_picture_can_be_kept(page):
     page.execute_script("viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle())")
     head, *rows = page.execute_script("return viewer.probes.table()").strip().split("\n")
-    assert head.startswith("time (s),probe ") and head.endswith("truth (°C)")
+    assert head.startswith("time (s),probe ") and head.split(",")[2].endswith("truth (°C)")
     told = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    point = page.execute_script("return viewer.probes.list[0].point")
+    assert [name[-1] for name in head.split(",")[3:]] == ["x", "y", "z"]
+    assert told[:, 3:] == pytest.approx(np.tile(point, (len(told), 1)))
+    told = told[:, :3]
     series = "const p = viewer.probes.list[0]; return [viewer.probes.times, p.model, p.truth]"
     assert np.abs(told.T - np.array(page.execute_script(series))).max() < 6e-4
     kept = page.execute_script("""viewer.frame(performance.now());
@@ -426,7 +430,9 @@ def test_a_second_run_is_itself_whatever_its_clock(page, folder, tmp_path):
     page.find_element("id", "run").send_keys(str(tmp_path / FILE))
     wait_until(page, "viewer.run && viewer.run.scene.ready")
     assert page.execute_script("return viewer.run.later") == pytest.approx(431.0)
-    assert "clock" not in page.execute_script("return $('other').selectedOptions[0].text")
+    run_note = "return $('runNote').textContent"
+    wait_until(page, "$('other').selectedOptions[0].text === 'run: etgs, cooling'")
+    assert page.execute_script(run_note) == "Second run: etgs, cooling."
     old, none, disagreeing = page.execute_script("""const {cameras, moments} = viewer.run.told;
       const apart = moments.map(([name, time], i) => [name, time + i]);
       return [{cameras}, {cameras: []}, {cameras: [], moments: apart}].map((told) => laterIn(viewer.told, told));""")
@@ -446,8 +452,204 @@ def test_a_second_run_is_itself_whatever_its_clock(page, folder, tmp_path):
     page.execute_script("viewer.say = (text) => { viewer.said = text; }")
     (tmp_path / "unknown.html").write_text(pages.page(unknown, block), encoding="utf-8")
     page.find_element("id", "run").send_keys(str(tmp_path / "unknown.html"))
-    wait_until(page, "viewer.run.later === 0 && $('other').selectedOptions[0].text.startsWith('run by its own clock')")
+    wait_until(page, "viewer.run.later === 0 && $('other').selectedOptions[0].text.startsWith('run: etgs, ')")
     assert "Images do not tell" in wait_until(page, "viewer.said")
+    page.execute_script("viewer.frame(performance.now())")
+    assert "Images do not tell" in page.execute_script(run_note)
+
+
+def test_a_second_run_of_another_day_scene_or_place_says_so(page, folder, tmp_path):
+    header, block = parts_of(folder / FILE)
+    week = 7 * 86400.0
+
+    def elsewhere(camera):
+        viewmat = list(camera["viewmat"])
+        viewmat[3] += header["size"]
+        return camera | {"viewmat": viewmat}
+
+    moved = [elsewhere(camera) for camera in header["cameras"]]
+    far = [place + 3 * header["size"] for place in header["centre"]]
+    unnamed = [camera | {"name": f"other {camera['name']}"} for camera in header["cameras"]]
+    cases = {
+        "day": ({"start": 1.7e9 + week}, ["7.0 days later", "counts from its own first"], 0),
+        "hour": ({"start": 1.7e9 - 60.0}, [], 60),
+        "zone": ({"start": 1.7e9 + week, "utc": False}, [], 0),  # a camera's clock is not UTC: images tell
+        "scene": ({"scene": "glass"}, ["Second run: etgs, glass. It is of another scene than this one, cooling."], 0),
+        "place": ({"cameras": moved}, ["Cameras of the same names stand elsewhere"], 0),
+        "extent": ({"cameras": unnamed, "centre": far}, ["It lies elsewhere"], 0),
+    }
+    page.execute_script("Object.assign(viewer.told, {start: 1.7e9, utc: true})")
+    for name, (changes, words, later) in cases.items():
+        (tmp_path / f"{name}.html").write_text(
+            pages.page({**header, "start": 1.7e9, "utc": True, **changes}, block), encoding="utf-8"
+        )
+        page.execute_script("viewer.run = null")
+        page.find_element("id", "run").send_keys(str(tmp_path / f"{name}.html"))
+        wait_until(page, "viewer.run && viewer.run.scene.ready && !viewer.pending")
+        told = page.execute_script("return [viewer.run.later, $('runNote').textContent]")
+        assert told[0] == pytest.approx(later), name
+        assert all(word in told[1] for word in words), (name, told[1])
+        assert words or told[1].count(".") == 1, (name, told[1])
+
+
+def test_a_page_without_the_keys_of_newer_ones_opens_alone_and_as_a_second_run(page, folder, tmp_path):
+    header, block = parts_of(folder / FILE)
+    old = {key: value for key, value in header.items() if key not in ("start", "utc", "origin")}
+    (tmp_path / FILE).write_text(pages.page(old, block), encoding="utf-8")
+    page.find_element("id", "run").send_keys(str(tmp_path / FILE))
+    wait_until(page, "viewer.run && viewer.run.scene.ready")
+    assert page.execute_script("return [viewer.run.note, viewer.run.later]") == ["Second run: etgs, cooling.", 0]
+    opened(page, tmp_path / FILE)
+    page.execute_script("viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle())")
+    assert page.execute_script("return viewer.probes.table()").startswith("time (s),probe ")
+    assert page.execute_script("return viewer.errors") == []
+
+
+def drawn(page, key: str, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drags with a tool between two shares of the canvas, from its upper left."""
+    canvas = page.find_element("id", "canvas")
+    width, height = canvas.size["width"], canvas.size["height"]
+    keys(page, key)
+    to_start = ActionChains(page).move_to_element_with_offset(
+        canvas, int((start[0] - 0.5) * width), int((start[1] - 0.5) * height)
+    )
+    way = int((end[0] - start[0]) * width), int((end[1] - start[1]) * height)
+    to_start.click_and_hold().move_by_offset(*way).release().perform()
+    wait_until(page, "!viewer.pending && !viewer.sorter.busy && !viewer.stale.order")
+    page.execute_script("viewer.frame(performance.now()); viewer.settle()")
+
+
+def test_a_box_measures_the_pixels_below_it_as_the_renderer_makes_them(page, trained):
+    """Against the image of the renderer, over the same part of it; again at another time and from another camera."""
+    scene = trained.scene
+    frames = [scene.train.frames[i] for i in evenly_spread(len(scene.train), 36)]
+    times = min(scene.train.times_s), max(scene.train.times_s)
+    page.execute_script("viewer.probes.list = []; viewer.goTo(1)")
+    before = page.execute_script("return [viewer.camera.centre, viewer.probes.list.length]")
+    drawn(page, "m", (0.4, 0.35), (0.6, 0.7))
+    assert page.execute_script("return [viewer.camera.centre, viewer.probes.list.length]") == before
+    assert page.execute_script("return [viewer.areas.tool, viewer.areas.list.length]") == ["point", 1]
+    for place, time_s in ((1, times[0]), (1, times[1]), (3, times[1])):
+        page.execute_script(f"viewer.goTo({place}); viewer.setTime({time_s}); viewer.frame(performance.now())")
+        wait_until(page, "!viewer.sorter.busy && !viewer.stale.order && !viewer.pending")
+        page.execute_script("viewer.frame(performance.now()); viewer.settle()")
+        area = page.execute_script("return viewer.areas.list[0]")
+        image = trained.render(frames[place], time_s, unseen="keep")
+        (left, top), (right, bottom) = (
+            np.round(np.array(area[end]) * image.shape[1::-1]).astype(int) for end in ("from", "to")
+        )
+        inside, wide = (image[top - more : bottom + more, left - more : right + more] for more in (0, 2))
+        found = area["found"]
+        assert found["mean"] == pytest.approx(inside.mean().item(), abs=0.3)
+        assert found["deviation"] == pytest.approx(inside.std().item(), abs=0.4)
+        assert inside.max() - 0.5 < found["hot"]["value"] < wide.max() + 0.5
+        assert wide.min() - 0.5 < found["cold"]["value"] < inside.min() + 0.5
+        text = page.execute_script("return $('areas').textContent")
+        assert f"{found['mean']:.2f} °C" in text and f"{found['count']:,} pixels" in text
+    bounds = page.execute_script("return viewer.areas.bounds(viewer.areas.list[0])")
+    assert found["count"] == bounds["width"] * bounds["height"]  # all of it shows a surface
+    head, row = page.execute_script("return viewer.areas.table()").strip().split("\n")
+    told = dict(zip(head.split(","), row.split(","), strict=True))
+    assert float(told["mean (°C)"]) == pytest.approx(found["mean"], abs=1e-3)
+    assert (told["name"], told["values"], int(told["pixels"])) == ("box 1", '"temperature"', found["count"])
+
+
+def test_pixels_without_a_surface_do_not_count_in_a_box(page):
+    page.execute_script("viewer.goTo(0); viewer.nearer(-12)")
+    keys(page, "m", "\ue007")  # Enter
+    page.execute_script("Object.assign(viewer.areas.list[0], {from: [-1, -1], to: [2, 2]})")
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order && !viewer.pending")
+    found, all_, seen = page.execute_script("""viewer.frame(performance.now()); viewer.settle();
+      const {width, height} = $('canvas'), content = viewer.drawing.read('first', 0, 0, width, height);
+      let seen = 0;
+      for (let j = 3; j < content.length; j += 4) seen += content[j] > 0.5;
+      return [viewer.areas.list[0].found.count, width * height, seen];""")
+    assert found == seen and 0 < seen < 0.9 * all_
+    page.execute_script(
+        "Object.assign(viewer.areas.list[0], {from: [-9, -9], to: [-8, -8]}); viewer.frame(performance.now())"
+    )
+    assert "nothing there" in page.execute_script("return $('areas').textContent")
+
+
+def test_a_line_shows_its_profile_and_delete_takes_the_last_thing_away(page):
+    page.execute_script("viewer.probes.list = []; viewer.goTo(1); viewer.probes.pin(...viewer.middle())")
+    drawn(page, "l", (0.2, 0.3), (0.8, 0.6))
+    line = page.execute_script("return viewer.areas.list[0]")
+    profile = [point["value"] for point in line["profile"]]
+    assert line["name"] == "line 1" and line["found"]["count"] == len(profile) > 100
+    assert (line["found"]["cold"]["value"], line["found"]["hot"]["value"]) == (min(profile), max(profile))
+    assert [line["profile"][i]["along"] for i in (0, -1)] == [0, 1]
+    read = "return viewer.valueOf(viewer.drawing.read('first', arguments[0], arguments[1], 1, 1), 0, arguments[0], arguments[1])"
+    for point in line["profile"][:: len(profile) // 5]:
+        assert page.execute_script(read, point["x"], point["y"]) == pytest.approx(point["value"], abs=1e-4)
+    assert page.execute_script("return document.querySelectorAll('#profile .curve').length") == 1
+    assert (
+        page.execute_script("return document.querySelectorAll('#marks .area').length") == 4
+    )  # twice the line, both ends
+    kept = page.execute_script("""const kept = viewer.picturePage(), ratio = $('canvas').width / $('canvas').clientWidth;
+      const {x, y} = viewer.areas.list[0].profile[30], size = 6 * ratio;
+      const around = kept.getContext('2d').getImageData(x - size / 2, y - size / 2, size, size);
+      return [[...around.data], viewer.areas.list[0].colour];""")
+    colour = [int(kept[1][i : i + 2], 16) for i in (1, 3, 5)]
+    assert colour in np.array(kept[0]).reshape(-1, 4)[:, :3].tolist()  # the picture that is saved shows the line
+    count = "return [viewer.probes.list.length, viewer.areas.list.length]"
+    keys(page, "\ue017")
+    assert page.execute_script(count) == [1, 0]
+    keys(page, "\ue017")
+    assert page.execute_script(count) == [0, 0]
+
+
+def test_a_tool_can_be_left_and_a_click_draws_nothing(page):
+    page.execute_script("viewer.probes.list = []; viewer.say = (text) => { viewer.said = text; }")
+    keys(page, "m")
+    ActionChains(page).move_to_element(page.find_element("id", "canvas")).click().perform()
+    found = "return [viewer.areas.list.length, viewer.probes.list.length, viewer.areas.tool]"
+    assert page.execute_script(found) == [0, 0, "box"] and "Drag" in page.execute_script("return viewer.said")
+    keys(page, "\ue00c")  # Escape
+    assert page.execute_script(found) == [0, 0, "point"]
+    keys(page, "l", "l")
+    assert page.execute_script(found) == [0, 0, "point"]
+    wait_until(page, "!viewer.pending")  # the button shows the tool that holds
+    page.execute_script("const tool = document.querySelector('[name=tool][value=line]'); tool.click(); tool.focus()")
+    ActionChains(page).send_keys("\ue007").perform()  # Enter, beside the picture
+    assert page.execute_script(found) == [1, 0, "point"]
+
+
+def test_differences_are_counted_from_a_probe_of_choice(page):
+    page.execute_script("""viewer.probes.list = []; viewer.goTo(1);
+      const [x, y] = viewer.middle();
+      viewer.probes.pin(x, y); viewer.probes.pin(0.5 * x, 1.3 * y); viewer.frame(performance.now());
+      document.querySelector('#probes button').click(); viewer.frame(performance.now());""")
+    first, second = page.execute_script("return viewer.probes.list.map((one) => viewer.probes.valueNow(one))")
+    shown = page.execute_script("return [...document.querySelectorAll('#probes li')].map((one) => one.textContent)")
+    assert f"Δ {second - first:+.2f}".replace("-", "−") in shown[1] and "Δ✕" in shown[0]
+    page.execute_script("document.querySelectorAll('#probes li')[0].querySelectorAll('button')[1].click()")
+    page.execute_script("viewer.frame(performance.now())")
+    assert page.execute_script("return [viewer.probes.reference, $('probes').textContent.includes('Δ')]") == [
+        None,
+        False,
+    ]
+
+
+def test_tables_tell_the_clock_and_the_coordinates_of_files_where_they_are_known(page):
+    page.execute_script("""viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle());
+      Object.assign(viewer.told, {start: 1782885600, utc: true, origin: [500000, 4000000, 0]});""")
+    head, row, *_ = page.execute_script("return viewer.probes.table()").split("\n")
+    told = dict(zip(head.split(","), row.split(","), strict=True))
+    number, x = next((name, value) for name, value in told.items() if name.endswith(" x"))
+    start = page.execute_script("return viewer.probes.times[0]")
+    assert (
+        told["clock (UTC)"]
+        == np.datetime64(round(1e3 * (1782885600 + start)), "ms").item().isoformat(timespec="milliseconds") + "Z"
+    )
+    assert float(x) == pytest.approx(500000 + page.execute_script("return viewer.probes.list[0].point[0]"), abs=1e-5), (
+        number
+    )
+
+
+def test_the_legend_says_that_its_ends_hold_all_beyond(page):
+    page.execute_script("viewer.state.ranges.values = [20, 30]; viewer.frame(performance.now())")
+    assert page.execute_script("return [$('barLow').textContent, $('barHigh').textContent]") == ["≤ 20", "≥ 30"]
 
 
 def test_the_cursor_reads_what_is_shown_on_each_side(page):

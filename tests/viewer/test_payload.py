@@ -18,7 +18,7 @@ from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.rolling_readout import RollingReadout
 from heatsplat.sensors.thermal_lag import ThermalLag
 from heatsplat.viewer.page import page
-from heatsplat.viewer.payload import MEAN_CODE, MOMENTS, Block, _added, _attribute, _moments, _small, payload
+from heatsplat.viewer.payload import MEAN_CODE, MOMENTS, Block, _added, _attribute, _clock, _moments, _small, payload
 
 
 def back(block: bytes, place: dict) -> np.ndarray:
@@ -88,6 +88,20 @@ def test_the_same_images_tell_the_time_however_a_scene_is_split():
     assert [name for name, _ in one] == [name for name, _ in other] and len(one) == MOMENTS
     assert {b - a for (_, a), (_, b) in zip(one, other, strict=True)} == {-30.0}
     assert _moments(SimpleNamespace(frames=[])) == []
+
+
+@pytest.mark.parametrize(
+    ("weather", "notes", "told"),
+    [
+        ({"utc_at_zero_s": 1.7e9}, {"clock_at_zero_s": 1.6e9}, {"start": 1.7e9, "utc": True}),
+        ({"clock_at_zero_s": 30.0}, {}, {"start": None, "utc": False}),
+        (None, {"clock_at_zero_s": 1.6e9}, {"start": 1.6e9, "utc": False}),
+        (None, {}, {"start": None, "utc": False}),
+    ],
+)
+def test_the_clock_is_that_of_the_weather_or_of_the_frames(weather, notes, told):
+    scene = SimpleNamespace(weather=weather and SimpleNamespace(notes=weather), notes=notes)
+    assert _clock(scene) == told
 
 
 def test_a_page_says_that_it_shows_the_mean_of_the_codes_of_images(tmp_path):

@@ -87,6 +87,7 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
         "span": None if seen.start_s is None else [seen.start_s, seen.end_s],
         "record": None if seen.start_s is None else [min(scene.train.times_s), max(scene.train.times_s)],
         "moments": _moments(scene),
+        **_clock(scene),
         "leftOut": [*seen.left_out, *[MEAN_CODE] * ("frame_offset" in module.thermal.effects())],
         "beyondRecord": module.thermal.beyond_record,
         "renderer": {
@@ -95,6 +96,7 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
             "near": renderer.near,
             "far": renderer.far,
         },
+        "origin": scene.notes.get("origin"),
         "centre": centre.tolist(),
         "size": size,
         "up": (-down / down.norm().clamp_min(1e-12)).tolist(),
@@ -112,6 +114,13 @@ def _moments(scene: SceneData) -> list[tuple[str, float]]:
     known = {frame.name: frame.time_s for frame in scene.frames if frame.time_s is not None}
     ordered = sorted(known.items(), key=lambda moment: (moment[1], moment[0]))
     return [ordered[i] for i in evenly_spread(len(ordered), MOMENTS)]
+
+
+def _clock(scene: SceneData) -> dict[str, Any]:
+    """The moment of second 0 in seconds since 1970, None where no clock tells it, and whether that is known to be UTC: a camera's
+    own clock may count in any zone."""
+    utc = scene.weather.notes.get("utc_at_zero_s") if scene.weather else None
+    return {"start": scene.notes.get("clock_at_zero_s") if utc is None else utc, "utc": utc is not None}
 
 
 def _layer(layer: Layer, block: Block) -> dict[str, Any]:

@@ -26,13 +26,19 @@ function timeScale(span) {
   return span < 3 * 3600 ? [60, "min"] : [3600, "h"];
 }
 
-// Curves: [{colour, name, model, truth, dots}] over times; a line at the present.
-function drawCurves(svg, times, curves, now, unit, record) {
+function timeAxis(times) {
+  const [divisor, word] = timeScale(times.at(-1) - times[0]);
+  return [divisor, `time (${word})`];
+}
+
+// Curves: [{colour, name, model, truth, dots}] over times, or over places of their own (at), with gaps where the model is null; a
+// line at the present. axis: what one unit of the labels below is, and their words; of time by default.
+function drawCurves(svg, times, curves, now, unit, record, axis = timeAxis(times)) {
   svg.replaceChildren();
   const width = Math.max(svg.clientWidth, 200), height = Math.max(svg.clientHeight, 120);
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const left = 40, right = width - 8, top = 10, bottom = height - 30;
-  const all = curves.flatMap((one) => [...one.model, ...(one.truth || []), ...one.dots.map((dot) => dot[1])]);
+  const all = curves.flatMap((one) => [...one.model.filter((value) => value !== null), ...(one.truth || []), ...one.dots.map((dot) => dot[1])]);
   if (!all.length || times.length < 2) return;
   let low = Math.min(...all), high = Math.max(...all);
   const pad = Math.max(0.06 * (high - low), unit ? 0.1 : 0.002);
@@ -46,7 +52,7 @@ function drawCurves(svg, times, curves, now, unit, record) {
       if (to > from) node("rect", { class: "beyond", x: x(from), y: top, width: x(to) - x(from), height: bottom - top }, svg);
     }
   }
-  const [divisor, word] = timeScale(last - first);
+  const [divisor, words] = axis;
   for (const tick of ticks(low, high, 4)) {
     node("line", { class: "grid", x1: left, x2: right, y1: y(tick), y2: y(tick) }, svg);
     node("text", { x: left - 5, y: y(tick) + 4, "text-anchor": "end" }, svg, String(tick));
@@ -54,13 +60,13 @@ function drawCurves(svg, times, curves, now, unit, record) {
   for (const tick of ticks(first / divisor, last / divisor, 5)) {
     node("text", { x: x(tick * divisor), y: bottom + 14, "text-anchor": "middle" }, svg, String(tick));
   }
-  node("text", { x: right, y: height - 3, "text-anchor": "end" }, svg, `time (${word})`);
+  node("text", { x: right, y: height - 3, "text-anchor": "end" }, svg, words);
   node("text", { x: 2, y: height - 3 }, svg, unit);
-  const line = (values) => values.map((value, i) => `${i ? "L" : "M"}${x(times[i]).toFixed(1)},${y(value).toFixed(1)}`).join("");
+  const line = (values, at = times) => values.map((value, i) => value === null ? "" : `${(values[i - 1] ?? null) === null ? "M" : "L"}${x(at[i]).toFixed(1)},${y(value).toFixed(1)}`).join("");
   for (const one of curves) {
     for (const [time, value] of one.dots) node("circle", { cx: x(time), cy: y(value), r: 2.2, fill: one.colour, "fill-opacity": 0.6 }, svg);
     if (one.truth) node("path", { d: line(one.truth), class: "curve truth", stroke: one.colour }, svg);
-    node("path", { d: line(one.model), class: "curve", stroke: one.colour }, svg);
+    node("path", { d: line(one.model, one.at), class: "curve", stroke: one.colour }, svg);
   }
   if (now !== null) node("line", { class: "now", x1: x(now), x2: x(now), y1: top, y2: bottom }, svg);
 }

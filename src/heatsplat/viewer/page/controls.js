@@ -48,7 +48,9 @@ class Controls {
     this.pointers.set(event.pointerId, event);
     this.alone = this.pointers.size === 1;
     this.moved = 0;
-    this.viewer.dragging = true;
+    const { areas } = this.viewer, plain = this.alone && event.button === 0 && !event.shiftKey;
+    if (!this.alone) areas.draft = null;
+    this.viewer.dragging = !(plain && areas.begin(...this.viewer.pixelAt(event.clientX, event.clientY)));
     this.viewer.keyboard = false;
   }
 
@@ -58,7 +60,8 @@ class Controls {
     const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
     this.moved += Math.hypot(dx, dy);
     pointers.set(event.pointerId, event);
-    if (pointers.size === 2) {
+    if (viewer.areas.draft) viewer.areas.extend(...viewer.pixelAt(event.clientX, event.clientY));
+    else if (pointers.size === 2) {
       const [a, b] = [...pointers.values()], now = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
       if (this.pinch) viewer.nearer(Math.log(now / this.pinch) / 0.08);
       this.pinch = now;
@@ -74,9 +77,12 @@ class Controls {
     const known = this.pointers.delete(event.pointerId);
     this.pinch = 0;
     viewer.dragging = this.pointers.size > 0;
+    const { draft } = viewer.areas;
+    if (event.type === "pointercancel") viewer.areas.draft = null;
     if (known && event.type === "pointerup" && event.button === 0) {
       this.clicks = [...this.clicks.slice(-1), { list: [...list], numbered }];
-      if (this.alone && this.moved <= 3) viewer.probes.pin(...viewer.pixelAt(event.clientX, event.clientY));
+      if (draft) viewer.areas.finish(this.moved > 3);
+      else if (this.alone && this.moved <= 3) viewer.probes.pin(...viewer.pixelAt(event.clientX, event.clientY));
     }
     viewer.request();
   }
@@ -102,6 +108,7 @@ class Controls {
     $("other").onchange = () => viewer.choose({ other: $("other").value });
     for (const input of document.querySelectorAll("input[name=how]")) input.onchange = () => viewer.choose({ how: input.value });
     for (const input of document.querySelectorAll("input[name=move]")) input.onchange = () => viewer.choose({ walk: input.value === "walk" });
+    for (const input of document.querySelectorAll("input[name=tool]")) input.onchange = () => viewer.areas.choose(input.value);
     $("spots").onchange = () => viewer.choose({ spots: $("spots").checked });
     $("theme").onclick = () => viewer.theme();
     $("help").onclick = () => viewer.help();
@@ -143,6 +150,7 @@ class Controls {
     const { viewer } = this;
     $("save").onclick = () => viewer.picturePage().toBlob((blob) => viewer.keep(`${viewer.stem}.png`, blob));
     $("curves").onclick = () => viewer.keep(`${viewer.stem}_probes.csv`, new Blob([viewer.probes.table()], { type: "text/csv" }));
+    $("areasTable").onclick = () => viewer.keep(`${viewer.stem}_areas.csv`, new Blob([viewer.areas.table()], { type: "text/csv" }));
     $("run").onchange = () => $("run").files[0] && viewer.openRun($("run").files[0]);
     document.body.ondragover = (event) => event.preventDefault();
     document.body.ondrop = (event) => {
@@ -157,7 +165,7 @@ class Controls {
     const { viewer } = this, { target, key } = event;
     if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
     const moves = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"], presses = ["Enter", " "];
-    const own = target.matches("[type=range]") ? moves : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
+    const own = target.matches("[type=range]") ? moves : target.matches("[name=tool]") ? [...moves, " "] : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
     if (target.matches("input[type=number], select") || own.includes(key)) return;
     const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
     const actions = {
@@ -170,8 +178,9 @@ class Controls {
       ",": () => viewer.stepTime(-1), ".": () => viewer.stepTime(1), "<": () => viewer.stepTime(-10), ">": () => viewer.stepTime(10),
       ";": () => viewer.stepTime(-10), ":": () => viewer.stepTime(10),
       n: () => viewer.goTo((viewer.lastCamera ?? -1) + 1, true), p: () => viewer.goTo((viewer.lastCamera ?? 1) - 1, true),
-      Enter: () => viewer.probes.pin(...viewer.middle()),
-      Delete: () => viewer.probes.list.pop() && viewer.request(), Backspace: () => viewer.probes.list.pop() && viewer.request(),
+      Enter: () => viewer.areas.tool === "point" ? viewer.probes.pin(...viewer.middle()) : viewer.areas.addInMiddle(),
+      m: () => viewer.pick("box"), l: () => viewer.pick("line"), Escape: () => viewer.areas.choose("point"),
+      Delete: () => viewer.removeLast(), Backspace: () => viewer.removeLast(),
       v: () => viewer.cycle("quantity", "quantity"), b: () => viewer.cycle("other", "other"),
       f: () => viewer.choose({ how: viewer.state.how === "swipe" ? "difference" : "swipe" }),
       "[": () => viewer.choose({ split: Math.max(viewer.state.split - 0.04, 0.02) }),

@@ -8,6 +8,7 @@ class Probes {
     this.viewer = viewer;
     this.list = [];
     this.numbered = 0;
+    this.reference = null;  // the probe from which differences of others are counted
     const { span } = viewer.told, [start, end] = span || [0, 0];
     this.times = Array.from({ length: span ? CHART_TIMES : 1 }, (_, i) => start + i / (CHART_TIMES - 1) * (end - start));
   }
@@ -23,7 +24,7 @@ class Probes {
     if (this.list.length === COLOURS.length) this.list.shift();
     const used = this.list.map((probe) => probe.colour);
     this.numbered += 1;
-    const probe = { name: String(this.numbered), colour: COLOURS.find((one) => !used.includes(one)), pixel, camera, px, py,
+    const probe = { name: String(this.numbered), colour: COLOURS.find((one) => !used.includes(one)), pixel, camera, px, py, since: performance.now(),
       point: camera.point(px, py, pixel.depth), dots: [] };
     this.list.push(probe);
     this.measure(probe);
@@ -64,32 +65,39 @@ class Probes {
   }
 
   draw() {
-    const { told, state } = this.viewer, list = $("probes"), charted = told.span && this.list.length;
-    $("curves").hidden = !charted;
+    const { told, state } = this.viewer, charted = told.span && this.list.length;
+    if (!this.list.includes(this.reference) || this.list.length < 2) this.reference = null;
+    $("curves").hidden = !this.list.length;
     $("chart").style.display = charted ? "" : "none";
     if (told.span) drawCurves($("chart"), this.times, this.list, state.time, told.unit, told.record);
     const dots = this.list.some((probe) => probe.dots.length), truth = this.list.some((probe) => probe.truth);
     $("chartNote").textContent = charted ? `Lines: model${truth ? "; dashes: truth" : dots ? "; dots: training images" : ""}.` : "";
-    const items = this.list.map((probe) => this.item(probe));
-    const focused = [...list.querySelectorAll("button")].indexOf(document.activeElement);
-    list.replaceChildren(...items);
-    if (focused >= 0) (list.querySelectorAll("button")[focused] || $("canvas")).focus();
+    refill($("probes"), this.list.map((probe) => this.item(probe)));
   }
 
-  // A probe in the list: its value now, and what the model learned there.
+  valueNow(probe) {
+    return this.viewer.splats.seriesAt(probe.pixel, probe.layer, [this.viewer.state.time])[0];
+  }
+
+  // A probe in the list: its value now, how far that is from the reference, and what the model learned there.
   item(probe) {
-    const { splats, state, told } = this.viewer;
-    const item = document.createElement("li"), swatch = document.createElement("i");
-    const [value] = splats.seriesAt(probe.pixel, probe.layer, [state.time]);
-    const text = (content) => Object.assign(document.createElement("span"), { textContent: content });
-    swatch.style.background = probe.colour;
-    const close = Object.assign(document.createElement("button"), { textContent: "✕", title: `Take probe ${probe.name} away` });
-    close.setAttribute("aria-label", close.title);
-    close.onclick = () => {
+    const { splats, told } = this.viewer, { reference } = this, value = this.valueNow(probe);
+    const item = entry(probe.colour, `probe ${probe.name}`, told.unit ? `${value.toFixed(2)} ${told.unit}` : value.toFixed(4), () => {
       this.list = this.list.filter((one) => one !== probe);
       this.viewer.request();
-    };
-    item.append(swatch, text(`probe ${probe.name}`), text(told.unit ? `${value.toFixed(2)} ${told.unit}` : value.toFixed(4)), close);
+    });
+    if (this.list.length > 1) {
+      const apart = reference && reference !== probe ? value - this.valueNow(reference) : null;
+      const button = Object.assign(document.createElement("button"), { textContent: apart === null ? "Δ" : `Δ ${signed(apart, told.unit ? 2 : 4)}`,
+        title: apart === null ? `Differences from probe ${probe.name}` : `Probe ${probe.name} minus probe ${reference.name}` });
+      button.setAttribute("aria-pressed", String(reference === probe));
+      button.setAttribute("aria-label", apart === null ? button.title : `${button.title}: ${button.textContent}`);
+      button.onclick = () => {
+        this.reference = reference === probe ? null : probe;
+        this.viewer.request();
+      };
+      item.lastChild.before(button);
+    }
     if (splats.attributes.length) {
       const number = (value) => Number.isNaN(value) ? "unknown" : Number(value.toPrecision(3));
       const learned = splats.attributes.map((one) => `${one.label} ${number(splats.attributeAt(probe.pixel, one))} ${one.unit}`.trim());
@@ -98,12 +106,44 @@ class Probes {
     return item;
   }
 
-  // The curves as a table: a row for each moment, and of each probe the model and, where it is known, the truth.
+  // A table with a row for each moment: the clock where it is known; of each probe the model, the truth where it is known, and its place
+  // in the coordinates of the scene's files.
   table() {
-    const unit = this.viewer.told.unit ? ` (${this.viewer.told.unit})` : "";
-    const columns = this.list.flatMap((one) => [[`probe ${one.name}${unit}`, one.model], [`probe ${one.name} truth${unit}`, one.truth]])
-      .filter(([, values]) => values);
-    const rows = this.times.map((time, i) => [time.toFixed(3), ...columns.map(([, values]) => values[i].toFixed(unit ? 3 : 5))]);
-    return [["time (s)", ...columns.map(([name]) => name)], ...rows].map((row) => row.join()).join("\n") + "\n";
+    const { told } = this.viewer, unit = told.unit ? ` (${told.unit})` : "", origin = told.origin || [0, 0, 0];
+    const values = (all) => all.map((value) => value.toFixed(unit ? 3 : 5)), still = (value) => this.times.map(() => value);
+    const columns = told.span ? [["time (s)", this.times.map((time) => time.toFixed(3))], ...clockColumn(told, this.times)] : [];
+    for (const one of this.list) {
+      columns.push([`probe ${one.name}${unit}`, values(one.model)]);
+      if (one.truth) columns.push([`probe ${one.name} truth${unit}`, values(one.truth)]);
+    }
+    for (const one of this.list) ["x", "y", "z"].forEach((axis, i) => columns.push([`probe ${one.name} ${axis}`, still(Number((one.point[i] + origin[i]).toPrecision(12)))]));
+    return [columns.map(([name]) => name), ...this.times.map((_, i) => columns.map(([, cells]) => cells[i]))].map((row) => row.join()).join("\n") + "\n";
   }
+}
+
+// The column of a table that says what the clock said, where it is known.
+function clockColumn({ start, utc }, times) {
+  if (typeof start !== "number") return [];
+  return [[`clock (${utc ? "UTC" : "camera"})`, times.map((time) => new Date(1000 * (start + time)).toISOString().slice(0, utc ? 24 : 23))]];
+}
+
+const signed = (value, digits) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)}`;
+
+// An entry of a list of what is measured: swatch, name, value, and a button that takes it away.
+function entry(colour, name, value, remove) {
+  const item = document.createElement("li"), swatch = document.createElement("i");
+  const text = (content) => Object.assign(document.createElement("span"), { textContent: content });
+  swatch.style.background = colour;
+  const close = Object.assign(document.createElement("button"), { textContent: "✕", title: `Take ${name} away` });
+  close.setAttribute("aria-label", close.title);
+  close.onclick = remove;
+  item.append(swatch, text(name), text(value), close);
+  return item;
+}
+
+// Other entries in a list; the focus stays on the button where it was.
+function refill(list, items) {
+  const focused = [...list.querySelectorAll("button")].indexOf(document.activeElement);
+  list.replaceChildren(...items);
+  if (focused >= 0) (list.querySelectorAll("button")[focused] || $("canvas")).focus();
 }

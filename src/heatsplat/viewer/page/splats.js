@@ -57,6 +57,12 @@ class Splats {
     return layer.name === "camera" ? Math.min(Math.max(value, low), high) : value;
   }
 
+  // Of a pixel of which the share alpha is covered, from its blended value as ``fill`` scales it.
+  valueOf(blended, alpha, layer) {
+    const [low, high] = this.told.tableEnds;
+    return this.shown(alpha * low + blended * (high - low) + (1 - alpha) * this.told.background, layer);
+  }
+
   // The shared curves of a layer at a time, [rank].
   curvesAt(layer, time) {
     const { times, curves } = layer;

@@ -2,6 +2,7 @@
 
 const $ = (id) => document.getElementById(id);
 const AT_CAMERAS = "Images of cameras are known where and when they were taken: N and P go to the next.";
+const OTHER_DAY = "The second run was recorded at another time";
 const OTHER_CLOCK = "Images do not tell how far the clocks of both runs are apart: each counts from its own first training image.";
 const BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
 
@@ -28,6 +29,7 @@ class Viewer {
     this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, spots: false, at: 0,
       time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
     this.probes = new Probes(this);
+    this.areas = new Areas(this);
     this.camera = this.cameras[0].camera;
     this.target = this.told.centre;
     this.quality = 1;
@@ -53,6 +55,16 @@ class Viewer {
 
   get unit() {
     return this.attribute ? this.attribute.unit : this.told.unit;
+  }
+
+  get quantityName() {
+    return ($("quantity").selectedOptions[0]?.text || "").replace(/^learned: /, "");
+  }
+
+  // What the picture shows, in words.
+  get shownName() {
+    const other = this.beside === "nothing" ? "" : `${this.differing ? " minus" : ", beside it"} ${$("other").selectedOptions[0].text}`;
+    return `${this.quantityName}${other}`;
   }
 
   get range() {
@@ -299,6 +311,7 @@ class Viewer {
     this.stale = { values: false, order: false };
     this.spots = null;
     this.paint();
+    this.areas.measureAll(true);
     this.overlay();
     if (this.state.playing) this.request();
     clearTimeout(this.rest);
@@ -415,9 +428,7 @@ class Viewer {
     }
     const layer = this.layer;
     if (!layer) return null;
-    const [low, high] = told.tableEnds;
-    const value = (share, of) => splats.shown(alpha * low + share * (high - low) + (1 - alpha) * told.background, of);
-    const first = value(blended[j], layer);
+    const first = splats.valueOf(blended[j], alpha, layer);
     const other = this.beside;
     if (other === "nothing" || other === "visible" || (!this.differing && x <= this.state.split * $("canvas").width)) return first;
     let second;
@@ -428,7 +439,7 @@ class Viewer {
     } else if (other === "run") {
       second = ofRun ? this.run.valueOf(ofRun, j) : null;
       if (second === null) return null;
-    } else second = value(blended[j + 1], other === "time" ? layer : splats.layer(other));
+    } else second = splats.valueOf(blended[j + 1], alpha, other === "time" ? layer : splats.layer(other));
     return this.differing ? first - second : second;
   }
 
@@ -471,6 +482,8 @@ class Viewer {
 
   histogram() {
     const values = this.sampled();
+    this.areas.measureAll(false);
+    this.areas.draw();
     if (!this.state.ranges[this.rangeName] || (!this.fitted && values.length > 100)) {
       this.fitted = true;
       this.fit();
@@ -481,10 +494,8 @@ class Viewer {
       const bin = Math.floor((value - low + pad) / (high - low + 2 * pad) * BINS);
       if (bin >= 0 && bin < BINS) counts[bin]++;
     }
-    if (this.state.spots) {
-      this.spots = this.extremes();
-      this.drawMarks();
-    }
+    if (this.state.spots) this.spots = this.extremes();
+    this.drawMarks();
     drawHistogram($("histogram"), counts, low - pad, high + pad, this.range, this.maps[this.mapName].colours);
     this.settled = true;
   }
@@ -498,7 +509,7 @@ class Viewer {
     let hot = null, cold = null;
     for (let y = 0; y < height; y += step) for (let x = 0; x < end; x += step) {
       const j = 4 * ((height - 1 - y) * width + x);
-      if (!(content[j + 3] > 0.5)) continue;  // edges of the scene
+      if (!(content[j + 3] > SURFACE)) continue;
       const value = this.valueOf(content, j, x, y, ofRun);
       if (value === null) continue;
       if (!hot || value > hot.value) hot = { x, y, value };
@@ -529,7 +540,11 @@ class Viewer {
     context.fillRect(0, 0, page.width, page.height);
     context.drawImage(shown, 0, 0);
     context.font = `600 ${12 * ratio}px ${style.fontFamily}`;
-    for (const one of $("marks").querySelectorAll("circle, text")) {
+    for (const one of $("marks").querySelectorAll("circle, text, .area")) {
+      if (one.tagName === "path") {
+        this.tracePath(context, one, ratio);
+        continue;
+      }
       const number = (key) => Number(one.getAttribute(key)) * ratio;
       [context.strokeStyle, context.lineWidth, context.fillStyle] = [one.tagName === "text" ? "#000b" : "#fff", 2 * ratio, "#fff"];
       if (one.tagName === "text") {
@@ -562,6 +577,17 @@ class Viewer {
     return page;
   }
 
+  // A path of the marks as SVG draws it, enlarged.
+  tracePath(context, path, ratio) {
+    const told = (key) => path.getAttribute(key), drawn = new Path2D(told("d"));
+    context.save();
+    context.scale(ratio, ratio);
+    Object.assign(context, { strokeStyle: told("stroke"), lineWidth: Number(told("stroke-width")), fillStyle: told("fill"), globalAlpha: Number(told("stroke-opacity") ?? 1) });
+    if (told("fill") !== "none") context.fill(drawn);
+    context.stroke(drawn);
+    context.restore();
+  }
+
   // Controls follow the state ---------------------------------------------------------------------------------------
 
   overlay() {
@@ -574,6 +600,8 @@ class Viewer {
     $("how").hidden = state.other === "nothing" || state.other === "visible" || this.layer === null;
     $("otherTimeRow").hidden = state.other !== "time";
     $("parts").hidden = state.other !== "sensor";
+    $("runNote").hidden = state.other !== "run" || !this.run;
+    $("runNote").textContent = this.run ? this.run.note : "";
     $("spots").checked = state.spots;
     const swiping = this.beside !== "nothing" && this.layer !== null && !this.differing;
     $("divider").hidden = !swiping;
@@ -599,14 +627,14 @@ class Viewer {
     }
     this.refused = false;
     $("legend").hidden = state.quantity === "visible";
-    $("barLow").textContent = digits(this.range[0]);
+    $("barLow").textContent = `≤ ${digits(this.range[0])}`;  // the last colours are those of all that lies beyond, too
     $("barMiddle").textContent = digits((this.range[0] + this.range[1]) / 2);
-    $("barHigh").textContent = digits(this.range[1]);
-    const quantity = $("quantity").selectedOptions[0]?.text || "";
-    $("barName").textContent = (this.differing ? `minus ${$("other").selectedOptions[0].text}` : quantity.replace(/^learned: /, ""))
+    $("barHigh").textContent = `≥ ${digits(this.range[1])}`;
+    $("barName").textContent = (this.differing ? `minus ${$("other").selectedOptions[0].text}` : this.quantityName)
       + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
     drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
     this.drawMarks();
+    this.areas.draw();
     this.probes.draw();
   }
 
@@ -633,6 +661,7 @@ class Viewer {
       node("circle", { cx: at[0], cy: at[1], r: 6, fill: probe.colour, stroke: "#fff", "stroke-width": 2 }, svg);
       node("text", { x: at[0] + 10, y: at[1] + 4 }, svg, probe.name);
     });
+    this.areas.mark(svg, ratio);
     for (const [name, mark] of Object.entries(this.spots || {})) {
       const x = (mark.x + 0.5) / ratio, y = (mark.y + 0.5) / ratio, near = x > $("canvas").clientWidth - 110;
       node("circle", { class: "spot", cx: x, cy: y, r: 7 }, svg);
@@ -655,8 +684,12 @@ class Viewer {
 
   // A value of the picture, with its unit.
   words(value) {
+    return `${this.differing && value > 0 ? "+" : ""}${this.amount(value)}`;
+  }
+
+  amount(value) {
     const number = this.attribute ? Number(value.toPrecision(3)) : value.toFixed(this.unit ? 2 : 4);
-    return `${this.differing && value > 0 ? "+" : ""}${number}${this.unit ? ` ${this.unit}` : ""}`;
+    return `${number}${this.unit ? ` ${this.unit}` : ""}`;
   }
 
   hover(clientX, clientY) {
@@ -697,6 +730,18 @@ class Viewer {
     this.request();
   }
 
+  // A tool that draws on the picture, or a probe again.
+  pick(tool) {
+    this.areas.choose(this.areas.tool === tool ? "point" : tool);
+    this.say(this.areas.tool === "point" ? "Click to pin a probe." : `Drag to draw a ${tool}; Enter puts one in the middle.`);
+  }
+
+  removeLast() {
+    const since = ({ list }) => list.at(-1)?.since ?? -1;
+    (since(this.areas) > since(this.probes) ? this.areas : this.probes).list.pop();
+    this.request();
+  }
+
   cycle(id, key) {
     const options = [...$(id).options].map((option) => option.value);
     this.choose({ [key]: options[(options.indexOf(this.state[key]) + 1) % options.length] });
@@ -729,7 +774,7 @@ class Viewer {
       $("other").querySelector("[value=run]")?.remove();
       $("other").append(new Option(this.run.label, "run"));
       this.choose({ other: "run" });
-      if (this.run.ownClock) this.say(OTHER_CLOCK);
+      if (this.run.clockNote || this.run.doubts.length) this.say(this.run.note);
     } catch (error) {
       this.say(`${file.name} cannot be opened: ${error.message}`);
     }
