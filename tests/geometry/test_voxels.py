@@ -1,5 +1,7 @@
 """Cubes, their numbers and middles, against what is counted by hand."""
 
+import math
+
 import pytest
 import torch
 
@@ -34,5 +36,6 @@ def test_anchors_begin_in_cubes_that_hold_a_point():
     found = Voxels(voxel=1.0)._means(Points(points), torch.Generator(), None)
     assert found.tolist() == [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]
     assert len(Voxels(voxel=1.0)._means(Points(points), torch.Generator().manual_seed(0), 2)) == 2
+    assert torch.equal(Voxels(voxel=1.0)._means(Points(points), torch.Generator(), math.inf), found)
     with pytest.raises(SceneError, match="no voxel size can be derived from them: give init.voxel"):
         Voxels()._means(Points(torch.zeros(5, 3)), torch.Generator(), None)

@@ -74,7 +74,7 @@ def test_training_lowers_the_error():
         ({"batch": "abc"}, "study.batch must be a whole number, 1 or more, got abc"),
         ({"factor": 0}, "study.factor must be a whole number"),
         ({"rate": "abc"}, "study.rate"),
-        ({"rate": 0}, "study.rate must be above 0, or nothing is learned, got 0"),
+        ({"rate": 0}, "study.rate must be above 0, got 0"),
         ({"network": NETWORK | {"heads": 5}}, "dim=8 channels .* study.network.heads=5: give a multiple of 5"),
         ({"network": NETWORK | {"heads": 0}}, "study.network.heads must be a whole number, 1 or more, got 0"),
         ({"network": NETWORK | {"depths": [2, "a"]}}, "study.network.depths must be a whole number"),

@@ -159,7 +159,7 @@ class Voxels(Initialisation):
                 f"most points of scene '{scene.name}' coincide, so no voxel size can be derived from them: give init.voxel"
             )
         means = middles(torch.unique(cells(scene.points, size), dim=0), size)
-        return means if most is None else _drawn(means, int(most), generator)
+        return means if most is None else _drawn(means, most, generator)
 
 
 class Pretrained(Start):
@@ -200,11 +200,11 @@ class Pretrained(Start):
         return with_heat(geometry, scene, thermal, seed)
 
 
-def _drawn(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Points [n, 3] in their order, at most ``count`` of them: of more, a draw."""
-    if count >= len(points):
+def _drawn(points: Tensor, most: float, generator: torch.Generator) -> Tensor:
+    """Points [n, 3] in their order, at most ``most`` of them, infinity for all: of more, a draw."""
+    if most >= len(points):
         return points
-    return points[torch.randperm(len(points), generator=generator)[:count].sort().values]
+    return points[torch.randperm(len(points), generator=generator)[: int(most)].sort().values]
 
 
 def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
