@@ -224,8 +224,8 @@ def load(
         trust: classes of yours that the checkpoint may name, fully dotted (``runs.trust.trusted``).
 
     Raises:
-        SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no
-            weather to change.
+        SceneError: there is no checkpoint of a run, it names classes that are not known, its data are not those of training any
+            more (``training.trained_frames``), or its method or data set has no weather to change.
     """
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
@@ -249,7 +249,8 @@ def load(
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint, changed):
-        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}))
+        per_frame = any(name.endswith("frame_ids") for name in loaded.get("state_dict", ()))
+        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}), exactly=per_frame)
         restore(module, scene_data, loaded)
         if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
             module.renderer.backend = "auto"
