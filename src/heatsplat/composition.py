@@ -96,6 +96,13 @@ def options_of(group: str) -> list[str]:
     return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
+def further_places() -> list[str]:
+    """Where configurations are beside heatsplat's, by --config-dir and hydra.searchpath of this job; none outside of one."""
+    sources = HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ()
+    named = [source for source in sources if re.match(r"command-line|hydra\.searchpath", source.provider)]
+    return [f"{source.schema}://{source.path}" for source in named]
+
+
 def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
     """Which option of each group a training run with these overrides has, such as {"density": "adaptive"}."""
     with contextlib.nullcontext() if _is_open() else _opened():
