@@ -28,6 +28,8 @@ from heatsplat.training.sampler import StepSampler
 
 __all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "RawScene", "SceneDataModule", "SceneOptions", "build_scene"]
 
+REPORT_FILE = "report.html"  # of a preparation
+
 log = logging.getLogger(__name__)
 
 
@@ -143,7 +145,11 @@ class SceneDataModule(pl.LightningDataModule, ABC):
             scenes = [p.name for p in sorted(root.iterdir()) if p.is_dir() and is_scene(p)]
             raise SceneError(
                 f"data.root={root} is no scene itself ({looked_for} is missing); "
-                + (f"choose one with data.scene: {', '.join(scenes)}" if scenes else f"it holds {_listed(root)}")
+                + (
+                    f"choose one with data.scene: {', '.join(scenes)}"
+                    if scenes
+                    else f"it holds {_listed(root)}. {_towards_a_scene(root)}"
+                )
             )
         folder = root / self.scene_name
         if not folder.is_dir():
@@ -170,6 +176,15 @@ class SceneDataModule(pl.LightningDataModule, ABC):
 def _read_mask(path: Path, white_counts: bool) -> np.ndarray:
     pixels = to_grey(split_alpha(read_image(path))[0])
     return (pixels > 0) == white_counts
+
+
+def _towards_a_scene(folder: Path) -> str:
+    """What makes a scene of a folder that is none, in words."""
+    if (folder / REPORT_FILE).is_file():
+        return f"A preparation left it without cameras: {REPORT_FILE} in it says why"
+    return (
+        "Of a camera's files, prepare.py source=FOLDER target=OTHER makes a scene in another folder, to be given here"
+    )
 
 
 def _listed(folder: Path, most: int = 20) -> str:

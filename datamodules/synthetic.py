@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,13 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics.units import DAY_S
 
+LAYOUTS = {  # what marks a scene of another data set
+    "rhd": "thermal/sparse/0",
+    "colmap": "sparse/0",
+    "thermoscenes": "transforms_thermal.json",
+    "nerfstudio": "transforms.json",
+    "benchmark": "scenes/*/meta.json",
+}
 STORED = {8: np.uint8, 16: np.uint16}  # integer type of images by their bits
 
 
@@ -50,7 +58,7 @@ class Synthetic(SceneDataModule):
         split: a rule, or None for the preset's own: the last day is held out outdoors, every 8th frame elsewhere. "parts" holds
             out several parts, whose names begin those of their frames, and gives every view its exact image.
         parts: what "parts" leaves out (``synthetic_scene.parts.parts_of``).
-        root: not used; the name is there so that every data set takes the same keys.
+        root: None; the name is there so that every data set takes the same keys.
         **options: of ``SceneDataModule``: downscale, seed, ...
     """
 
@@ -73,6 +81,10 @@ class Synthetic(SceneDataModule):
         root: str | None = None,
         **options,
     ) -> None:
+        if root is not None:
+            raise SceneError(
+                f"data.root={root} is given, but data=synthetic (the default) reads no folder: {_meant(Path(root).expanduser())}"
+            )
         number = number_of(scene, DRAWN)
         self.drawn = None if number is None else drawn(number)
         outdoors = scene in YARDS or self.drawn is not None and isinstance(self.drawn.preset, OutdoorPreset)
@@ -200,6 +212,20 @@ class Synthetic(SceneDataModule):
             return solved(known if self.hours is None else replace(known, hours=self.hours))
         preset = None if self.drawn is None else self.drawn.preset
         return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else None
+
+
+def _meant(folder: Path) -> str:
+    """Which data set was meant by a folder, as its files tell, in words."""
+    if not folder.is_dir():
+        return "there is no such folder; leave data.root out for a made-up scene"
+    places = (folder, *(place for place in sorted(folder.iterdir()) if place.is_dir()))
+    for name, mark in LAYOUTS.items():
+        if found := next((path for place in places for path in place.glob(mark)), None):
+            return f"did you mean data={name}? The folder has {found.relative_to(folder)}"
+    return (
+        f"say with data=... what the folder holds ({', '.join(LAYOUTS)}, ...), make a scene of a camera's files by "
+        "prepare.py, or leave data.root out for a made-up scene"
+    )
 
 
 def _of_the_yard(world: OutdoorScene, recording: Recording) -> dict[str, Any]:

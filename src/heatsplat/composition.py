@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
-from heatsplat.io.settings import at
+from heatsplat.io.settings import at, walk
 from heatsplat.training.machine import cores
 
 ROOT = CHECKOUT or Path.cwd()  # outputs/ goes there
@@ -38,18 +38,57 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
     Args:
         overrides: as the command line has them.
         name: of the command: train | evaluate | render | simplify | view | export | study | prepare.
+
+    Raises:
+        TypeError: the overrides are no list of texts.
     """
-    return plain(compose_unresolved(overrides, name), overrides)
+    if isinstance(overrides, str) or not all(isinstance(text, str) for text in overrides):
+        raise TypeError(
+            f"compose takes a list of overrides, such as ['method=etgs', 'max_steps=2000'], got {overrides!r}"
+        )
+    users = HydraConfig.instance().cfg if GlobalHydra.instance().is_initialized() and not _is_open() else None
+    try:
+        return plain(compose_unresolved(overrides, name), overrides)
+    finally:
+        if users is not None:
+            HydraConfig.instance().cfg = users
+
+
+def _is_open() -> bool:
+    """Whether Hydra composes from heatsplat's configurations now, as in a job of the command line. Within another program it
+    composes from those of that."""
+    found = GlobalHydra.instance()
+    places = found.config_loader().get_search_path().get_path() if found.is_initialized() else ()
+    return any(str(place.path).removeprefix("file://") == CONF for place in places)
+
+
+@contextlib.contextmanager
+def _opened() -> Iterator[None]:
+    """Hydra composes from heatsplat's configurations while it lasts, and then again from those of the program around it."""
+    around = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(CONF, version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = around
 
 
 def compose_unresolved(overrides: Sequence[str] = (), name: str = "train") -> DictConfig:
     """As ``compose``, before its interpolations are resolved."""
-    if GlobalHydra.instance().is_initialized():
+    if _is_open():
         return hydra.compose(name, list(overrides))
-    with hydra.initialize_config_dir(CONF, version_base="1.3"):
+    with _opened():
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+
+
+@functools.cache
+def module_settings() -> dict[str, str]:
+    """What the training module is built from: dotted keys in "module", with those of the settings that are copied there."""
+    module = OmegaConf.to_container(OmegaConf.load(Path(CONF) / "train.yaml"), resolve=False)["module"]
+    return {place: value[2:-1] for place, value in walk(module) if re.fullmatch(r"\$\{[\w.]+\}", str(value))}
 
 
 def options_of(group: str) -> list[str]:
@@ -57,10 +96,16 @@ def options_of(group: str) -> list[str]:
     return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
+def further_places() -> list[str]:
+    """Where configurations are beside heatsplat's, by --config-dir and hydra.searchpath of this job; none outside of one."""
+    sources = HydraConfig.get().runtime.config_sources if HydraConfig.initialized() else ()
+    named = [source for source in sources if re.match(r"command-line|hydra\.searchpath", source.provider)]
+    return [f"{source.schema}://{source.path}" for source in named]
+
+
 def choices_of(overrides: Sequence[str] = ()) -> dict[str, str]:
     """Which option of each group a training run with these overrides has, such as {"density": "adaptive"}."""
-    open_already = GlobalHydra.instance().is_initialized()
-    with contextlib.nullcontext() if open_already else hydra.initialize_config_dir(CONF, version_base="1.3"):
+    with contextlib.nullcontext() if _is_open() else _opened():
         config = hydra.compose("train", list(overrides), return_hydra_config=True)
     return dict(config.hydra.runtime.choices)
 

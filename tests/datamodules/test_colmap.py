@@ -217,6 +217,13 @@ def test_no_sparse_model_says_what_was_looked_for(tmp_path):
     write_image(tmp_path / "s" / "images" / "a.png", grey(0))
     with pytest.raises(SceneError, match=r"a sparse model \(sparse/0\) is missing; .*holds images/"):
         Colmap(root=str(tmp_path), scene="s").setup()
+    with pytest.raises(
+        SceneError, match="it holds s/. Of a camera's files, prepare.py source=FOLDER target=OTHER makes"
+    ):
+        Colmap(root=str(tmp_path)).setup()
+    (tmp_path / "report.html").write_text("")
+    with pytest.raises(SceneError, match="A preparation left it without cameras: report.html"):
+        Colmap(root=str(tmp_path)).setup()
     with pytest.raises(SceneError, match="no sparse model in .*Reconstruct the scene with COLMAP first"):
         read_model(tmp_path / "s")
 

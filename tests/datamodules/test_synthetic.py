@@ -344,3 +344,21 @@ def test_bad_presets_are_named():
         Preset(surfaces=TABLE_TOP[:1] * 2)
     with pytest.raises(ValueError, match="either held steady or heated"):
         Preset(held=True, lamp=PRESETS["heated"].lamp)
+
+
+@pytest.mark.parametrize(
+    ("mark", "said"),
+    [
+        ("sparse/0/cameras.bin", "did you mean data=colmap. The folder has sparse/0"),
+        ("scene/transforms.json", "did you mean data=nerfstudio. The folder has scene/transforms.json"),
+        ("scene/thermal/sparse/0/cameras.bin", "did you mean data=rhd"),
+        ("IR_0001.jpg", "say with data=... what the folder holds .*prepare.py"),
+    ],
+)
+def test_a_folder_that_would_not_be_read_is_refused(tmp_path, mark, said):
+    (tmp_path / mark).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / mark).write_text("")
+    with pytest.raises(SceneError, match=f"data.root={tmp_path} is given, but data=synthetic .*{said}"):
+        Synthetic(root=str(tmp_path))
+    with pytest.raises(SceneError, match="there is no such folder"):
+        Synthetic(root=str(tmp_path / "nowhere"))

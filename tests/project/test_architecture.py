@@ -45,7 +45,7 @@ ALLOWED = {
         "splats",
         "training",
     },
-    "studies": {"contracts", "geometry", "losses", "metrics", "io", "training"},
+    "studies": {"composition", "contracts", "geometry", "losses", "metrics", "io", "training"},
     "training": {
         "contracts",
         "geometry",

@@ -1,7 +1,9 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
+import hydra
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from running import TINY
 
 import heatsplat
@@ -43,8 +45,66 @@ def test_a_step_changes_no_configuration_that_it_is_given(trained):
 
 def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
     folder, config, _ = trained
-    with pytest.raises(OccupiedError, match=r"other settings \(seed\)"):
-        heatsplat.train(config | {"seed": 7}, folder)
+    with pytest.raises(OccupiedError, match=r"other settings \(data.seed, seed\)"):
+        heatsplat.train(heatsplat.compose([*QUICK, "seed=7"]), folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda config: config.update(seed=1),
+            r"seed was changed after compose, from 0 to 1, .*compose\(\[..., 'seed=1'\]\)",
+        ),
+        (lambda config: config.update(max_steps=9), "max_steps was changed after compose"),
+        (lambda config: config["thermal"].update(lr_rate=0.1), "'thermal.lr_rate=0.1'"),
+        (
+            lambda config: config["loss"]["terms"]["photometric"].update(dssim_weight=0.1),
+            "loss.terms.photometric.dssim_weight",
+        ),
+        (lambda config: config["normals"].update(views=3), "normals.views was changed after compose"),
+    ],
+)
+def test_a_setting_that_is_changed_where_nothing_reads_it_is_refused(change, told):
+    config = heatsplat.compose(["method=etgs"])
+    assert checked(config) == config
+    change(config)
+    with pytest.raises(SceneError, match=told):
+        checked(config)
+
+
+def test_another_program_that_uses_hydra_composes_ours_and_goes_on_with_its_own(tmp_path):
+    (tmp_path / "theirs.yaml").write_text("mine: 1\n")
+    with hydra.initialize_config_dir(str(tmp_path), version_base="1.3"):
+        theirs = hydra.compose("theirs", return_hydra_config=True)
+        HydraConfig.instance().set_config(theirs)
+        config = heatsplat.compose(["method=etgs"])
+        assert config["name"] == "etgs" and checked(config) == config
+        assert hydra.compose("theirs").mine == 1 and HydraConfig.get().job.config_name == "theirs"
+
+
+@pytest.mark.parametrize("overrides", ["method=etgs", [1]])
+def test_overrides_that_are_no_list_of_texts_are_refused(overrides):
+    with pytest.raises(TypeError, match="compose takes a list of overrides"):
+        heatsplat.compose(overrides)
+    with pytest.raises(TypeError, match="train takes a configuration, such as heatsplat.compose"):
+        heatsplat.train(overrides)
+
+
+def test_what_is_given_to_the_module_itself_passes():
+    config = heatsplat.compose(["method=etgs", "module.seed=3"])
+    assert checked(config) == config
+
+
+@pytest.mark.parametrize("devices", ["2", "[0,1]", "'0,1'"])
+def test_several_devices_for_one_scene_are_refused(devices):
+    with pytest.raises(SceneError, match="one scene trains on one device, .* ask for 2"):
+        checked(heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"]))
+
+
+@pytest.mark.parametrize("devices", ["1", "[0]", "auto", "'1'"])
+def test_one_device_passes(devices):
+    checked(heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"]))
 
 
 def test_a_checkpoint_of_a_gpu_is_looked_at_where_there_is_none(trained, tmp_path):
@@ -67,6 +127,7 @@ def test_a_checkpoint_is_read_on_the_scales_of_its_run(trained, tmp_path):
     bounds, frame = own.scene.thermal_range, own.scene.test.frames[0]
     assert stored["heatsplat"]["scales"]["range_c"] == [bounds.min_c, bounds.max_c]
     stored["heatsplat"]["scales"] |= {"range_c": [0.0, 100.0], "first": own.scene.test.frames[0].name}
+    stored["heatsplat"]["scales"].pop("frames")  # which are on the clock of their run
     torch.save(stored, tmp_path / "other.ckpt")
     other = heatsplat.load(tmp_path / "other.ckpt")
     torch.testing.assert_close(

@@ -92,6 +92,9 @@ def test_classes_of_registered_packages_and_those_that_the_user_names_may_be_bui
         built = own | {"module": composed["module"] | {"thermal": own["thermal"]}}
         run.load(stored(tmp_path, built), trust=["my_package.heat.Mine"])
     assert trust.trusted(own, "own.ckpt", ["my_package.heat.Mine"])
+    mine = type("Mine", (), {"__module__": "my_package.heat"})
+    for one in ("my_package.heat.Mine", mine, [mine]):
+        assert run._names(one) == ["my_package.heat.Mine"]
 
     class Entry:
         value = "my_package.heat:Mine"

@@ -1,10 +1,14 @@
 """Runs of a study: found again where they are the same, refused where they are not, and told where they fail."""
 
+import json
 import sys
 from pathlib import Path
 
+import hydra
 import pytest
+from hydra.core.hydra_config import HydraConfig
 
+from heatsplat.composition import CONF
 from heatsplat.contracts import SceneError
 from heatsplat.studies.child_runs import OtherSettingsError, all_rows, train_or_read
 
@@ -67,3 +71,17 @@ def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):
         train_or_read(place, script, ["seed=13"], tmp_path / "study")
     assert f"{place / 'FAILED'} says why" in str(failure.value) and sys.executable in str(failure.value)
     assert f"hydra.run.dir={tmp_path / 'study'} goes on" in str(failure.value)
+
+
+def test_a_run_is_told_of_configurations_beside_ours(script, tmp_path, monkeypatch):
+    """Of a plugin's folder, which the study was given by --config-dir."""
+    (tmp_path / "plugin, mine").mkdir()
+    name = f"hydra.searchpath=['file://{tmp_path}/plugin, mine']"
+    before = HydraConfig.instance().cfg
+    try:
+        with hydra.initialize_config_dir(CONF, version_base="1.3"):
+            HydraConfig.instance().set_config(hydra.compose("study", [name], return_hydra_config=True))
+        trained(tmp_path / "one", script, ["seed=1"], tmp_path)
+    finally:
+        HydraConfig.instance().cfg = before
+    assert name in json.loads((tmp_path / "one" / ".hydra" / "overrides.yaml").read_text())

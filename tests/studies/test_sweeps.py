@@ -11,9 +11,10 @@ from commands import succeeds
 from hydra.core.utils import JobReturn, JobStatus
 from running import compose_run
 
-from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.contracts import SceneError
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
-from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, row_names, settings_of
+from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
 from heatsplat.studies.sweeps import collect, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
@@ -300,3 +301,17 @@ def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
     succeeds(command)
     (folder,) = (path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert folder.name.startswith("etgs_cooling_0_") and len(folder.name) < 160
+
+
+def test_runs_are_found_in_a_folder_at_any_depth_but_not_within_each_other(tmp_path):
+    for place in ("a/one", "a/one/evaluations/first", "b/deep/two"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / FAILED).write_text("RuntimeError: broken")
+    expected = [tmp_path / "a/one", tmp_path / "b/deep/two"]
+    for folders in (tmp_path, str(tmp_path), [str(tmp_path)], expected):
+        assert read_runs(folders)["folder"].tolist() == expected
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError, match="empty holds no run"):
+        read_runs([tmp_path / "empty"])
+    with pytest.raises(SceneError, match="there is no folder .*nowhere"):
+        read_runs(tmp_path / "nowhere")

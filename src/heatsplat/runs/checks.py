@@ -7,10 +7,13 @@ import os
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import torch
+
+from heatsplat.composition import module_settings, overlap
 from heatsplat.contracts import SceneError, check_count
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
-from heatsplat.io.settings import walk
+from heatsplat.io.settings import at, walk
 from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
@@ -37,11 +40,12 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
 
     Raises:
         SceneError: settings contradict each other, are of another kind than is asked for or asked for by nothing, lie out of
-            range, or need what this machine lacks.
+            range, were changed where nothing reads them any more, or need what this machine lacks.
         ImportError: the renderer is not installed.
     """
     _check_ranges(config)
     check_declared(config)
+    _check_as_composed(config)
     _check_first_stage(config)
     check_last_stage(config)
     _check_machine(config)
@@ -60,6 +64,29 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
                 "Set its parts by effects.states.*, effects.parts.* and effects.sensor.*, or choose a method that has its own."
             )
     return config
+
+
+def _check_as_composed(config: Mapping[str, Any]) -> None:
+    """Raises SceneError for a setting that was changed after composition: the module is built from what was composed."""
+    given = keys_of(config["overrides"])
+    for place, key in module_settings().items():
+        if any(overlap(f"module.{place}", other) for other in given):
+            continue
+        changed = _difference(key, at(config, key), at(config["module"], place))
+        if changed is not None:
+            name, value, composed = changed
+            raise SceneError(
+                f"{name} was changed after compose, from {composed} to {value}, and would not take effect: give it to "
+                f"compose, as in compose([..., '{name}={value}'])"
+            )
+
+
+def _difference(key: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
+    """Dotted key and both values of the first setting in which two differ; None where they are equal."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        found = (_difference(f"{key}.{name}", one.get(name), other.get(name)) for name in {**other, **one})
+        return next((difference for difference in found if difference is not None), None)
+    return None if one == other else (key, one, other)
 
 
 def _check_first_stage(config: Mapping[str, Any]) -> None:
@@ -113,4 +140,21 @@ def _weights(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _check_machine(config: Mapping[str, Any]) -> None:
-    device_of(config["trainer"]["accelerator"], config["renderer"])
+    device = device_of(config["trainer"]["accelerator"], config["renderer"])
+    devices = _devices(config["trainer"].get("devices", 1), device) * (config["trainer"].get("num_nodes") or 1)
+    if devices > 1:
+        raise SceneError(
+            f"one scene trains on one device, but trainer.devices and trainer.num_nodes ask for {devices}: leave them out. "
+            "Several devices take jobs side by side: add -m and launcher=joblib or launcher=slurm"
+        )
+
+
+def _devices(asked: Any, device: str) -> int:
+    """How many devices Lightning would take: of a number, a list of them, or all there are ("auto", -1)."""
+    if isinstance(asked, str) and "," in asked:
+        asked = [one for one in asked.split(",") if one.strip()]
+    if isinstance(asked, list | tuple):
+        return len(asked)
+    if str(asked) in ("auto", "-1"):
+        return torch.cuda.device_count() if device == "cuda" else 1
+    return int(asked) if str(asked).isdecimal() else 1

@@ -71,7 +71,10 @@ def train(config: dict[str, Any], output_dir: Path | str | None = None) -> RunRe
     Raises:
         SceneError: the configuration or the scene cannot be trained, with the remedy.
         OccupiedError: the folder holds results of other settings, or another process trains in it.
+        TypeError: the configuration is none.
     """
+    if not isinstance(config, dict) or "module" not in config:
+        raise TypeError(f"train takes a configuration, such as heatsplat.compose(['method=etgs']), got {config!r}")
     if output_dir is None:
         data = config["data"]
         scene = scene_name("data", data.get("root"), data.get("scene"))
@@ -211,7 +214,7 @@ def load(
     weather: Path | str | None = None,
     weather_zone: str | None = None,
     output_dir: Path | str = ".",
-    trust: Sequence[str] = (),
+    trust: Sequence[str | type] | str | type = (),
 ) -> Trained:
     """The trained scene of a checkpoint, on the clock and with the bounds of its run (``training.scales``).
 
@@ -222,16 +225,17 @@ def load(
         weather: table of another weather for the scene's place and times.
         weather_zone: zone of its times where they have no offset.
         output_dir: folder for what is measured of it.
-        trust: classes of yours that the checkpoint may name, fully dotted (``runs.trust.trusted``).
+        trust: classes of yours that the checkpoint may name, or one of them: themselves or their names, fully dotted
+            (``runs.trust.trusted``).
 
     Raises:
-        SceneError: there is no checkpoint of a run, it names classes that are not known, or its method or data set has no
-            weather to change.
+        SceneError: there is no checkpoint of a run, it names classes that are not known, its data are not those of training any
+            more (``training.trained_frames``), or its method or data set has no weather to change.
     """
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
     loaded = load_checkpoint(checkpoint)
-    config = trusted(stored_config(loaded), checkpoint, trust)
+    config = trusted(stored_config(loaded), checkpoint, _names(trust))
     if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
     changed = {key: None if value == "null" else value for key, value in (data or {}).items() if value is not None}
@@ -250,12 +254,18 @@ def load(
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint, changed):
-        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}))
+        per_frame = any(name.endswith("frame_ids") for name in loaded.get("state_dict", ()))
+        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}), exactly=per_frame)
         restore(module, scene_data, loaded)
         if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
             module.renderer.backend = "auto"
         _try_render(module, scene_data.scene.train.frames[0])
     return Trained(config, module, scene_data, loaded)
+
+
+def _names(trust: Sequence[str | type] | str | type) -> list[str]:
+    classes = [trust] if isinstance(trust, str | type) else trust
+    return [one if isinstance(one, str) else f"{one.__module__}.{one.__qualname__}" for one in classes]
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from heatsplat.composition import further_places
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import key_of, setting
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
@@ -45,7 +46,7 @@ def train_or_read(place: Path, train: str | None, overrides: Sequence[str], stud
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
     program = [train] if train else ["-c", INSTALLED]
-    command = [sys.executable, *program, *overrides, setting("hydra.run.dir", place)]
+    command = [sys.executable, *program, *overrides, setting("hydra.run.dir", place), *_further_configurations()]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         failed = place / FAILED
@@ -55,6 +56,12 @@ def train_or_read(place: Path, train: str | None, overrides: Sequence[str], stud
             f"Command: {shlex.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
         )
     return RunResults.read(place / METRICS_FILE)
+
+
+def _further_configurations() -> list[str]:
+    """What tells a run of the configurations beside heatsplat's that the study was told of."""
+    quoted = [setting("", place).removeprefix("=") for place in further_places()]
+    return [f"hydra.searchpath=[{','.join(quoted)}]"] if quoted else []
 
 
 def spelled(value: Any) -> str:

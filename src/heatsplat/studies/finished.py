@@ -5,15 +5,16 @@ from __future__ import annotations
 import re
 import statistics
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
-from heatsplat.studies.recorded import config_of, overrides_of
+from heatsplat.studies.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 
 # Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
 # are among them; the method is named by itself.
@@ -73,14 +74,36 @@ class Runs:
         return statistics.stdev(values) if len(values) > 1 else None
 
 
-def read_runs(folders: Iterable[Path]) -> pd.DataFrame:
-    """A row for each run, in the order of the folders.
+def read_runs(folders: Iterable[Path | str] | Path | str) -> pd.DataFrame:
+    """A row for each run, in the order of the folders; of a folder that is no run a row for each that lies below it.
 
     Columns: folder, scene, method, row (of a sweep, "" for none), overrides (key -> value), failed (why there are no results,
     None where there are), results (None where there are none), data (the options of the data), then every score of the test
     views and every cost, NaN where a run has none.
+
+    Raises:
+        SceneError: a folder is none, or has no run in it.
     """
-    return pd.DataFrame([_read(folder) for folder in folders])
+    places = [folders] if isinstance(folders, Path | str) else folders
+    return pd.DataFrame([_read(run) for place in places for run in _runs_in(Path(place))])
+
+
+def _runs_in(place: Path) -> list[Path]:
+    if not place.is_dir():
+        raise SceneError(f"there is no folder {place}")
+    found = list(_runs_below(place))
+    if not found:
+        raise SceneError(f"{place} holds no run, nor does any folder below it: a run has {METRICS_FILE} or {OVERRIDES}")
+    return found
+
+
+def _runs_below(place: Path) -> Iterator[Path]:
+    """The folder itself where it is one of a run; else those below it, but none within a run, such as of its evaluations."""
+    if any((place / name).exists() for name in (METRICS_FILE, FAILED, OVERRIDES, CONFIG)):
+        yield place
+        return
+    for inner in sorted(path for path in place.iterdir() if path.is_dir()):
+        yield from _runs_below(inner)
 
 
 def _read(folder: Path) -> dict[str, Any]:

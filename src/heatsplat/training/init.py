@@ -18,6 +18,7 @@ from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.rng import generator_for
+from heatsplat.training.trained_frames import moved
 
 log = logging.getLogger(__name__)
 
@@ -186,8 +187,10 @@ class Pretrained(Start):
             raise SceneError(
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
             )
-        read = _splats_of_file if self.path.suffix == ".ply" else _splats_of_checkpoint
-        geometry, rows = read(self.path)
+        if self.path.suffix == ".ply":
+            geometry, rows = _splats_of_file(self.path)
+        else:
+            geometry, rows = _splats_of_checkpoint(self.path, scene)
         if rows not in (GAUSSIANS, thermal.rows):
             held = "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
             raise SceneError(
@@ -248,8 +251,8 @@ def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], str]:
     return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}, GAUSSIANS
 
 
-def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
-    """Geometry of a checkpoint, and what its rows are."""
+def _splats_of_checkpoint(path: Path, scene: SceneData) -> tuple[dict[str, Tensor], str]:
+    """Geometry of a checkpoint, and what its rows are; cameras of frames of the same names that moved are warned of."""
     try:
         stored = load_checkpoint(path)
     except SceneError as error:
@@ -259,7 +262,17 @@ def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
     if missing:
         raise SceneError(f"init.path={path} is no checkpoint of heatsplat: it holds no {', '.join(missing)} of splats")
     geometry = {name: tensors[f"splats.raw.{name}"] for name in GEOMETRY}
-    rows = stored.get("heatsplat", {}).get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
+    own = stored.get("heatsplat", {})
+    frames = own.get("scales", {}).get("frames")
+    if frames is not None and (
+        told := moved(frames, scene.train.frames)
+    ):  # those of another camera do, by its mounting
+        log.warning(
+            "init.path=%s: %s: unless the frames are of another camera, its Gaussians are not in the world of this scene",
+            path,
+            told,
+        )
+    rows = own.get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
     return geometry, rows
 
 

@@ -34,7 +34,7 @@ from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
-from heatsplat.training.scales import scales_of
+from heatsplat.training.scales import check_same_scene, scales_of
 from heatsplat.training.scene_model import SceneModel
 from heatsplat.training.schedule import Schedule
 from heatsplat.training.stages import Stages
@@ -410,7 +410,12 @@ class SplatTraining(SceneModel):
             checkpoint[CHECKPOINT_KEY]["average"] = self._average.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Gives every tensor the size that it has in the checkpoint; Lightning then loads the values."""
+        """Training goes on from the checkpoint, on the scene that it was trained on; Lightning then loads the values."""
+        self.make_room(checkpoint)
+        check_same_scene(self.scene, checkpoint[CHECKPOINT_KEY].get("scales", {}))
+
+    def make_room(self, checkpoint: dict[str, Any]) -> None:
+        """Gives every tensor the size that it has in the checkpoint, and takes over what is no tensor."""
         weights = checkpoint["state_dict"]
         check_same_method(self, checkpoint)
         self.splats.resize(weights["splats.raw.means"].shape[0])

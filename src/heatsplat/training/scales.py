@@ -1,7 +1,8 @@
-"""What a checkpoint counts in: the clock and the temperatures of the scene that it was trained on.
+"""What a checkpoint counts in: the clock, the temperatures and the cameras of the scene that it was trained on.
 
-Both follow from the training images: time begins at the first of them, and bounds of temperatures may be theirs. Data that are
-divided otherwise, or have other bounds, would be read on other scales than those on which a model has learned.
+Clock and temperatures follow from the training images: time begins at the first of them, and bounds of temperatures may be
+theirs. Data that are divided otherwise, or have other bounds, would be read on other scales than those on which a model has
+learned.
 """
 
 from __future__ import annotations
@@ -13,28 +14,48 @@ from typing import Any
 
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, ThermalRange, View, ViewSet
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.training.trained_frames import check_frames, frames_of
 
 log = logging.getLogger(__name__)
 
 
 def scales_of(scene: SceneData) -> dict[str, Any]:
-    """What a checkpoint tells of a scene: "range_c", its bounds in °C, and "first", the name of its first training frame.
+    """What a checkpoint tells of a scene: "range_c", its bounds in °C, "first", the name of its first training frame, and
+    "frames" (``trained_frames.frames_of``).
 
-    Each is None where the scene has no temperatures, or no times.
+    The first two are None where the scene has no temperatures, or no times.
     """
     bounds, frames = scene.thermal_range, scene.train.frames
     timed = "time" in scene.metadata and len(frames) > 0
     return {
         "range_c": None if bounds is None else [bounds.min_c, bounds.max_c],
         "first": min(frames, key=lambda frame: frame.time_s).name if timed else None,
+        "frames": frames_of(scene),
     }
 
 
-def on_scales(scene: SceneData, scales: Mapping[str, Any]) -> SceneData:
+def check_same_scene(scene: SceneData, scales: Mapping[str, Any]) -> None:
+    """Raises SceneError where training cannot go on with a scene, which is not the one of its checkpoint (``scales_of``)."""
+    check_frames(scales.get("frames"), scene, exactly=True)
+    here, bounds = scene.thermal_range, scales.get("range_c")
+    if bounds is not None and here is not None and bounds != [here.min_c, here.max_c]:
+        raise SceneError(
+            f"the images of scene '{scene.name}' have bounds of {here.min_c:.6g} to {here.max_c:.6g} °C, and in training had "
+            f"{bounds[0]:.6g} to {bounds[1]:.6g} °C: give the data as they were, or train again, in another folder"
+        )
+
+
+def on_scales(scene: SceneData, scales: Mapping[str, Any], *, exactly: bool = False) -> SceneData:
     """The scene on the scales of a checkpoint (``scales_of``): times since its first frame, image values of its bounds.
 
     Where the first frame is not among the scene's any more, times stay as they are, and a warning says so.
+
+    Args:
+        exactly: its training frames have to be those of the checkpoint (``trained_frames.check_frames``).
+
+    Raises:
+        SceneError: its cameras or frames are not those of the checkpoint.
     """
     first, bounds = scales.get("first"), scales.get("range_c")
     if first is not None and "time" in scene.metadata:
@@ -47,6 +68,7 @@ def on_scales(scene: SceneData, scales: Mapping[str, Any]) -> SceneData:
         elif later != 0:
             log.info("times are counted from frame %s, as in training", first)
             scene = _since(scene, later)
+    check_frames(scales.get("frames"), scene, exactly=exactly)
     here = scene.thermal_range
     if bounds is not None and here is not None and bounds != [here.min_c, here.max_c]:
         log.warning(

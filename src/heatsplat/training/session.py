@@ -87,7 +87,7 @@ def restore(module: SplatTraining, data: pl.LightningDataModule, checkpoint: dic
     """
     data.setup("test")
     module.attach(data.scene)
-    module.on_load_checkpoint(checkpoint)
+    module.make_room(checkpoint)
     module.load_state_dict(checkpoint["state_dict"])
     broken = [name for name, parameter in module.named_parameters() if not bool(parameter.isfinite().all())]
     if broken:

@@ -1,0 +1,131 @@
+"""The frames that a run was trained on, as its checkpoint tells them, and what has become of them in the data since.
+
+A folder that is prepared again has another coordinate system, and often other frames: a trained scene would be looked at from
+wrong places there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Frame, SceneData, SceneError
+
+# Below these nothing moved: the last digits of a file, or the pixel counts of a smaller image.
+TURNED = 1e-4  # rad
+MOVED = 1e-4  # distance, in median distances of the training cameras from their middle
+LENS = 1e-3  # of the image's width or height
+LATER_S = 1e-2
+
+
+def frames_of(scene: SceneData) -> dict[str, Any]:
+    """What a checkpoint tells of the frames of a scene.
+
+    "names" and "frame_ids" of the n training frames in their order, "viewmats" [n, 4, 4], "lenses" [n, 4] (focal lengths and
+    principal point in widths and heights of the image), "times_s" [n], NaN where there are none, all float64; and "held_out",
+    the names of all others.
+    """
+    frames = scene.train.frames
+    names = [frame.name for frame in frames]
+    known = set(names)
+    return {
+        "names": names,
+        "frame_ids": [frame.frame_id for frame in frames],
+        "viewmats": torch.stack([frame.camera.viewmat for frame in frames]),
+        "lenses": torch.stack([_lens(frame) for frame in frames]),
+        "times_s": _times(frames),
+        "held_out": [frame.name for frame in scene.frames if frame.name not in known],
+    }
+
+
+def check_frames(before: Mapping[str, Any] | None, scene: SceneData, *, exactly: bool = False) -> None:
+    """Raises SceneError where a scene is not the one whose frames a checkpoint tells of (``frames_of``), with what changed.
+
+    Args:
+        before: what it tells; None, as of an older heatsplat, is not held against anything.
+        scene: on the clock of the checkpoint.
+        exactly: the training frames have to be the same, as for training that goes on. Otherwise the data may be divided in
+            another way, and have more or fewer test frames.
+    """
+    if before is not None and (changes := list(_changes(before, scene, exactly))):
+        raise SceneError(
+            f"the data of scene '{scene.name}' are not those of training: {'; '.join(changes)}. Give the data as they were "
+            "(data.root, data.scene, data.split), or train again, in another folder"
+        )
+
+
+def moved(before: Mapping[str, Any], frames: Iterable[Frame]) -> str | None:
+    """How far the cameras of those frames moved that a checkpoint tells of, in words; None where they did not."""
+    rows = _rows(before["names"])
+    here = {frame.name: frame for frame in reversed([*frames]) if frame.name in rows}
+    if not here:
+        return None
+    chosen = [rows[name] for name in here]
+    old, new = before["viewmats"][chosen], torch.stack([frame.camera.viewmat for frame in here.values()])
+    lenses = before["lenses"][chosen] - torch.stack([_lens(frame) for frame in here.values()])
+    way = (_centers(old) - _centers(new)).norm(dim=1)
+    turns = old[:, :3, :3] - new[:, :3, :3]  # its norm is 2 sqrt(2) sin(angle / 2)
+    angles = 2 * (turns.norm(dim=(1, 2)) / math.sqrt(8)).clamp(max=1).asin()
+    all_centers = _centers(before["viewmats"])
+    reach = (all_centers - all_centers.mean(0)).norm(dim=1).median().clamp_min(1e-9)
+    away = (way > MOVED * reach) | (angles > TURNED)
+    if bool(away.any()):
+        return (
+            f"the cameras of {int(away.sum())} of its {len(rows)} training frames moved by up to {float(way.max()):.3g} "
+            f"world units and {math.degrees(float(angles.max())):.3g} degrees"
+        )
+    other = (lenses.abs() > LENS).any(dim=1)
+    if bool(other.any()):
+        return f"{int(other.sum())} of its {len(rows)} training frames have another focal length or principal point"
+    return None
+
+
+def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool) -> Iterator[str]:
+    names, train = before["names"], scene.train.frames
+    here = {frame.name: frame for frame in reversed(train if exactly else scene.frames)}  # training frames come first
+    known = {*names} if exactly else {*names, *before["held_out"]}
+    if gone := [name for name in names if name not in here]:
+        yield f"{_counted(gone)} less"
+    if more := [frame.name for frame in train if frame.name not in known]:
+        yield f"{_counted(more)} more"
+    if told := moved(before, here.values()):
+        yield told
+    kept = [(row, here[name]) for name, row in _rows(names).items() if name in here]
+    if not kept:
+        return
+    times = before["times_s"][[row for row, _ in kept]] - _times([frame for _, frame in kept])
+    later = times.abs().nan_to_num(0.0)
+    if float(later.max()) > LATER_S:
+        yield f"times of {int((later > LATER_S).sum())} training frames differ by up to {float(later.max()):.6g} s"
+    ids = [before["frame_ids"][row] for row, _ in kept]
+    if exactly and not gone and not more and ids != [frame.frame_id for _, frame in kept]:
+        yield "its frames are numbered in another way, as by test frames that were added or removed"
+
+
+def _rows(names: Sequence[str]) -> dict[str, int]:
+    """Place of each name; of frames of one name that of the first."""
+    return {names[row]: row for row in reversed(range(len(names)))}
+
+
+def _counted(names: Sequence[str]) -> str:
+    return f"{len(names)} training frame{'s' * (len(names) > 1)} ({', '.join(names[:3])}{', ...' * (len(names) > 3)})"
+
+
+def _lens(frame: Frame) -> Tensor:
+    camera = frame.camera
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    lens = [fx / camera.width, fy / camera.height, cx / camera.width, cy / camera.height]
+    return torch.tensor(lens, dtype=torch.float64)
+
+
+def _centers(viewmats: Tensor) -> Tensor:
+    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+
+
+def _times(frames: Sequence[Frame]) -> Tensor:
+    times = [math.nan if frame.time_s is None else frame.time_s for frame in frames]
+    return torch.tensor(times, dtype=torch.float64)
