@@ -19,7 +19,7 @@ from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
-from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
+from heatsplat.losses.compose import Loss, LossInputs, pixel_errors, summands
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
@@ -294,10 +294,9 @@ class SplatTraining(SceneModel):
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
             ratio,
         )
-        terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
-        terms |= self.cameras.regularisers()
-        if signs is not None:
-            terms["entropy"] = self.overlap.entropy(output)
+        entropy = {} if signs is None else {"entropy": self.overlap.entropy(output)}
+        own = self.thermal.regularisers(self.splats), self.sensor.regularisers(), self.cameras.regularisers()
+        terms = summands(self.loss(inputs), *own, entropy)
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
