@@ -235,8 +235,8 @@ def summands(*parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         for name, value in part.items():
             if name in terms:
                 raise ValueError(
-                    f"two loss terms are called '{name}': a term of the loss, or a regulariser of the thermal model, the sensor or "
-                    "the cameras, needs another name"
+                    f"two loss terms are called '{name}': a term of the loss, or a regulariser of the thermal model, the sensor "
+                    "or the cameras, needs another name"
                 )
             _check_scalar(f"loss term '{name}'", value)
             terms[name] = value
