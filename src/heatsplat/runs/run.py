@@ -158,7 +158,7 @@ class Trained:
         return self.data.scene
 
     def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
-        """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
+        """Temperatures in °C [H, W], or image values in [0, 1] where there are none; of images with several channels [H, W, C].
 
         The first moment beyond the training record is warned of: it is a prediction.
 
@@ -175,9 +175,12 @@ class Trained:
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
         self._warned = self._warned or warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record)
-        image = self.module.predict(frame)[..., 0].cpu()
-        image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
-        return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
+        image = self.module.predict(frame).cpu()
+        bounds = self.scene.range_of(self.module.modality)
+        if bounds is not None and image.shape[2] == 1:
+            image = bounds.to_celsius(image)
+        image = image if unseen == "keep" else image.where(self.seen(frame)[..., None], torch.nan)
+        return image[..., 0] if image.shape[2] == 1 else image
 
     @property
     def image_names(self) -> tuple[str, ...]:
