@@ -98,7 +98,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         loaded = self.load()
         if not isinstance(loaded, SceneData):
             raise SceneError(
-                f"{type(self).__name__}.load returned {type(loaded).__name__}; it must return a SceneData, as self.finish(...) does"
+                f"{type(self).__name__}.load returned {type(loaded).__name__}; it must return a SceneData, as self.finish(...) "
+                "does"
             )
         scene = degraded(loaded, self.degrade, self.upsample)
         log.info("scene %s: %d training, %d test views", scene.name, len(scene.train), len(scene.test))

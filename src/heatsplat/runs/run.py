@@ -117,13 +117,22 @@ def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
 
 
 def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
-    """The trainer of a configuration, with the callbacks and the logger of ``watching``, which write into the run's folder."""
-    logger = build({**watching["logger"], "save_dir": str(output_dir)}) if watching.get("logger") else False
+    """The trainer of a configuration, with the callbacks and loggers of ``watching``, which write into the run's folder."""
     callbacks = build_callbacks(watching["callbacks"], output_dir)
     places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
-    built = build(dict(trainer), callbacks=callbacks, logger=logger, **places)
+    built = build(
+        dict(trainer), callbacks=callbacks, logger=build_loggers(watching.get("logger"), output_dir), **places
+    )
     lean(built)
     return built
+
+
+def build_loggers(logger: Mapping[str, Any] | Sequence[Any] | None, output_dir: Path) -> list[Any]:
+    """The loggers of a configuration: of one, of a list or of a mapping of several by name."""
+    if not logger:
+        return []
+    several = [logger] if "_target_" in logger else logger.values() if isinstance(logger, Mapping) else logger
+    return [build({**settings, "save_dir": str(output_dir)}) for settings in several if settings is not None]
 
 
 def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]:
