@@ -9,6 +9,8 @@ from running import TINY
 
 from heatsplat.composition import build, compose
 from heatsplat.geometry.neighbours import neighbour_distances
+from heatsplat.thermal.base import PerGaussian
+from heatsplat.thermal.static import Static
 from heatsplat.training.init import Initialisation, Voxels
 
 
@@ -25,6 +27,30 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.allclose(splats.opacities.detach(), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize(
+    ("name", "item", "told"),
+    [
+        ("means", lambda n: PerGaussian(torch.zeros(n), 0.1), "'means' .* is the name of a tensor of the geometry"),
+        ("level", lambda n: torch.zeros(n), "'level' in per_gaussian of Declares is of type Tensor: give PerGaussian"),
+        (
+            "level",
+            lambda n: PerGaussian(torch.zeros(n).int(), 0.1),
+            r"must start from floats .*, got torch.int32 \[\d+\]",
+        ),
+        ("level", lambda n: PerGaussian(torch.zeros(3), 0.1), r"one row for each Gaussian, got torch.float32 \[3\]"),
+        ("level", lambda n: PerGaussian(torch.full((n,), math.nan), 0.1), r"'level' .* from \d+ values that are NaN"),
+        ("level", lambda n: PerGaussian(torch.zeros(n), -1e-3), "'level' .* has a learning rate of -0.001"),
+    ],
+)
+def test_declared_tensors_of_another_kind_are_named(parts, name, item, told):
+    class Declares(Static):
+        def per_gaussian(self, seeds):
+            return super().per_gaussian(seeds) | {name: item(len(seeds.means))}
+
+    with pytest.raises(ValueError, match=told):
+        Initialisation()(parts[0], Declares(), seed=0)
 
 
 @pytest.mark.parametrize("source", ["sfm", "random"])

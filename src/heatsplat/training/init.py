@@ -129,7 +129,7 @@ class NoSplats(Start):
         """Splats without rows, and what the thermal model declared, which is nothing as a rule."""
         shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (len(thermal.opacity_channels),)}
         means, values = torch.zeros(0, 3), torch.zeros(0, sum(thermal.modality_channels))
-        declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+        declared = declared_by(thermal, Seeds(means, values, generator_for(seed, 0, "thermal")))
         geometry = {name: torch.zeros(0, *shape) for name, shape in shapes.items()}
         return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
 
@@ -229,8 +229,33 @@ def with_heat(
     looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in modalities], dim=2)
     generator, log_scales = generator_for(seed, 0, "thermal"), geometry["log_scales"]
     seeds = Seeds(means, usual_values(scene, looks), generator, looks, _times(scene), log_scales)
-    declared = thermal.per_gaussian(seeds)
+    declared = declared_by(thermal, seeds)
     return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
+
+
+def declared_by(thermal: ThermalModel, seeds: Seeds) -> dict[str, PerGaussian]:
+    """What a thermal model declares in ``per_gaussian``.
+
+    Raises:
+        ValueError: a tensor has a name of the geometry, a negative rate, or values that are no finite floats, one row for each
+            Gaussian; the message names it.
+    """
+    declared, count = thermal.per_gaussian(seeds), len(seeds.means)
+    for name, item in declared.items():
+        what = f"'{name}' in per_gaussian of {type(thermal).__name__}"
+        if name in GEOMETRY:
+            raise ValueError(f"{what} is the name of a tensor of the geometry ({', '.join(GEOMETRY)}): choose another")
+        if not isinstance(item, PerGaussian):
+            raise ValueError(f"{what} is of type {type(item).__name__}: give PerGaussian(initial, lr)")
+        initial = item.initial
+        if not isinstance(initial, Tensor) or not initial.is_floating_point() or initial.shape[:1] != (count,):
+            found = f"{initial.dtype} {list(initial.shape)}" if isinstance(initial, Tensor) else type(initial).__name__
+            raise ValueError(f"{what} must start from floats [{count}, ...], one row for each Gaussian, got {found}")
+        if not bool(initial.isfinite().all()):
+            raise ValueError(f"{what} starts from {int((~initial.isfinite()).sum())} values that are NaN or infinite")
+        if not 0 <= item.lr < float("inf"):
+            raise ValueError(f"{what} has a learning rate of {item.lr}, which must be 0 (not trained) or more")
+    return declared
 
 
 def _times(scene: SceneData) -> Tensor | None:

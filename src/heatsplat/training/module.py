@@ -32,6 +32,7 @@ from heatsplat.training.init import Start
 from heatsplat.training.loop import plain
 from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
+from heatsplat.training.registered import check_registered, check_trained, warn_of_untrained
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.scales import scales_of
@@ -122,6 +123,9 @@ class SplatTraining(SceneModel):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
+        self._compared = (
+            False  # whether the optimiser has all parameters, once the first step has made those that it makes
+        )
         self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
@@ -156,6 +160,12 @@ class SplatTraining(SceneModel):
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
+        for name, statistic in self._density_state.items():
+            if statistic.shape[:1] != (len(self.splats),):
+                raise ValueError(
+                    f"'{name}' of {type(self.density).__name__}.initial_state is {list(statistic.shape)}; it needs a row for each "
+                    f"of the {len(self.splats)} Gaussians"
+                )
         modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
@@ -226,6 +236,7 @@ class SplatTraining(SceneModel):
             groups.append(group(f"cameras.{name}", parameter, rate))
         optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
+        check_registered(self)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _between_resets(self, interval: int | float) -> int | float:
@@ -250,6 +261,7 @@ class SplatTraining(SceneModel):
     def _stop_at_the_end(self) -> None:
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
+            warn_of_untrained(plain(self.trainer.optimizers[0]), self.stages)
             if self._average:
                 self.results.run["averaged_updates"] = self._average.give(self._learned())
             if (found := self.cameras.found()) is not None:
@@ -338,6 +350,9 @@ class SplatTraining(SceneModel):
         update = self._updates(step)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
+        if not self._compared:
+            self._compared = True
+            check_trained(self, inner)
         cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
