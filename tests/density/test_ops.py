@@ -74,11 +74,6 @@ def test_append_refuses_rows_that_are_none(changed, told):
     assert len(cloud) == 6
 
 
-def test_keep_refuses_to_leave_nothing():
-    with pytest.raises(SceneError, match="density control would remove all 6 Gaussians"):
-        make_cloud().keep(torch.zeros(6, dtype=torch.bool))
-
-
 def test_tensors_that_are_not_there_are_named_with_those_that_are():
     with pytest.raises(
         KeyError, match="splats have no tensor 'level', only heat, log_scales, means, opacity_logits, quats"

@@ -9,6 +9,8 @@ from torch import nn
 
 from heatsplat.callbacks.finite import NotFinite
 from heatsplat.composition import compose
+from heatsplat.contracts import SceneError
+from heatsplat.density.base import DensityChange, DensityControl
 from heatsplat.runs.run import begin
 from heatsplat.thermal.static import Static
 from heatsplat.training.session import fit
@@ -43,9 +45,22 @@ class Broken(Static):
         return super().features(splats, query) * float("nan")
 
 
-def trained(model, folder):
+class Emptying(DensityControl):
+    def refine(self, cloud, step, extent, generator):
+        count = len(cloud)
+        cloud.keep(torch.zeros(count, dtype=torch.bool))
+        return DensityChange(removed=count)
+
+
+class Short(DensityControl):
+    def initial_state(self, count, device):
+        return {"seen": torch.zeros(3)}
+
+
+def trained(model, folder, density=None):
     begun = begin(compose(SHORT), folder)
     begun.module.thermal = model
+    begun.module.density = density or begun.module.density
     fit(begun.module, begun.data, begun.trainer, test=False)
 
 
@@ -72,3 +87,10 @@ def test_parameters_without_a_gradient_are_warned_of_at_the_end(tmp_path, caplog
 def test_emission_that_is_not_finite_is_named_before_the_gradients_of_the_geometry(tmp_path):
     with pytest.raises(NotFinite, match=r"step 1: what Broken.features returns has \d+ NaN"):
         trained(Broken(), tmp_path)
+
+
+def test_density_control_that_leaves_nothing_or_has_other_rows_is_named(tmp_path):
+    with pytest.raises(SceneError, match="Emptying removed all Gaussians in step 1"):
+        trained(Static(), tmp_path / "emptying", Emptying())
+    with pytest.raises(ValueError, match=r"'seen' of Short.initial_state is \[3\]; it needs a row for each of the \d+"):
+        trained(Static(), tmp_path / "short", Short())

@@ -98,14 +98,8 @@ class Cloud:
         self.splats.place(name, kept)
 
     def keep(self, mask: Tensor) -> None:
-        """Removes the Gaussians where ``mask`` [N] bool is False, with their moments and statistics.
-
-        Raises:
-            SceneError: none would be left.
-        """
+        """Removes the Gaussians where ``mask`` [N] bool is False, with their moments and statistics."""
         ids = mask.nonzero().squeeze(1)
-        if len(ids) == 0 and len(self):
-            raise SceneError(f"density control would remove all {len(self)} Gaussians: give it milder thresholds")
         for name in self.splats.names:
             places, rows = self.splats.places(name), ids
             if places is not None:

@@ -163,8 +163,8 @@ class SplatTraining(SceneModel):
         for name, statistic in self._density_state.items():
             if statistic.shape[:1] != (len(self.splats),):
                 raise ValueError(
-                    f"'{name}' of {type(self.density).__name__}.initial_state is {list(statistic.shape)}; it needs a row for each "
-                    f"of the {len(self.splats)} Gaussians"
+                    f"'{name}' of {type(self.density).__name__}.initial_state is {list(statistic.shape)}; it needs a row for "
+                    f"each of the {len(self.splats)} Gaussians"
                 )
         modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
@@ -362,6 +362,10 @@ class SplatTraining(SceneModel):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
+        if change is not None and not len(self.splats):
+            raise SceneError(
+                f"{type(self.density).__name__} removed all Gaussians in step {step + 1}: give it milder thresholds"
+            )
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
         if change is not None:

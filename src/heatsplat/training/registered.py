@@ -19,15 +19,15 @@ def check_registered(module: nn.Module) -> None:
     """Raises ValueError where a part of a run holds parameters in a list or dict of Python, of which torch knows nothing."""
     known = {id(parameter) for parameter in module.parameters()}
     for name, part in module.named_modules():
-        if part is module:
-            continue
-        for attribute, value in vars(part).items():
-            if not attribute.startswith("_") and isinstance(value, list | tuple | dict):
-                if any(id(parameter) not in known for parameter in _parameters_in(value)):
-                    raise ValueError(
-                        f"{name}.{attribute} of {type(part).__name__} holds parameters in a {type(value).__name__}, where neither the "
-                        "optimiser nor checkpoints find them: use nn.ParameterList, nn.ModuleList, nn.ParameterDict or nn.ModuleDict"
-                    )
+        attributes = {} if part is module else vars(part)
+        for attribute, value in attributes.items():
+            if attribute.startswith("_") or not isinstance(value, list | tuple | dict):
+                continue
+            if any(id(parameter) not in known for parameter in _parameters_in(value)):
+                raise ValueError(
+                    f"{name}.{attribute} of {type(part).__name__} holds parameters in a {type(value).__name__}, where neither "
+                    "the optimiser nor checkpoints find them: use nn.ParameterList, nn.ModuleList or the like"
+                )
 
 
 def check_trained(module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
