@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
+from heatsplat.physics.units import kelvin
 from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.checkpoints import load_checkpoint
@@ -163,7 +165,10 @@ class Voxels(Initialisation):
 
 
 class Pretrained(Start):
-    """Splats whose geometry and opacity are those of an earlier run or of a file; heat starts as it does elsewhere.
+    """Splats whose geometry and opacity are those of an earlier run or of a file.
+
+    Heat starts as it does elsewhere, but for a model of the images that a file holds: of colours, of visible images, or of
+    temperatures, where the scene has bounds. What is not taken is logged.
 
     Args:
         path: a point cloud .ply in the layout of 3DGS, or a checkpoint .ckpt of heatsplat, in the world of the scene. A
@@ -186,18 +191,34 @@ class Pretrained(Start):
             raise SceneError(
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
             )
-        read = _splats_of_file if self.path.suffix == ".ply" else _splats_of_checkpoint
-        geometry, rows = read(self.path)
+        held: dict[str, Tensor] = {}
+        if self.path.suffix == ".ply":
+            geometry, held, rows = _splats_of_file(self.path)
+        else:
+            geometry, rows = _splats_of_checkpoint(self.path)
         if rows not in (GAUSSIANS, thermal.rows):
-            held = "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+            other = (
+                "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+            )
             raise SceneError(
-                f"init.path={self.path} holds {held}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
+                f"init.path={self.path} holds {other}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
             )
         wanted = len(thermal.opacity_channels)
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
-        return with_heat(geometry, scene, thermal, seed)
+        values = _values_held(held, scene, thermal)
+        splats, declared = with_heat(geometry, scene, thermal, seed, values)
+        taken = {"values"} if values is not None and thermal.modality == "rgb" else set()
+        taken |= {"temperature_k"} if values is not None and thermal.modality == "thermal" else set()
+        if "values" in taken and "sh_rest" in held and _takes_harmonics(splats, held["sh_rest"]):
+            taken.add("sh_rest")
+        names = {"values": "colours", "sh_rest": "spherical harmonics", "temperature_k": "temperatures"}
+        if left := [told for name, told in names.items() if name in held and name not in taken]:
+            log.info(
+                "init.path: %s of the file are not taken: they are not what this model starts from", ", ".join(left)
+            )
+        return splats, declared
 
 
 def _drawn(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -220,15 +241,40 @@ def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
     return several | {"opacity_logits": several["opacity_logits"].where(own, ABSENT)}
 
 
+def _values_held(held: Mapping[str, Tensor], scene: SceneData, thermal: ThermalModel) -> Tensor | None:
+    """Image values [N, C] that a file holds for a model, or None: of colours as of visible images, of temperatures in the scene's
+    bounds."""
+    images, bounds = (thermal.modality, thermal.modality_channels), scene.range_of(thermal.modality)
+    if images == ("rgb", (3,)):
+        return held.get("values")
+    if images == ("thermal", (1,)) and bounds is not None and "temperature_k" in held:
+        return bounds.to_unit(held["temperature_k"] - kelvin(0.0))[:, None].clamp(0, 1)
+    return None
+
+
+@torch.no_grad()
+def _takes_harmonics(splats: Splats, rest: Tensor) -> bool:
+    """Whether splats have harmonics of the direction of view, which then are ``rest`` [N, K, C], as many as both have."""
+    if "sh_rest" not in splats or splats["sh_rest"].shape[2] != rest.shape[2]:
+        return False
+    count = min(splats["sh_rest"].shape[1], rest.shape[1])
+    splats["sh_rest"][:, :count] = rest[:, :count]
+    return True
+
+
 def with_heat(
-    geometry: dict[str, Tensor], scene: SceneData, thermal: ThermalModel, seed: int
+    geometry: dict[str, Tensor], scene: SceneData, thermal: ThermalModel, seed: int, values: Tensor | None = None
 ) -> tuple[Splats, dict[str, PerGaussian]]:
-    """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared."""
+    """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared.
+
+    Image ``values`` [N, C] of the Gaussians are, unless they are given, those that the training views see.
+    """
     means = geometry["means"]
     modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
     looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in modalities], dim=2)
     generator, log_scales = generator_for(seed, 0, "thermal"), geometry["log_scales"]
-    seeds = Seeds(means, usual_values(scene, looks), generator, looks, _times(scene), log_scales)
+    seen = usual_values(scene, looks) if values is None else values
+    seeds = Seeds(means, seen, generator, looks, _times(scene), log_scales)
     declared = declared_by(thermal, seeds)
     return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
 
@@ -264,13 +310,13 @@ def _times(scene: SceneData) -> Tensor | None:
     return None if None in times else torch.tensor(times, dtype=torch.float64)
 
 
-def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], str]:
-    """Geometry of a point cloud, and what its rows are: Gaussians."""
+def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], str]:
+    """Geometry of a point cloud, what else it holds (``read_splats``), and what its rows are: Gaussians."""
     try:
-        found = read_splats(path)
+        found = {name: torch.from_numpy(values.copy()) for name, values in read_splats(path).items()}
     except ValueError as error:
         raise SceneError(f"init.path: {error}") from error
-    return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}, GAUSSIANS
+    return {name: found.pop(name) for name in GEOMETRY}, found, GAUSSIANS
 
 
 def _splats_of_checkpoint(path: Path) -> tuple[dict[str, Tensor], str]:
