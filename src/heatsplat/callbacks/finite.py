@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, View
-from heatsplat.splats import GAUSSIANS
 
 
 class NotFinite(FloatingPointError):
@@ -115,7 +114,7 @@ def _gradients(module: pl.LightningModule) -> Iterator[tuple[str, Tensor]]:
 
 def _emitted(module: pl.LightningModule, frame: Frame | None) -> Iterator[tuple[str, Tensor]]:
     """What the thermal model emits in a frame, of which NaN reach gradients of the geometry."""
-    if frame is not None and getattr(module.thermal, "rows", None) == GAUSSIANS:
+    if frame is not None and len(module.splats) and getattr(module.thermal, "per_row", 0) == 1:  # rows are Gaussians
         yield f"what {type(module.thermal).__name__}.features returns", module.emissions(module.splats, frame)
 
 
