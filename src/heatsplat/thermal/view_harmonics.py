@@ -65,6 +65,7 @@ class _Fused(torch.autograd.Function):
         gradients = v_constant, allocate(rest.shape), allocate(means.shape)
         kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
         v_center = None
-        if ctx.needs_input_grad[3]:  # directions go from the center to the means; numpy adds in one order on any threads
+        if ctx.needs_input_grad[3]:
+            # Directions go from the center to the means. numpy adds in one order on any number of threads.
             v_center = -torch.from_numpy(gradients[2].numpy().sum(axis=0, dtype=np.float64)).to(v_values)
         return *gradients, v_center, None, None
