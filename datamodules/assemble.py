@@ -199,7 +199,13 @@ def _split(
 
 def _with_finite_points(raw: RawScene, notes: dict[str, Any]) -> RawScene:
     """The scene with float64 points [P, 3] of usable coordinates, and the rows that belong to them."""
-    points = np.asarray(raw.points, dtype=np.float64).reshape(-1, 3)
+    if raw.points is None:
+        raise SceneError(
+            f"scene {raw.name} has no points: give points [P, 3] to start from, such as those of the sparse model"
+        )
+    points = np.asarray(raw.points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SceneError(f"points of scene {raw.name} must be [P, 3], got {list(points.shape)}")
     kept = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
     rows = {name: _of_points(name, getattr(raw, name), kept) for name in ("labels", "point_features", "point_colors")}
     points = points[kept]

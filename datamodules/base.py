@@ -97,7 +97,13 @@ class SceneDataModule(pl.LightningDataModule, ABC):
     @cached_property
     def scene(self) -> SceneData:
         """The loaded scene, its training images reduced where that is asked for."""
-        scene = degraded(self.load(), self.degrade, self.upsample)
+        loaded = self.load()
+        if not isinstance(loaded, SceneData):
+            raise SceneError(
+                f"{type(self).__name__}.load returned {type(loaded).__name__}; it must return a SceneData, as self.finish(...) "
+                "does"
+            )
+        scene = degraded(loaded, self.degrade, self.upsample)
         log.info("scene %s: %d training, %d test views", scene.name, len(scene.train), len(scene.test))
         return scene
 

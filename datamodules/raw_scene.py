@@ -22,7 +22,7 @@ class RawFrame:
 
     Args:
         name: file name relative to the image folder; splits and messages use it.
-        viewmat: world-to-camera [4, 4] float64, OpenCV axes.
+        viewmat: world-to-camera [4, 4], OpenCV axes; kept as a float64 array.
         lens: intrinsics and distortion, for whatever image size they were written down for.
         read: returns the stored thermal pixels [H, W] or [H, W, 3 or 4] (RGB, RGBA), uint8, uint16 or float32. Integers
             span their type (0 .. 255 is 0 .. 1) unless the scene has ``Counts``; float32 holds °C, NaN where unknown.
@@ -45,7 +45,7 @@ class RawFrame:
     environment: Environment | None = None
 
     def __post_init__(self) -> None:
-        checked_pose(self.viewmat, f"viewmat of frame {self.name}")
+        object.__setattr__(self, "viewmat", checked_pose(self.viewmat, f"viewmat of frame {self.name}"))
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Nouns that all packages share: positions evenly spread, and points seen by a camera."""
 
+import numpy as np
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, ViewSet, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, evenly_spread
 
 
 @pytest.mark.parametrize(
@@ -29,6 +30,35 @@ def test_a_camera_projects_points_of_the_world():
     pixels, depths = Camera(viewmat, K, 60, 40).project(torch.tensor([[1.0, 1.0, 2.0], [0.0, 0.0, -3.0]]))
     assert pixels[0].tolist() == [100 / 4 + 30, 50 * 2 / 4 + 20]
     assert depths.tolist() == [4.0, -1.0] and pixels.dtype == depths.dtype == torch.float64
+
+
+def test_a_camera_takes_arrays_and_keeps_its_gradients():
+    viewmat = torch.eye(4, dtype=torch.float64).requires_grad_()
+    camera = Camera(viewmat, np.diag([9, 8, 1]), np.int64(8), 6)
+    assert camera.viewmat is viewmat and camera.K.dtype == torch.float64 and camera.resized(4, 3).width == 4
+
+
+def changed(matrix, row, column, value):
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("what", "value", "told"),
+    [
+        ("viewmat", torch.eye(3), r"camera needs viewmat \[4, 4\] and K \[3, 3\], got viewmat \[3, 3\]"),
+        ("viewmat", changed(torch.eye(4), 0, 3, float("nan")), "viewmat of a camera has NaN or infinite values"),
+        ("K", changed(torch.eye(3), 0, 0, float("inf")), "K of a camera has NaN or infinite values"),
+        ("K", changed(torch.eye(3), 0, 1, 0.5), "without skew"),
+        ("K", 2 * torch.eye(3), "K of a camera must be"),
+        ("width", 8.0, "whole numbers of pixels, got 8.0 x 6"),
+        ("height", 0, "camera has no pixels: 8 x 0"),
+    ],
+)
+def test_what_is_no_pinhole_camera_is_refused(what, value, told):
+    given = {"viewmat": torch.eye(4), "K": torch.eye(3), "width": 8, "height": 6}
+    with pytest.raises(SceneError, match=told):
+        Camera(**given | {what: value})
 
 
 def scene(times_s, test_times_s=()) -> SceneData:

@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,12 @@ class Camera:
     """A pinhole camera without distortion (images are undistorted when they are loaded).
 
     Args:
-        viewmat: world-to-camera matrix [4, 4], float64, OpenCV axes.
-        K: intrinsics [3, 3] in pixels, float64; the principal point counts from the corner of the image.
+        viewmat: world-to-camera matrix [4, 4], OpenCV axes; kept as a float64 tensor.
+        K: intrinsics [3, 3] in pixels, without skew; likewise. The principal point counts from the corner of the image.
         width, height: image size in pixels.
+
+    Raises:
+        SceneError: a shape or size is none of a camera, a number is NaN or infinite, or K has skew.
     """
 
     viewmat: Tensor
@@ -88,14 +92,27 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
+        for name, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
+            matrix = torch.as_tensor(getattr(self, name)).to(torch.float64)
+            if tuple(matrix.shape) != shape:
+                raise SceneError(f"camera needs viewmat [4, 4] and K [3, 3], got {name} {list(matrix.shape)}")
+            if not bool(matrix.isfinite().all()):
+                raise SceneError(f"{name} of a camera has NaN or infinite values: {matrix.tolist()}")
+            object.__setattr__(self, name, matrix)
+        (_, skew, _), (below, _, _), last = self.K.tolist()
+        if skew or below or last != [0.0, 0.0, 1.0]:
             raise SceneError(
-                f"camera needs viewmat [4, 4] and K [3, 3], got {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}"
+                f"K of a camera must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew, got {self.K.tolist()}; undistort "
+                "the images to such a camera"
             )
-        if self.width < 1 or self.height < 1:
+        try:
+            size = index(self.width), index(self.height)
+        except TypeError as error:
+            raise SceneError(
+                f"size of a camera must be whole numbers of pixels, got {self.width} x {self.height}"
+            ) from error
+        if min(size) < 1:
             raise SceneError(f"camera has no pixels: {self.width} x {self.height}")
-        object.__setattr__(self, "viewmat", self.viewmat.to(torch.float64))
-        object.__setattr__(self, "K", self.K.to(torch.float64))
 
     @property
     def center(self) -> Tensor:

@@ -48,8 +48,13 @@ class Splats(nn.Module):
         return self.raw["means"].shape[0]
 
     def __getitem__(self, name: str) -> Tensor:
-        """The raw tensor of that name, [N, ...]; a sparse one has fewer rows."""
-        return self.raw[name]
+        """The raw tensor of that name, [N, ...]; a sparse one has fewer rows. Raises KeyError, with the names that there are."""
+        try:
+            return self.raw[name]
+        except (AttributeError, KeyError) as error:  # torch raises the former
+            raise KeyError(
+                f"splats have no tensor '{name}', only {', '.join(self.names)}: declare it in per_gaussian"
+            ) from error
 
     def __contains__(self, name: str) -> bool:
         return name in self.raw

@@ -1,5 +1,6 @@
 """The layout of TensorBoard: every panel finds a curve that training really writes."""
 
+import csv
 import re
 from itertools import chain
 
@@ -7,12 +8,32 @@ from fake_run import FakeModule, events, fit, trainer, wall
 from running import TINY, run
 
 from heatsplat.callbacks.dashboard import LAYOUT, Dashboard
+from heatsplat.composition import compose
+from heatsplat.runs.run import begin
+from heatsplat.training.session import fit as training_fit
 
 
 def test_the_layout_is_written_once_per_run(tmp_path):
     fit(FakeModule(wall(), tmp_path), trainer(tmp_path, [Dashboard()], steps=2, every=2))
     tags = events(tmp_path).Tags()["tensors"]
     assert tags.count("custom_scalars__config__") == 1
+
+
+def test_runs_with_other_loggers_write_their_numbers(tmp_path):
+    table, both = tmp_path / "table", tmp_path / "both"
+    quick = (*TINY, "method=3dgs", "data.downscale=4", "max_steps=4", "callbacks.statistics.every=2")
+    run(table, *quick, "logger=csv")
+    with (table / "logs" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    steps = {int(row["step"]): row for row in rows if row["loss/total"]}
+    assert sorted(steps) == [1, 2, 4] and float(steps[4]["density/count"]) > 0
+    assert any(row["val/psnr"] for row in rows) and any(row["final/psnr"] for row in rows)
+
+    config = compose([*quick, "logger=csv", "test=false"])
+    config["logger"] = {"board": compose(["logger=tensorboard"])["logger"], "table": config["logger"], "off": None}
+    begun = begin(config, both)
+    training_fit(begun.module, begun.data, begun.trainer, test=False)
+    assert (both / "logs" / "metrics.csv").exists() and "loss/total" in events(both).Tags()["scalars"]
 
 
 def test_every_panel_finds_curves_of_a_real_run(tmp_path):

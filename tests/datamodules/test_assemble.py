@@ -6,7 +6,7 @@ import torch
 from layouts import FOCAL, HEIGHT, WIDTH, grey, points, viewmats
 
 from heatsplat.contracts import SceneError, ThermalRange
-from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneOptions, build_scene
+from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneDataModule, SceneOptions, build_scene
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.splits import SplitRule
 
@@ -350,3 +350,25 @@ def test_the_package_of_a_scene_from_memory_needs_no_file():
     assert scene.notes["made"] == "up"
     assert {"ambient", "metres"} <= scene.metadata
     assert scene.point_colors is None
+
+
+@pytest.mark.parametrize(
+    ("xyz", "told"),
+    [
+        (points().T, r"points of scene s must be \[P, 3\], got \[3, \d+\]"),
+        (points().ravel(), r"points of scene s must be \[P, 3\], got \[\d+\]"),
+        (None, "scene s has no points: give points"),
+    ],
+)
+def test_points_that_are_no_rows_of_three_are_refused(xyz, told):
+    with pytest.raises(SceneError, match=told):
+        assembled(frames_of([grey(i) for i in range(9)]), xyz)
+
+
+def test_a_loader_that_returns_no_scene_is_named():
+    class Forgetful(SceneDataModule):
+        def load(self):
+            assembled(frames_of([grey(i) for i in range(9)]), points())
+
+    with pytest.raises(SceneError, match="Forgetful.load returned NoneType; it must return a SceneData"):
+        Forgetful().setup()

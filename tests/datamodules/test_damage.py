@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+import torch
 from layouts import HEIGHT, WIDTH, grey, names, viewmats, write_colmap, write_image, write_json, write_thermoscenes
 
 from heatsplat.contracts import SceneError
@@ -122,6 +123,16 @@ def test_what_is_no_pose_is_refused_with_its_frame(tmp_path, change, message):
         ThermoScenes(root=str(tmp_path)).setup()
     with pytest.raises(SceneError, match=f"viewmat of frame a .*{message}"):
         RawFrame("a", viewmats(1)[0] @ change, None, None)
+
+
+def test_a_transposed_pose_is_said_to_be_one():
+    with pytest.raises(SceneError, match="frame 7 is no pose: its last row is .*, not 0 0 0 1; it is transposed"):
+        checked_pose(viewmats(1)[0].T, "frame 7")
+
+
+def test_poses_may_be_tensors():
+    frame = RawFrame("a", torch.from_numpy(viewmats(1)[0]), None, None)
+    assert isinstance(frame.viewmat, np.ndarray) and np.array_equal(frame.viewmat, viewmats(1)[0])
 
 
 @pytest.mark.parametrize("pose", [[[1, 0], [0]], "pose", None, [[1.0] * 4] * 2, {"a": 1}])

@@ -58,10 +58,27 @@ def test_append_starts_moments_and_statistics_at_zero():
     assert torch.equal(cloud.state["seen"][6:], torch.zeros(2))
 
 
-def test_append_refuses_incomplete_rows():
-    with pytest.raises(KeyError, match="heat"):
-        make_cloud().append({name: torch.zeros(1, n) for name, n in (("means", 3), ("log_scales", 3), ("quats", 4))}
-                            | {"opacity_logits": torch.zeros(1, 2)})  # fmt: skip
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"heat": None}, "adds Gaussians without heat: begin with cloud.rows"),
+        ({"quats": torch.ones(1, 3)}, r"adds 'quats' \[1, 3\], \[1, 4\] is needed"),
+        ({"heat": torch.full((1, 5), float("nan"))}, "adds Gaussians whose 'heat' is NaN"),
+    ],
+)
+def test_append_refuses_rows_that_are_none(changed, told):
+    cloud = make_cloud()
+    rows = {name: tensor for name, tensor in (cloud.rows(torch.tensor([2])) | changed).items() if tensor is not None}
+    with pytest.raises(ValueError, match=told):
+        cloud.append(rows)
+    assert len(cloud) == 6
+
+
+def test_tensors_that_are_not_there_are_named_with_those_that_are():
+    with pytest.raises(
+        KeyError, match="splats have no tensor 'level', only heat, log_scales, means, opacity_logits, quats"
+    ):
+        make_cloud().splats["level"]
 
 
 def test_overwrite_forgets_moments_of_that_tensor_only():

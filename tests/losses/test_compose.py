@@ -5,7 +5,7 @@ import torch
 
 from heatsplat.composition import build, compose
 from heatsplat.losses import schedules
-from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted
+from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted, summands
 from heatsplat.losses.low_resolution import OnTargetGrid
 from heatsplat.losses.modality_balance import ByOthersShare
 from heatsplat.losses.photometric import Photometric
@@ -100,3 +100,44 @@ def test_constant_schedule():
 def test_a_ramp_that_ends_before_it_starts_is_refused():
     with pytest.raises(ValueError, match="ends at 0.1 of the run, before it starts at 0.4"):
         schedules.linear(0.2, 0.4, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (lambda image: None, "None"),
+        (lambda image: image.mean().item(), "of type float"),
+        (lambda image: (image.mean(), image.mean()), "of type tuple"),
+        (lambda image: image, r"a tensor of shape \[2, 2, 1\]"),
+        (lambda image: {"a": image.mean(), "b": image[0, 0].expand(3)}, r"a tensor of shape \[3\]"),
+    ],
+)
+@pytest.mark.parametrize("around", [lambda term: term, Weighted])
+def test_a_term_that_returns_no_scalar_is_named(returned, told, around):
+    class Mistaken(LossTerm):
+        def __call__(self, inputs):
+            return returned(inputs.prediction)
+
+    with pytest.raises(ValueError, match=f"loss term Mistaken returned is {told}; it must be a scalar tensor"):
+        Loss({"mine": around(Mistaken())})(at(0))
+
+
+def test_what_is_no_loss_term_is_refused_by_name():
+    def plain(inputs):
+        return inputs.prediction.mean()
+
+    with pytest.raises(ValueError, match="loss.terms.mine is of type function; a loss term derives from .*LossTerm"):
+        Loss({"mine": plain})
+    with pytest.raises(ValueError, match="loss.terms.mine.term.term is of type function"):
+        Loss({"mine": During(Weighted(plain))})
+
+
+def test_two_terms_of_one_name_and_regularisers_that_are_no_scalars_are_refused():
+    one = torch.ones(())
+    assert summands({"a": one}, {}, {"b": one}) == {"a": one, "b": one}
+    with pytest.raises(ValueError, match="two loss terms are called 'smooth'"):
+        summands({"smooth": one}, {"smooth": 2 * one})
+    with pytest.raises(ValueError, match=r"loss term 'mine' is a tensor of shape \[4\]; it must be a scalar"):
+        summands({"mine": torch.ones(4)})
+    with pytest.raises(ValueError, match="loss term 'mine' is of type float"):
+        summands({"mine": 0.5})

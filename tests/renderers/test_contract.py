@@ -360,6 +360,31 @@ def test_images_and_gradients_of_plain_scenes(backend, name):
     assert_close(run(backend, PLAIN[name]), oracle(PLAIN[name]))
 
 
+WIDE = plain_scene(**ONE, antialiased=True, seed=5)
+INTRINSICS = {
+    "one channel": PLAIN["one channel"],
+    "rgb and thermal, antialiased": PLAIN["rgb and thermal, antialiased"],
+    # Gaussians far outside of the image, whose Jacobian is that of the limit of sight, which depends on the intrinsics.
+    "beyond the field of view": replace(WIDE, means=2.5 * WIDE.means, scales=4 * WIDE.scales),
+}
+
+
+@pytest.mark.parametrize("name", INTRINSICS)
+def test_the_gradient_of_the_intrinsics(backend, name):
+    scene, found = INTRINSICS[name], []
+    if backend == "gsplat":
+        pytest.skip("gsplat gives no gradient to intrinsics")
+    for used, dtype in ((backend, torch.float32), ("reference", torch.float64)):
+        rows = [
+            getattr(scene, name).to(dtype) for name in ("means", "quats", "scales", "opacities", "features", "viewmat")
+        ]
+        K = scene.K.to(dtype, copy=True).requires_grad_()
+        loss(rasterization(*rows, K, scene.width, scene.height, backend=used, **scene.options)).backward()
+        found.append(K.grad.double())
+    assert relative(*found) < 1e-4
+    assert (found[1][[0, 1, 0, 1], [0, 1, 2, 2]].abs() > 1e-3 * found[1].norm()).all()
+
+
 @pytest.mark.parametrize("name", ["one channel", "rgb and thermal"])
 def test_sizes_and_opacities_may_be_given_as_they_are_trained(backend, name):
     """Logarithms and logits, some of them out of the range of their activations, with gradients of their own."""
@@ -778,6 +803,17 @@ BAD = {
     "viewmats": (torch.eye(3), r"viewmats and Ks must be \[4, 4\] and \[3, 3\], got \[3, 3\] and \[3, 3\]"),
     "width": (0, "image must have pixels, got 0 x 20"),
     "modality_channels": ((3, 1), r"modality_channels \(3, 1\) must name 1 counts"),
+    "means": (torch.zeros(5, 3).half(), "Gaussians must be float32 or float64, got means of torch.float16"),
+    "background": (
+        torch.zeros(2).double(),
+        "background must be like means, torch.float32 on cpu, got torch.float64 on cpu",
+    ),
+    "signs": (torch.ones(4), r"signs must have shape \[5\], got \[4\]"),
+    "far": (0.001, "far must be beyond near, got near 0.01 and far 0.001"),
+    "Ks": (
+        torch.tensor([[20.0, 0.5, 12.0], [0, 20, 10], [0, 0, 1]]),
+        r"Ks has a skew of 0.5 \(its \[0, 1\]\), which no renderer has",
+    ),
     "backend": ("cuda", "unknown renderer backend 'cuda'; there are reference, cpu, gsplat and auto"),
 }
 
@@ -797,6 +833,12 @@ def test_bad_arguments_are_named(name):
     rasterization(**arguments())
     with pytest.raises(ValueError, match=message):
         rasterization(**arguments(**{name: value}))
+
+
+def test_gsplat_refuses_to_leave_the_intrinsics_without_a_gradient():
+    K = camera_matrix(20.0, 24, 20).requires_grad_()
+    with pytest.raises(ValueError, match="gsplat gives no gradient to Ks"):
+        rasterization(**arguments(Ks=K, backend="gsplat"))
 
 
 def test_two_opacity_sets_need_their_channels():

@@ -38,6 +38,19 @@ def test_a_notebook_composes_trains_loads_and_looks_at_temperatures(trained):
     assert torch.equal(scene.render(frame.camera, 0.0, "keep"), celsius)  # static splats know no time
 
 
+def test_visible_images_are_no_temperatures(tmp_path):
+    colours = ("data.scene=glass", "thermal.modality=rgb", "thermal.channels=3", "test=false")
+    config = heatsplat.compose([*QUICK, *colours])
+    heatsplat.train(config, tmp_path)
+    scene = heatsplat.load(tmp_path / "checkpoints" / "last.ckpt")
+    frame = scene.scene.test.frames[0]
+    assert scene.scene.thermal_range is not None
+    image = scene.render(frame, unseen="keep")
+    assert torch.equal(image, scene.images(frame, ["recorded"])["recorded"]) and image.shape[2] == 3
+    masked = scene.render(frame)
+    assert torch.equal(masked.isnan().all(2), ~scene.seen(frame))
+
+
 def test_a_step_changes_no_configuration_that_it_is_given(trained):
     _, config, _ = trained
     assert config == heatsplat.compose(QUICK) and "scene" not in config

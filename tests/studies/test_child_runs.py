@@ -81,7 +81,7 @@ def test_a_run_is_told_of_configurations_beside_ours(script, tmp_path, monkeypat
     try:
         with hydra.initialize_config_dir(CONF, version_base="1.3"):
             HydraConfig.instance().set_config(hydra.compose("study", [name], return_hydra_config=True))
-        trained(tmp_path / "one", script, ["seed=1"], tmp_path)
+        train_or_read(tmp_path / "one", script, ["seed=1"], tmp_path)
     finally:
         HydraConfig.instance().cfg = before
     assert name in json.loads((tmp_path / "one" / ".hydra" / "overrides.yaml").read_text())

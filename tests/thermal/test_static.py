@@ -1,5 +1,7 @@
 """The static model: seeds, directions, the degree schedule, temperature and what is absent at degree 0."""
 
+from dataclasses import replace
+
 import numba
 import pytest
 import torch
@@ -85,6 +87,22 @@ def test_float32_emission_and_gradients_agree_with_float64(degree, channels, som
     assert (results[1][0] == 0).any() or degree == 0  # the clamp is met
     for got, expected in zip(*results, strict=True):
         assert torch.allclose(got.double(), expected, atol=1e-6 * max(1.0, expected.abs().max().item()))
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_the_gradient_of_the_camera_agrees_with_float64(some):
+    model, start = Static(sh_degree=3), seeds(200)
+    ids, found = torch.arange(0, 200, 3) if some else None, []
+    for dtype in (torch.float32, torch.float64):
+        camera = camera_at([0.3, 0.1, -2.0])
+        viewmat = camera.viewmat.clone().requires_grad_()
+        emitted = model.features(
+            splats_of(model, start, rest=0.3, dtype=dtype), Query(ids, replace(camera, viewmat=viewmat))
+        )
+        weights = torch.randn(emitted.shape, generator=torch.Generator().manual_seed(2)).to(dtype)
+        (emitted * weights).sum().backward()
+        found.append(viewmat.grad)
+    assert found[1].norm() > 1 and (found[0] - found[1]).norm() < 1e-5 * found[1].norm()
 
 
 def test_the_number_of_threads_changes_no_bit():

@@ -3,13 +3,18 @@
 import logging
 import math
 
+import numpy as np
 import pytest
 import torch
 from running import TINY
 
 from heatsplat.composition import build, compose
 from heatsplat.geometry.neighbours import neighbour_distances
-from heatsplat.training.init import Initialisation, Voxels
+from heatsplat.geometry.spherical_harmonics import C0
+from heatsplat.io.ply import read_splats, write_splats
+from heatsplat.thermal.base import PerGaussian
+from heatsplat.thermal.static import Static
+from heatsplat.training.init import Initialisation, Pretrained, Voxels
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +30,30 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.allclose(splats.opacities.detach(), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize(
+    ("name", "item", "told"),
+    [
+        ("means", lambda n: PerGaussian(torch.zeros(n), 0.1), "'means' .* is the name of a tensor of the geometry"),
+        ("level", lambda n: torch.zeros(n), "'level' in per_gaussian of Declares is of type Tensor: give PerGaussian"),
+        (
+            "level",
+            lambda n: PerGaussian(torch.zeros(n).int(), 0.1),
+            r"must start from floats .*, got torch.int32 \[\d+\]",
+        ),
+        ("level", lambda n: PerGaussian(torch.zeros(3), 0.1), r"one row for each Gaussian, got torch.float32 \[3\]"),
+        ("level", lambda n: PerGaussian(torch.full((n,), math.nan), 0.1), r"'level' .* from \d+ values that are NaN"),
+        ("level", lambda n: PerGaussian(torch.zeros(n), -1e-3), "'level' .* has a learning rate of -0.001"),
+    ],
+)
+def test_declared_tensors_of_another_kind_are_named(parts, name, item, told):
+    class Declares(Static):
+        def per_gaussian(self, seeds):
+            return super().per_gaussian(seeds) | {name: item(len(seeds.means))}
+
+    with pytest.raises(ValueError, match=told):
+        Initialisation()(parts[0], Declares(), seed=0)
 
 
 @pytest.mark.parametrize("source", ["sfm", "random"])
@@ -62,3 +91,33 @@ def test_clouds_of_their_own_share_the_cap(parts):
     plain = compose([*TINY, "method=msmg"])
     splats, _ = Initialisation(separate=True)(scene, build(plain["module"]["thermal"]), seed=0, cap_max=101)
     assert len(splats) == 100
+
+
+def cloud_file(path, scene, **more):
+    count = min(50, len(scene.points))
+    shape = scene.points[:count], torch.full((count, 3), -2.0), torch.ones(count, 4), torch.zeros(count)
+    write_splats(path, *shape, torch.rand(count, 3, generator=torch.Generator().manual_seed(0)), **more)
+    return Pretrained(str(path)), read_splats(path)
+
+
+def test_a_file_of_colours_starts_a_model_of_colours_with_its_harmonics(tmp_path, caplog):
+    plain = compose([*TINY, "method=3dgs", "data.scene=glass"])
+    scene = build(plain["data"]).scene
+    start, file = cloud_file(tmp_path / "a.ply", scene, sh_rest=np.full((50, 8, 3), 0.1))
+    splats, _ = start(scene, Static(sh_degree=1, channels=3, modality="rgb"), seed=0)
+    colours = 0.5 + C0 * splats["sh0"][:, 0].detach().numpy()
+    np.testing.assert_allclose(colours, file["values"], atol=1e-6)
+    assert torch.equal(splats["sh_rest"].detach(), torch.full((50, 3, 3), 0.1))
+    with caplog.at_level(logging.INFO):
+        start(scene, Static(), seed=0)
+    assert "colours, spherical harmonics of the file are not taken" in caplog.text
+
+
+def test_a_file_of_temperatures_starts_a_thermal_model_in_the_bounds_of_the_scene(parts, tmp_path):
+    scene, thermal = parts
+    bounds = scene.thermal_range
+    celsius = np.linspace(bounds.min_c, bounds.max_c, 50)
+    start, _ = cloud_file(tmp_path / "a.ply", scene, temperature_k=celsius + 273.15)
+    splats, _ = start(scene, thermal, seed=0)
+    values = 0.5 + C0 * splats["sh0"][:, 0, 0].detach().numpy()
+    np.testing.assert_allclose(values, np.linspace(0, 1, 50), atol=1e-5)

@@ -9,7 +9,7 @@ from heatsplat.contracts import Camera, Frame, SceneError, View
 from heatsplat.geometry.sight_lines import rays
 from heatsplat.training.lattice import Lattice
 
-CAMERA = Camera(torch.eye(4), torch.tensor([[11.0, 0.2, 6.3], [0, 12.0, 4.1], [0, 0, 1]]), 13, 9)
+CAMERA = Camera(torch.eye(4), torch.tensor([[11.0, 0.0, 6.3], [0, 12.0, 4.1], [0, 0, 1]]), 13, 9)
 
 
 def view() -> View:

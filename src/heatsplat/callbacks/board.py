@@ -1,4 +1,4 @@
-"""Where callbacks write: the TensorBoard of a run."""
+"""Where callbacks write: numbers to the loggers of a run, pictures and tables to TensorBoard."""
 
 from __future__ import annotations
 
@@ -6,25 +6,29 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytorch_lightning as pl
+from pytorch_lightning.loggers import TensorBoardLogger
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 
 def board(module: pl.LightningModule) -> SummaryWriter | None:
-    """The TensorBoard writer of the run, or None where it has no logger."""
-    return None if module.logger is None else module.logger.experiment
+    """The TensorBoard writer of the run, or None where it has none among its loggers."""
+    return next((logger.experiment for logger in module.loggers if isinstance(logger, TensorBoardLogger)), None)
 
 
-def add_scalars(module: pl.LightningModule, values: Mapping[str, float], step: int) -> None:
-    """Adds numbers by tag, where the run has a logger."""
-    writer = board(module)
-    if writer is not None:
-        for tag, value in values.items():
-            writer.add_scalar(tag, value, step)
+def add_scalars(module: pl.LightningModule, values: Mapping[str, float], step: int, by_steps: bool = True) -> None:
+    """Hands numbers by tag to the loggers of the run; to TensorBoard alone where ``step`` counts something else than steps, since
+    others keep one count for all."""
+    for logger in module.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            for tag, value in values.items():
+                logger.experiment.add_scalar(tag, value, step)
+        elif values and by_steps:
+            logger.log_metrics(dict(values), step)
 
 
 def add_picture(module: pl.LightningModule, tag: str, picture: np.ndarray, png: bytes, step: int) -> None:
-    """Adds a picture [H, W, 3] that was encoded already, where the run has a logger.
+    """Adds a picture [H, W, 3] that was encoded already, where the run has a TensorBoard.
 
     The writer's ``add_image`` encodes anew, a third of the time of a panel (measured).
     """

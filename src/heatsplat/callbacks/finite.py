@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import View
+from heatsplat.contracts import Frame, View
 
 
 class NotFinite(FloatingPointError):
@@ -33,15 +33,20 @@ class FiniteGuard(pl.Callback):
             raise ValueError(f"FiniteGuard(every={every}): checks must be at least 1 step apart")
         self.every = every
         self._seen: str | None = None
+        self._frame: Frame | None = None
 
     def on_train_batch_start(self, trainer: pl.Trainer, module: pl.LightningModule, view: View, *_: Any) -> None:
-        self._seen = view.frame.name
+        self._seen, self._frame = view.frame.name, view.frame
 
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
         if trainer.global_step % self.every == 0:
-            demand_finite(_gradients(module), trainer.global_step + 1, self._seen)
+            try:
+                demand_finite(_gradients(module), trainer.global_step + 1, self._seen)
+            except NotFinite:
+                demand_finite(_emitted(module, self._frame), trainer.global_step + 1, self._seen)
+                raise
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, module: pl.LightningModule, outputs: dict[str, Any], *_: Any
@@ -105,6 +110,12 @@ def _sum_is_finite(optimizer: torch.optim.Optimizer) -> bool:
 
 def _gradients(module: pl.LightningModule) -> Iterator[tuple[str, Tensor]]:
     return ((f"gradient of {name}", p.grad) for name, p in module.named_parameters() if p.grad is not None)
+
+
+def _emitted(module: pl.LightningModule, frame: Frame | None) -> Iterator[tuple[str, Tensor]]:
+    """What the thermal model emits in a frame, of which NaN reach gradients of the geometry."""
+    if frame is not None and len(module.splats) and getattr(module.thermal, "per_row", 0) == 1:  # rows are Gaussians
+        yield f"what {type(module.thermal).__name__}.features returns", module.emissions(module.splats, frame)
 
 
 def _parameters(module: pl.LightningModule) -> Iterator[tuple[str, Tensor]]:

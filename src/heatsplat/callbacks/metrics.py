@@ -207,13 +207,13 @@ class QualityMetrics(pl.Callback):
         return "no test image has a region of interest with such pixels"
 
     def _log(self, module: pl.LightningModule, tag: str, scores: Mapping[str, float | None], step: int) -> None:
-        """Scores to TensorBoard and to the trainer, where checkpoints may monitor them.
+        """Scores to the loggers and to the trainer, where checkpoints may monitor them.
 
         Lightning's own way to the logger counts steps from zero, one less than every other curve.
         """
         known = {f"{tag}/{name}": value for name, value in scores.items() if value is not None}
         module.log_dict(known, logger=False)
-        add_scalars(module, known, step)
+        add_scalars(module, known, step, by_steps="_by_" not in tag)
 
     # Resume ----------------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytorch_lightning as pl
 from matplotlib.figure import Figure
+from pytorch_lightning.loggers import TensorBoardLogger
 from rich.console import Console
 from rich.table import Table
 
@@ -67,13 +68,23 @@ class Report(pl.Callback):
         write_atomically(folder / REPORT_FILE, text)
         if self.html:
             write_page(folder / PAGE_FILE, text)
-        if trainer.logger is not None:
+        if trainer.loggers:
             scores = {f"final/{name}": value for name, value in (results.test | results.cost).items()}
             finite = {name: value for name, value in scores.items() if value is not None and math.isfinite(value)}
-            trainer.logger.log_hyperparams(hyperparameters(module.config), finite)
+            log_results(trainer, hyperparameters(module.config), finite)
         results.write(folder / METRICS_FILE)  # last: it says that the run is over, and nothing of it is made again
         if self.show:
             show(results, folder, shown[0] if shown else None)
+
+
+def log_results(trainer: pl.Trainer, settings: dict[str, Any], scores: dict[str, float]) -> None:
+    """Hands the settings and final scores of a run to its loggers, of which TensorBoard keeps both in one table."""
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.log_hyperparams(settings, scores)
+        else:
+            logger.log_hyperparams(settings)
+            logger.log_metrics(scores, trainer.global_step)
 
 
 def pictures_of(folder: Path, frames: Iterable[Frame], count: int) -> list[Path]:

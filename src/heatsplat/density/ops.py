@@ -129,8 +129,9 @@ class Cloud:
         A sparse tensor takes no row that is all zeros.
 
         Raises:
-            KeyError: a tensor of the splats is missing in ``rows``.
+            ValueError: a tensor of the splats is missing in ``rows``, has other rows than the splats, or is not finite.
         """
+        self._check_rows(rows)
         count = rows["means"].shape[0]
         for name in self.splats.names:
             new, places = rows[name], self.splats.places(name)
@@ -145,6 +146,18 @@ class Cloud:
             )
         for name, tensor in self.state.items():
             self.state[name] = torch.cat([tensor, tensor.new_zeros(count, *tensor.shape[1:])])
+
+    def _check_rows(self, rows: Mapping[str, Tensor]) -> None:
+        if missing := [name for name in self.splats.names if name not in rows]:
+            raise ValueError(
+                f"density control adds Gaussians without {', '.join(missing)}: begin with cloud.rows(ids), which has all tensors"
+            )
+        for name in self.splats.names:
+            shape = (len(rows["means"]), *self.splats[name].shape[1:])
+            if tuple(rows[name].shape) != shape:
+                raise ValueError(f"density control adds '{name}' {list(rows[name].shape)}, {list(shape)} is needed")
+            if not bool(rows[name].isfinite().all()):
+                raise ValueError(f"density control adds Gaussians whose '{name}' is NaN or infinite")
 
     @torch.no_grad()
     def split(self, ids: Tensor, how: LongAxisSplit) -> None:

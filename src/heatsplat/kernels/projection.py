@@ -443,8 +443,10 @@ def _only(visible, vectors):
 
 
 @inline
-def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y):
-    """Adds what Gaussians tell about rotation (0-8) and translation (9-11) of the camera."""
+def _add_camera_gradient(
+    v_cameras, chunk, visible, camera, world, here, slopes, jacobian, v_here, v_row_x, v_row_y, v_mean_x, v_mean_y
+):
+    """Adds what Gaussians tell about rotation (0-8), translation (9-11), fx, fy, cx and cy (12-15) of the camera."""
     jx, jy = camera[FX] * slopes[2], camera[FY] * slopes[2]
     for k in range(3):
         by_x, by_y = jx * v_row_x[k], jy * v_row_y[k]
@@ -454,6 +456,27 @@ def _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_her
         v_cameras[chunk, 6 + k] += np.float64(total(select(visible, by_z + v_here[2] * world[k], 0.0)))
     for k in range(3):
         v_cameras[chunk, 9 + k] += np.float64(total(v_here[k]))
+    v_fx, v_cx = _intrinsics_backward(
+        camera[FX], camera[LOWEST_X], camera[HIGHEST_X], here[0] * slopes[2], slopes[0], jx, camera[6:9], jacobian[0],
+        v_row_x, v_mean_x,
+    )  # fmt: skip
+    v_fy, v_cy = _intrinsics_backward(
+        camera[FY], camera[LOWEST_Y], camera[HIGHEST_Y], here[1] * slopes[2], slopes[1], jy, camera[6:9], jacobian[1],
+        v_row_y, v_mean_y,
+    )  # fmt: skip
+    v_cameras[chunk, FX] += np.float64(total(select(visible, v_fx, 0.0)))
+    v_cameras[chunk, FY] += np.float64(total(select(visible, v_fy, 0.0)))
+    v_cameras[chunk, CX] += np.float64(total(select(visible, v_cx, 0.0)))
+    v_cameras[chunk, CY] += np.float64(total(select(visible, v_cy, 0.0)))
+
+
+@inline
+def _intrinsics_backward(focal, lowest, highest, free_slope, slope, scale, axis, row, v_row, v_mean):
+    """Gradients of the focal length and the principal point along one axis of the image, by way of the row f/z (W_0 - x/z W_2)
+    of J W, of the mean f x/z + c, and of the limits (-c - margin) / f and (width - c + margin) / f of x/z in the row."""
+    clamped = (free_slope < lowest) | (free_slope > highest)
+    v_limit = select(clamped, -scale * _dot(v_row, axis), 0.0)
+    return (_dot(v_row, row) - v_limit * slope) / focal + v_mean * free_slope, v_mean - v_limit / focal
 
 
 @inline
@@ -500,7 +523,21 @@ def _project_block_backward(
     store_columns(v_quats, first, (select(visible, v_quat[0], 0.0), v_qx, v_qy, v_qz), rows)
     store_columns(v_means2d, first, (select(visible, v_mean_x, 0.0), select(visible, v_mean_y, 0.0)), rows)
     if v_cameras.shape[1] > 0:
-        _add_camera_gradient(v_cameras, chunk, visible, camera, world, slopes, v_here, v_row_x, v_row_y)
+        _add_camera_gradient(
+            v_cameras,
+            chunk,
+            visible,
+            camera,
+            world,
+            here,
+            slopes,
+            jacobian,
+            v_here,
+            v_row_x,
+            v_row_y,
+            v_mean_x,
+            v_mean_y,
+        )
 
 
 @inline
@@ -545,7 +582,7 @@ def project_backward(
         v_means, v_quats, v_scales, v_opacities, v_features, v_means2d: out, all rows are written.
         maps: out [n, S], sums of maps for the visible ones.
         absgrad: out [N, 2], or [0, 0] where it is not wanted.
-        v_cameras: out, added to: [chunks, 12] rotation and translation, or [chunks, 0] where it is not wanted.
+        v_cameras: out, added to: [chunks, 16] rotation, translation, fx, fy, cx and cy, or [chunks, 0] where it is not wanted.
     """
     parallel_for(
         _project_chunk_backward, v_cameras.shape[0],

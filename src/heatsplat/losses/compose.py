@@ -156,7 +156,7 @@ class Weighted(Wrapped):
 
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         factor = self.weight if self.schedule is None else self.weight * self.schedule(inputs.progress)
-        return {} if factor == 0.0 else scaled(self.term(inputs), factor)
+        return {} if factor == 0.0 else scaled(self.term, inputs, factor)
 
 
 class During(Wrapped):
@@ -188,13 +188,15 @@ class Loss:
         terms: name -> term, or None for a term that is absent.
 
     Raises:
-        ValueError: there is no term, or none counts at some steps before others do.
+        ValueError: there is no term, or one is no ``LossTerm``, or none counts at some steps before others do.
     """
 
     def __init__(self, terms: Mapping[str, LossTerm | None]) -> None:
         self.terms = {name: term for name, term in terms.items() if term is not None}
         if not self.terms:
             raise ValueError(f"the loss has no term: give one of loss.terms ({', '.join(terms)}) that is not null")
+        for name, term in self.terms.items():
+            _check_term(name, term)
         spans = {name: term.span for name, term in self.terms.items()}
         last = max(stop for _, stop in spans.values())
         for step in sorted({0, *(stop for _, stop in spans.values() if stop < last)}):
@@ -217,16 +219,62 @@ class Loss:
         """Scalars by name: ``name`` of a term that returns a tensor, ``name/part`` of one that returns several."""
         scalars: dict[str, Tensor] = {}
         for name, term in self.terms.items():
-            for part, value in _named(term(inputs)).items():
+            for part, value in _named(term, inputs).items():
                 scalars[f"{name}/{part}" if part else name] = value
         return scalars
 
 
-def scaled(values: Tensor | dict[str, Tensor], factor: Tensor | float) -> dict[str, Tensor]:
+def summands(*parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The terms of several parts of a run by name, scalars whose sum is minimised.
+
+    Raises:
+        ValueError: two are called the same, or one is no scalar tensor; the message names it.
+    """
+    terms: dict[str, Tensor] = {}
+    for part in parts:
+        for name, value in part.items():
+            if name in terms:
+                raise ValueError(
+                    f"two loss terms are called '{name}': a term of the loss, or a regulariser of the thermal model, the sensor "
+                    "or the cameras, needs another name"
+                )
+            _check_scalar(f"loss term '{name}'", value)
+            terms[name] = value
+    return terms
+
+
+def scaled(term: LossTerm, inputs: LossInputs, factor: Tensor | float) -> dict[str, Tensor]:
     """A term's values by name, times a factor."""
-    return {name: factor * value for name, value in _named(values).items()}
+    return {name: factor * value for name, value in _named(term, inputs).items()}
 
 
-def _named(values: Tensor | dict[str, Tensor]) -> dict[str, Tensor]:
-    """A term's values by name; a lone scalar has the empty name."""
-    return {"": values} if isinstance(values, Tensor) else values
+def _named(term: LossTerm, inputs: LossInputs) -> dict[str, Tensor]:
+    """A term's values by name; a lone scalar has the empty name. Raises ValueError where one is no scalar."""
+    values = term(inputs)
+    named = values if isinstance(values, dict) else {"": values}
+    for value in named.values():
+        _check_scalar(f"what loss term {type(term).__name__} returned", value)
+    return named
+
+
+def _check_term(name: str, term: object) -> None:
+    """Raises ValueError where a term, or one that others are around, is no ``LossTerm``."""
+    while isinstance(term, Wrapped):
+        name, term = f"{name}.term", term.term
+    if not isinstance(term, LossTerm):
+        raise ValueError(
+            f"loss.terms.{name} is {_shown(term)}; a loss term derives from heatsplat.losses.compose.LossTerm, and its __call__ "
+            "compares images"
+        )
+
+
+def _check_scalar(what: str, value: object) -> None:
+    if not isinstance(value, Tensor) or value.numel() != 1:
+        raise ValueError(f"{what} is {_shown(value)}; it must be a scalar tensor, such as a mean over pixels")
+
+
+def _shown(value: object) -> str:
+    """What something out of place is, for messages."""
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {list(value.shape)}"
+    return "None" if value is None else f"of type {type(value).__name__}"

@@ -34,4 +34,4 @@ class ByOthersShare(Weighted):
         if self.weight == 0.0:
             return {}
         others = (logits.argmax(dim=1) != self.opacity).float().mean()
-        return scaled(self.term(inputs), self.weight * others)
+        return scaled(self.term, inputs, self.weight * others)

@@ -69,7 +69,8 @@ def rasterization(
     signs: Tensor | None = None,
     raw: bool = False,
 ) -> RenderOutput:
-    """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in every tensor argument.
+    """Composited features, alpha and depth of Gaussians seen by one camera; differentiable in the tensors of the Gaussians, the
+    background and ``viewmats``, and in fx, fy, cx and cy of ``Ks`` but with "gsplat".
 
     **Convention:** OpenCV axes; ``viewmats`` maps world to camera; pixel centres at +0.5; quaternions wxyz, any length
     but zero; front to back in order of camera z, equal depths in order of index.
@@ -81,7 +82,7 @@ def rasterization(
         opacities: [N], or [M, N] for M modalities that share geometry, projection and depth order.
         features: [N, C], or a function from the visible ids [n] int64 to [n, C], called once after projection.
         viewmats: [4, 4] world to camera.
-        Ks: [3, 3] intrinsics in pixels.
+        Ks: [3, 3] intrinsics in pixels, without skew.
         width, height: image size in pixels.
         near, far: Gaussians whose camera z lies outside are not seen.
         background: [C] added behind what is left of the transmittance; None is black.
@@ -100,7 +101,8 @@ def rasterization(
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
 
     Raises:
-        ValueError: shapes do not fit together, eps2d is not positive, or the backend is unknown.
+        ValueError: shapes, types or devices do not fit together, eps2d is not positive, far is not beyond near, the
+            intrinsics have skew or want a gradient of "gsplat", or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
     n = means.shape[0]
@@ -111,22 +113,42 @@ def rasterization(
         opacities = opacities[None]
     if opacities.ndim != 2 or opacities.shape[1] != n:
         raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"Gaussians must be float32 or float64, got means of {means.dtype}")
+    given = {"quats": quats, "scales": scales, "opacities": opacities, "features": features, "background": background}
+    for name, tensor in given.items():
+        if isinstance(tensor, Tensor) and (tensor.dtype != means.dtype or tensor.device != means.device):
+            raise ValueError(
+                f"{name} must be like means, {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}"
+            )
     if isinstance(features, Tensor) and (features.ndim != 2 or features.shape[0] != n):
         raise ValueError(f"features must have shape [{n}, C], got {list(features.shape)}")
     if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
         raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
+    if Ks.device.type == "cpu" and float(Ks[0, 1]):  # elsewhere a look at it would wait for the device
+        raise ValueError(
+            f"Ks has a skew of {float(Ks[0, 1]):.6g} (its [0, 1]), which no renderer has: undistort images to 0"
+        )
+    if signs is not None and tuple(signs.shape) != (n,):
+        raise ValueError(f"signs must have shape [{n}], got {list(signs.shape)}")
     if opacities.shape[0] > 1 and modality_channels is None:
         raise ValueError(f"{opacities.shape[0]} opacity sets need modality_channels, such as (3, 1)")
     if modality_channels is not None and len(modality_channels) != opacities.shape[0]:
         raise ValueError(f"modality_channels {tuple(modality_channels)} must name {opacities.shape[0]} counts")
     if not eps2d > 0:
         raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
+    if not near < far:
+        raise ValueError(f"far must be beyond near, got near {near} and far {far}")
     if width < 1 or height < 1:
         raise ValueError(f"image must have pixels, got {width} x {height}")
     if backend == "auto":
         backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
     if backend not in BACKENDS:
         raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
+    if backend == "gsplat" and Ks.requires_grad:
+        raise ValueError(
+            "gsplat gives no gradient to Ks: detach it, or take backend='cpu' or 'reference', which give those of fx, fy, cx, cy"
+        )
     if raw and backend != "cpu":
         scales, opacities, raw = scales.exp(), opacities.sigmoid(), False
     native = maps if backend == "cpu" else 0  # the others sum maps as gradients of channels that are zero

@@ -47,7 +47,7 @@ def render(inputs: RenderInputs) -> RenderOutput:
     sums = torch.zeros(len(ids), inputs.maps, requires_grad=True) if inputs.maps else None
     image, alpha, depth, maps = _Rasterize.apply(
         frame, channels, ids, inputs.means, inputs.quats, inputs.scales, inputs.opacities, features, background,
-        inputs.viewmat, frame.means2d, sums,
+        inputs.viewmat, inputs.K, frame.means2d, sums,
     )  # fmt: skip
     meta = {"means2d": frame.means2d, "radii": frame.radii, "visible_ids": ids}
     return RenderOutput(image, alpha, depth, meta, None if sums is None else WeightedSums(maps, sums))
@@ -66,7 +66,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, frame, channels, ids, means, quats, scales, opacities, features, background, viewmat, means2d, sums
+        ctx, frame, channels, ids, means, quats, scales, opacities, features, background, viewmat, K, means2d, sums
     ):
         ctx.frame, ctx.means2d = frame, means2d
         ctx.save_for_backward(means, quats, scales, opacities, features)
@@ -79,12 +79,12 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, v_image, v_alpha, v_depth, maps):
         means, quats, scales, opacities, features = ctx.saved_tensors
         v_background = ctx.frame.composite_backward(v_image, v_alpha, v_depth, maps)
-        *v_gaussians, v_means2d, sums, absgrad, v_viewmat = ctx.frame.project_backward(
-            means, quats, scales, opacities, features, camera=ctx.needs_input_grad[9]
+        *v_gaussians, v_means2d, sums, absgrad, v_viewmat, v_K = ctx.frame.project_backward(
+            means, quats, scales, opacities, features, camera=any(ctx.needs_input_grad[9:11])
         )
         if absgrad is not None:
             ctx.means2d.absgrad = absgrad
-        return None, None, None, *v_gaussians, v_background, v_viewmat, v_means2d, sums
+        return None, None, None, *v_gaussians, v_background, v_viewmat, v_K, v_means2d, sums
 
 
 class _Frame:
@@ -122,7 +122,7 @@ class _Frame:
             self.opacities, self.screen, self.depths, self.means2d.numpy(), self.radii.numpy(), self.seen, ids.numpy(),
             self.first_ranks, array("bounds", np.int64, chunks), array("columns", np.float32, chunks, RANK, LANES),
         )  # fmt: skip
-        self.means2d.requires_grad_(inputs.means.requires_grad or inputs.viewmat.requires_grad)
+        self.means2d.requires_grad_(any(x.requires_grad for x in (inputs.means, inputs.viewmat, inputs.K)))
         return ids[:visible]
 
     def bin(self, channels: tuple[int, ...], visible: Tensor, features: Tensor) -> None:
@@ -190,13 +190,13 @@ class _Frame:
 
     def project_backward(
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
+    ) -> tuple[Tensor | None, ...]:
         """Gradients of the Gaussians and of ``means2d``; where they are wanted sums of maps [n, S] and absolute screen
-        gradients [N, 2]; and the gradient of the view matrix where ``camera`` wants it."""
+        gradients [N, 2]; and the gradients of the view matrix and of the intrinsics where ``camera`` wants them."""
         v = [torch.empty(tensor.shape) for tensor in (means, quats, scales, opacities, features)]
         absgrad = torch.empty(self.count, 2) if self.inputs.absgrad else None
         v_means2d, sums = torch.empty(self.count, 2), torch.empty(len(self.ids), self.inputs.maps)
-        v_cameras = np.zeros((self.chunks, 12 if camera else 0))
+        v_cameras = np.zeros((self.chunks, 16 if camera else 0))
         scratch = LANES * SUMS + -(-self.backward_layout.slot_size // LANES) * LANES
         projection.project_backward(
             _numpy(means), _numpy(quats), _numpy(scales), self.opacities, self.inputs.raw, self.camera,
@@ -208,11 +208,12 @@ class _Frame:
         )  # fmt: skip
         sums = sums if self.inputs.maps else None
         if not camera:
-            return *v, v_means2d, sums, absgrad, None
-        v_viewmat = torch.zeros(4, 4)
+            return *v, v_means2d, sums, absgrad, None, None
+        v_viewmat, v_K = torch.zeros(4, 4), torch.zeros(3, 3)
         v_camera = torch.from_numpy(v_cameras.sum(axis=0))
-        v_viewmat[:3, :3], v_viewmat[:3, 3] = v_camera[:9].view(3, 3), v_camera[9:]
-        return *v, v_means2d, sums, absgrad, v_viewmat
+        v_viewmat[:3, :3], v_viewmat[:3, 3] = v_camera[:9].view(3, 3), v_camera[9:12]
+        v_K[0, 0], v_K[1, 1], v_K[:2, 2] = v_camera[12], v_camera[13], v_camera[14:]
+        return *v, v_means2d, sums, absgrad, v_viewmat, v_K
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:

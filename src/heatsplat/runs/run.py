@@ -120,13 +120,22 @@ def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
 
 
 def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
-    """The trainer of a configuration, with the callbacks and the logger of ``watching``, which write into the run's folder."""
-    logger = build({**watching["logger"], "save_dir": str(output_dir)}) if watching.get("logger") else False
+    """The trainer of a configuration, with the callbacks and loggers of ``watching``, which write into the run's folder."""
     callbacks = build_callbacks(watching["callbacks"], output_dir)
     places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
-    built = build(dict(trainer), callbacks=callbacks, logger=logger, **places)
+    built = build(
+        dict(trainer), callbacks=callbacks, logger=build_loggers(watching.get("logger"), output_dir), **places
+    )
     lean(built)
     return built
+
+
+def build_loggers(logger: Mapping[str, Any] | Sequence[Any] | None, output_dir: Path) -> list[Any]:
+    """The loggers of a configuration: of one, of a list or of a mapping of several by name."""
+    if not logger:
+        return []
+    several = [logger] if "_target_" in logger else logger.values() if isinstance(logger, Mapping) else logger
+    return [build({**settings, "save_dir": str(output_dir)}) for settings in several if settings is not None]
 
 
 def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]:
@@ -161,7 +170,7 @@ class Trained:
         return self.data.scene
 
     def render(self, camera: Camera | Frame, time_s: float | None = None, unseen: str = "nan") -> Tensor:
-        """Temperatures in °C [H, W], or image values in [0, 1] where the scene has no thermal range.
+        """Temperatures in °C [H, W], or image values in [0, 1] where there are none; of images with several channels [H, W, C].
 
         Without gradients; ``module.render`` has them. The first moment beyond the training record is warned of: it is a
         prediction.
@@ -179,9 +188,12 @@ class Trained:
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
         self._warned = self._warned or warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record)
-        image = self.module.predict(frame)[..., 0].cpu()
-        image = image if self.scene.thermal_range is None else self.scene.thermal_range.to_celsius(image)
-        return image if unseen == "keep" else image.where(self.seen(frame), torch.nan)
+        image = self.module.predict(frame).cpu()
+        bounds = self.scene.range_of(self.module.modality)
+        if bounds is not None and image.shape[2] == 1:
+            image = bounds.to_celsius(image)
+        image = image if unseen == "keep" else image.where(self.seen(frame)[..., None], torch.nan)
+        return image[..., 0] if image.shape[2] == 1 else image
 
     @property
     def image_names(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -26,7 +27,7 @@ def spherical_harmonics_of(constant: Tensor, rest: Tensor | None, means: Tensor,
         constant: [N, 1, C] coefficients of the constant harmonic.
         rest: [N, B - 1, C] those of the further ones, at least (degree + 1)² - 1 of them; not read at degree 0.
         means: [N, 3] positions; differentiable, and not read at degree 0.
-        query: which Gaussians (ids do not repeat), and the camera.
+        query: which Gaussians (ids do not repeat), and the camera, whose view matrix may have a gradient.
         degree: 0 to 3.
 
     Raises:
@@ -63,4 +64,8 @@ class _Fused(torch.autograd.Function):
         v_constant = allocate(len(means), 1, v_values.shape[1])
         gradients = v_constant, allocate(rest.shape), allocate(means.shape)
         kernel.backward(*ctx.inputs, v_values.contiguous().numpy(), *(tensor.numpy() for tensor in gradients))
-        return *gradients, None, None, None
+        v_center = None
+        if ctx.needs_input_grad[3]:
+            # Directions go from the center to the means. numpy adds in one order on any number of threads.
+            v_center = -torch.from_numpy(gradients[2].numpy().sum(axis=0, dtype=np.float64)).to(v_values)
+        return *gradients, v_center, None, None

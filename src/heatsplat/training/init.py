@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
+from heatsplat.physics.units import kelvin
 from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.checkpoints import load_checkpoint
@@ -130,7 +132,7 @@ class NoSplats(Start):
         """Splats without rows, and what the thermal model declared, which is nothing as a rule."""
         shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "opacity_logits": (len(thermal.opacity_channels),)}
         means, values = torch.zeros(0, 3), torch.zeros(0, sum(thermal.modality_channels))
-        declared = thermal.per_gaussian(Seeds(means, values, generator_for(seed, 0, "thermal")))
+        declared = declared_by(thermal, Seeds(means, values, generator_for(seed, 0, "thermal")))
         geometry = {name: torch.zeros(0, *shape) for name, shape in shapes.items()}
         return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
 
@@ -164,7 +166,10 @@ class Voxels(Initialisation):
 
 
 class Pretrained(Start):
-    """Splats whose geometry and opacity are those of an earlier run or of a file; heat starts as it does elsewhere.
+    """Splats whose geometry and opacity are those of an earlier run or of a file.
+
+    Heat starts as it does elsewhere, but for a model of the images that a file holds: of colours, of visible images, or of
+    temperatures, where the scene has bounds. What is not taken is logged.
 
     Args:
         path: a point cloud .ply in the layout of 3DGS, or a checkpoint .ckpt of heatsplat, in the world of the scene. A
@@ -187,20 +192,33 @@ class Pretrained(Start):
             raise SceneError(
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
             )
+        held: dict[str, Tensor] = {}
         if self.path.suffix == ".ply":
-            geometry, rows = _splats_of_file(self.path)
+            geometry, held, rows = _splats_of_file(self.path)
         else:
             geometry, rows = _splats_of_checkpoint(self.path, scene)
         if rows not in (GAUSSIANS, thermal.rows):
-            held = "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+            other = (
+                "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+            )
             raise SceneError(
-                f"init.path={self.path} holds {held}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
+                f"init.path={self.path} holds {other}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
             )
         wanted = len(thermal.opacity_channels)
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
-        return with_heat(geometry, scene, thermal, seed)
+        source, values = _start_held(held, scene, thermal)
+        splats, declared = with_heat(geometry, scene, thermal, seed, values)
+        taken = {source}
+        if source == "values" and "sh_rest" in held and _takes_harmonics(splats, held["sh_rest"]):
+            taken.add("sh_rest")
+        names = {"values": "colours", "sh_rest": "spherical harmonics", "temperature_k": "temperatures"}
+        if left := [word for name, word in names.items() if name in held and name not in taken]:
+            log.info(
+                "init.path: %s of the file are not taken: they are not what this model starts from", ", ".join(left)
+            )
+        return splats, declared
 
 
 def _drawn(points: Tensor, most: float, generator: torch.Generator) -> Tensor:
@@ -223,17 +241,69 @@ def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
     return several | {"opacity_logits": several["opacity_logits"].where(own, ABSENT)}
 
 
+def _start_held(
+    held: Mapping[str, Tensor], scene: SceneData, thermal: ThermalModel
+) -> tuple[str | None, Tensor | None]:
+    """What of a file a model starts from, and the image values [N, C] that it is: colours as of visible images, temperatures in
+    the scene's bounds; None where it holds neither for this model."""
+    images, bounds = (thermal.modality, thermal.modality_channels), scene.range_of(thermal.modality)
+    if images == ("rgb", (3,)) and "values" in held:
+        return "values", held["values"]
+    if images == ("thermal", (1,)) and bounds is not None and "temperature_k" in held:
+        return "temperature_k", bounds.to_unit(held["temperature_k"] - kelvin(0.0))[:, None].clamp(0, 1)
+    return None, None
+
+
+@torch.no_grad()
+def _takes_harmonics(splats: Splats, rest: Tensor) -> bool:
+    """Whether splats have harmonics of the direction of view, which then are ``rest`` [N, K, C], as many as both have."""
+    if "sh_rest" not in splats or splats["sh_rest"].shape[2] != rest.shape[2]:
+        return False
+    count = min(splats["sh_rest"].shape[1], rest.shape[1])
+    splats["sh_rest"][:, :count] = rest[:, :count]
+    return True
+
+
 def with_heat(
-    geometry: dict[str, Tensor], scene: SceneData, thermal: ThermalModel, seed: int
+    geometry: dict[str, Tensor], scene: SceneData, thermal: ThermalModel, seed: int, values: Tensor | None = None
 ) -> tuple[Splats, dict[str, PerGaussian]]:
-    """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared."""
+    """Splats of geometry tensors and of what a thermal model wants beside them, and what it declared.
+
+    Image ``values`` [N, C] of the Gaussians are, unless they are given, those that the training views see.
+    """
     means = geometry["means"]
     modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
     looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in modalities], dim=2)
     generator, log_scales = generator_for(seed, 0, "thermal"), geometry["log_scales"]
-    seeds = Seeds(means, usual_values(scene, looks), generator, looks, _times(scene), log_scales)
-    declared = thermal.per_gaussian(seeds)
+    seen = usual_values(scene, looks) if values is None else values
+    seeds = Seeds(means, seen, generator, looks, _times(scene), log_scales)
+    declared = declared_by(thermal, seeds)
     return Splats(geometry | {name: item.initial for name, item in declared.items()}), declared
+
+
+def declared_by(thermal: ThermalModel, seeds: Seeds) -> dict[str, PerGaussian]:
+    """What a thermal model declares in ``per_gaussian``.
+
+    Raises:
+        ValueError: a tensor has a name of the geometry, a negative rate, or values that are no finite floats, one row for each
+            Gaussian; the message names it.
+    """
+    declared, count = thermal.per_gaussian(seeds), len(seeds.means)
+    for name, item in declared.items():
+        what = f"'{name}' in per_gaussian of {type(thermal).__name__}"
+        if name in GEOMETRY:
+            raise ValueError(f"{what} is the name of a tensor of the geometry ({', '.join(GEOMETRY)}): choose another")
+        if not isinstance(item, PerGaussian):
+            raise ValueError(f"{what} is of type {type(item).__name__}: give PerGaussian(initial, lr)")
+        initial = item.initial
+        if not isinstance(initial, Tensor) or not initial.is_floating_point() or initial.shape[:1] != (count,):
+            found = f"{initial.dtype} {list(initial.shape)}" if isinstance(initial, Tensor) else type(initial).__name__
+            raise ValueError(f"{what} must start from floats [{count}, ...], one row for each Gaussian, got {found}")
+        if not bool(initial.isfinite().all()):
+            raise ValueError(f"{what} starts from {int((~initial.isfinite()).sum())} values that are NaN or infinite")
+        if not 0 <= item.lr < float("inf"):
+            raise ValueError(f"{what} has a learning rate of {item.lr}, which must be 0 (not trained) or more")
+    return declared
 
 
 def _times(scene: SceneData) -> Tensor | None:
@@ -242,13 +312,13 @@ def _times(scene: SceneData) -> Tensor | None:
     return None if None in times else torch.tensor(times, dtype=torch.float64)
 
 
-def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], str]:
-    """Geometry of a point cloud, and what its rows are: Gaussians."""
+def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], str]:
+    """Geometry of a point cloud, what else it holds (``read_splats``), and what its rows are: Gaussians."""
     try:
-        found = read_splats(path)
+        found = {name: torch.from_numpy(values.copy()) for name, values in read_splats(path).items()}
     except ValueError as error:
         raise SceneError(f"init.path: {error}") from error
-    return {name: torch.from_numpy(found[name].copy()) for name in GEOMETRY}, GAUSSIANS
+    return {name: found.pop(name) for name in GEOMETRY}, found, GAUSSIANS
 
 
 def _splats_of_checkpoint(path: Path, scene: SceneData) -> tuple[dict[str, Tensor], str]:

@@ -19,7 +19,7 @@ from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
-from heatsplat.losses.compose import Loss, LossInputs, pixel_errors
+from heatsplat.losses.compose import Loss, LossInputs, pixel_errors, summands
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
@@ -32,6 +32,7 @@ from heatsplat.training.init import Start
 from heatsplat.training.loop import plain
 from heatsplat.training.optimisation import Optimisation, penalties
 from heatsplat.training.overlap import Overlap
+from heatsplat.training.registered import check_registered, check_trained, warn_of_untrained
 from heatsplat.training.resolution import Resolution, rendered
 from heatsplat.training.rng import generator_for
 from heatsplat.training.scales import check_same_scene, scales_of
@@ -122,6 +123,9 @@ class SplatTraining(SceneModel):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
+        self._compared = (
+            False  # whether the optimiser has all parameters, once the first step has made those that it makes
+        )
         self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
@@ -156,6 +160,12 @@ class SplatTraining(SceneModel):
         learned = (self.modality, *self.thermal.companions)
         self.resolution.prepare(scene, learned, self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
+        for name, statistic in self._density_state.items():
+            if statistic.shape[:1] != (len(self.splats),):
+                raise ValueError(
+                    f"'{name}' of {type(self.density).__name__}.initial_state is {list(statistic.shape)}; it needs a row for "
+                    f"each of the {len(self.splats)} Gaussians"
+                )
         modalities = zip(learned, self.thermal.modality_channels, strict=True)
         behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
@@ -226,6 +236,7 @@ class SplatTraining(SceneModel):
             groups.append(group(f"cameras.{name}", parameter, rate))
         optimizer, scheduler = self.optim.build(groups, self.schedule.round_progress)
         self.stages.check(optimizer)
+        check_registered(self)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def _between_resets(self, interval: int | float) -> int | float:
@@ -250,6 +261,7 @@ class SplatTraining(SceneModel):
     def _stop_at_the_end(self) -> None:
         if self.global_step >= self.schedule.end:
             self.trainer.should_stop = True
+            warn_of_untrained(plain(self.trainer.optimizers[0]), self.stages)
             if self._average:
                 self.results.run["averaged_updates"] = self._average.give(self._learned())
             if (found := self.cameras.found()) is not None:
@@ -294,10 +306,9 @@ class SplatTraining(SceneModel):
             {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
             ratio,
         )
-        terms = self.loss(inputs) | self.thermal.regularisers(self.splats) | self.sensor.regularisers()
-        terms |= self.cameras.regularisers()
-        if signs is not None:
-            terms["entropy"] = self.overlap.entropy(output)
+        entropy = {} if signs is None else {"entropy": self.overlap.entropy(output)}
+        own = self.thermal.regularisers(self.splats), self.sensor.regularisers(), self.cameras.regularisers()
+        terms = summands(self.loss(inputs), *own, entropy)
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
@@ -339,6 +350,9 @@ class SplatTraining(SceneModel):
         update = self._updates(step)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
+        if not self._compared:
+            self._compared = True
+            check_trained(self, inner)
         cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
@@ -348,6 +362,10 @@ class SplatTraining(SceneModel):
             cloud.drop(name, gone, instead)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self.density_change = change
+        if change is not None and not len(self.splats):
+            raise SceneError(
+                f"{type(self.density).__name__} removed all Gaussians in step {step + 1}: give it milder thresholds"
+            )
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
         if change is not None:

@@ -98,6 +98,11 @@ class Stages:
             (one.start for one in ends if any(fnmatchcase(group, name) for name in one.groups)), default=math.inf
         )
 
+    def freezes_group(self, group: str) -> bool:
+        """Whether a stage freezes a parameter group, all of it, at some step."""
+        names = (name for freeze in self.freezes.values() for name in freeze.groups)
+        return any(fnmatchcase(group, name) for name in names)
+
     def check(self, optimizer: torch.optim.Optimizer) -> None:
         """Warns of stages that freeze nothing, as none of their names is a group of this run."""
         for name, freeze in self.freezes.items():
