@@ -71,14 +71,10 @@ class ExtremeSurfaces(pl.Callback):
 
 
 def middle(scene: SceneData, frame: Frame) -> Frame:
-    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look.
-
-    Between images, by day where all were taken by night, the model would only predict. In scenes without time, as it is.
-    """
+    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look; in scenes
+    without time, as it is."""
     if frame.time_s is not None:
-        taken_s = (time_s for time_s in scene.train.times_s if time_s is not None)
-        middle_s = scene.middle_s
-        frame = at_time(scene, frame, min(taken_s, key=lambda time_s: abs(time_s - middle_s)))
+        frame = at_time(scene, frame, scene.middle_s)
     return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
 
 
