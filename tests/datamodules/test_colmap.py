@@ -138,7 +138,9 @@ def test_a_prepared_folder_whose_frames_had_no_times_has_none(tmp_path):
 def test_options_that_are_metadata(tmp_path):
     scene = loaded(write_colmap(tmp_path, names(9)), ambient_c=21.5, metres_per_unit=2.0)
     assert scene.ambient_c == 21.5 and scene.metres_per_unit == 2.0
-    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5}')
+    assert "axes" not in scene.notes
+    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5, "axes": "east, north, up"}')
+    assert loaded(tmp_path).notes["axes"] == "east, north, up"
     assert loaded(tmp_path).metres_per_unit == 0.5 and loaded(tmp_path, metres_per_unit=2.0).metres_per_unit == 2.0
     (tmp_path / "world.json").write_text('{"metres_per_unit": "far"}')
     with pytest.raises(SceneError, match="world.json: 'metres_per_unit'"):
