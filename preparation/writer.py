@@ -195,7 +195,9 @@ def write_world(target: Path, metres_per_unit: float | None, axes: str | None = 
     if metres_per_unit is None:
         path.unlink(missing_ok=True)
     else:
-        write_atomically(path, json.dumps({"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})) + "\n")
+        write_atomically(
+            path, json.dumps({"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})) + "\n"
+        )
 
 
 def write_bounds(target: Path, low: float, high: float) -> None:

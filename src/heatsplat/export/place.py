@@ -69,8 +69,8 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
         gps: CSV with the name, latitude and longitude (WGS 84, degrees) and height (metres) of camera positions; "auto" takes
             the scene's own, where it has one that places its cameras and ``above`` does not say otherwise; None takes none.
         above: [3] direction that counts as up, in place of the scene's own; not with a table. None: that of its weather, or of
-            its axes where they are east, north and up; else where all cameras look the same way (a drone that looks down, a wall seen from the front) back towards
-            them; else upward in their images.
+            its axes where they are east, north and up; else where all cameras look the same way (a drone that looks down, a
+            wall seen from the front) back towards them; else upward in their images.
 
     Raises:
         SceneError: the table cannot be read, or its positions do not place the cameras.
@@ -157,8 +157,8 @@ def _placed(scene: SceneData, path: Path) -> Place:
     height = (similarity(source)[:, 2].median() - similarity(scene.points.double())[:, 2].median()).abs().item()
     tipped = height * off[:, 2].square().mean().sqrt().item() * len(source) ** 0.5 / max(across, 1e-9)
     log.info(
-        "%s: %d cameras placed in %s, %.2f m from their positions (rms); %.0f m below them, the ground may be off by %.1f m across "
-        "the line of flight",
+        "%s: %d cameras placed in %s, %.2f m from their positions (rms); %.0f m below them, the ground may be off by %.1f m "
+        "across the line of flight",
         path, len(found), crs, off.square().sum(1).mean().sqrt().item(), height, tipped,
     )  # fmt: skip
     return Place(similarity, crs, "metre")
