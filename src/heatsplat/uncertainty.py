@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -208,9 +208,11 @@ class Uncertainty:
         self.shares, told = _calibrated(used, self.noise)
         return told
 
+    @torch.no_grad()
     def deviation(self, frame: Frame) -> Tensor:
-        """Standard deviation [H, W] of the temperature in each pixel of a frame."""
+        """Standard deviation [H, W] of the temperature in each pixel of the image of a frame."""
         variance = self._variances(frame, (self.stretch,)) @ self.shares
+        frame = replace(frame, camera=self.module.cameras.of(frame))
         unseen = ~covered(frame.camera, self.module.depth(frame), self._sightings)
         return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
 
