@@ -21,6 +21,7 @@ from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
+from heatsplat.io.files import read_json_object
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 # Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
@@ -36,6 +37,13 @@ def _positions(folder: Path) -> Path | None:
                 if "lat" in file.readline().lower():
                     return path
     return None
+
+
+def _uncertainty(image: Path) -> float | None:
+    """Standard uncertainty in °C of the temperatures of a prepared image, at their median; None where that is not known."""
+    known = (read_json_object(image.with_suffix(".json")) or {}).get("uncertainty_c")
+    value = known.get("combined") if isinstance(known, dict) else None
+    return value if isinstance(value, float) else None
 
 
 def _world(folder: Path) -> dict[str, Any]:
@@ -129,6 +137,8 @@ class Colmap(SceneDataModule):
         bounds, bounds_source = self._bounds(folder)
         if "axes" in (world := _world(folder)):
             notes["axes"] = str(world["axes"])
+        if (uncertainty := _uncertainty(index.folder / files[kept[0]])) is not None:
+            notes["prepared_uncertainty_c"] = round(uncertainty, 2)
         if bounds:
             notes["bounds_source"] = bounds_source
 

@@ -22,7 +22,7 @@ from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, sur
 from heatsplat.geometry.looks import surface_points
 from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, lettering, write_png
 from heatsplat.io.quantities import moment as said
-from heatsplat.shots import at_time, checked_unseen, first_free_id, sightings
+from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
@@ -116,6 +116,9 @@ class Map(Format):
             for number, (name, band) in enumerate(bands.items(), start=1):
                 file.write(band.astype(np.float32), number)
                 file.set_band_description(number, name)
+                if name.startswith(DEVIATION):
+                    file.update_tags(number, of=deviations_told(scene))
+                    log.info("%s: %s", name, deviations_told(scene))
             file.update_tags(
                 layer=moment.layer.name,
                 lengths=place.unit,

@@ -47,8 +47,8 @@ class Mesh(Format):
     ) -> None:
         if mesh is None:
             raise SceneError(
-                "which mesh? Give what.mesh=FILE, in the coordinates of the scene. Programs such as OpenMVS or Metashape make one "
-                "of the same images and cameras, Open3D or MeshLab one of the points of what=las (Poisson)"
+                "which mesh? Give what.mesh=FILE, in the coordinates of the scene. Programs such as OpenMVS or Metashape make "
+                "one of the same images and cameras, Open3D or MeshLab one of the points of what=las (Poisson)"
             )
         if views is not None:
             check_count("what.views", views)
