@@ -21,7 +21,6 @@ from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
-from heatsplat.io.files import read_json_object
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 # Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
@@ -41,7 +40,11 @@ def _positions(folder: Path) -> Path | None:
 
 def _uncertainty(image: Path) -> float | None:
     """Standard uncertainty in °C of the temperatures of a prepared image, at their median; None where that is not known."""
-    known = (read_json_object(image.with_suffix(".json")) or {}).get("uncertainty_c")
+    path = image.with_suffix(".json")
+    try:
+        known = json_object(path).get("uncertainty_c") if path.is_file() else None
+    except SceneError:  # notes of another program, which need not be readable
+        return None
     value = known.get("combined") if isinstance(known, dict) else None
     return value if isinstance(value, float) else None
 

@@ -57,6 +57,12 @@ class Place:
         """Points [n, 3] float64."""
         return self.similarity(points.double())
 
+    def latitudes_longitudes(self, points: Tensor) -> list[tuple[float, float]]:
+        """Latitude and longitude (WGS 84, degrees) of points [n, 3] of the world, where it has a ``crs``."""
+        east, north, _ = self(points).T.tolist()
+        longitudes, latitudes = optional("rasterio.warp", "map").transform(self.crs, "EPSG:4326", east, north)
+        return list(zip(latitudes, longitudes, strict=True))
+
 
 def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | None = None) -> Place:
     """Where a scene lies: by a table of camera positions in a UTM zone, else with its own scale and direction of up.
